@@ -1,0 +1,115 @@
+"""The inventory: which nodes, clusters and brokers there are, and who may use them.
+
+A node is a vehicle, a roadside station, an edge or a cloud server. It belongs to one cluster and
+one access domain, and a node selector finds it there.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints
+
+from generator.catalog.model import DnsLabel, FileModel, Frozen, Word
+
+NodeId = Annotated[str, StringConstraints(min_length=1, max_length=1024)]
+
+LabelKey = Annotated[
+    str,
+    StringConstraints(pattern=r"^([a-z0-9.-]+/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?$"),
+]
+LabelValue = Annotated[
+    str, StringConstraints(pattern=r"^([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?$")
+]
+
+
+class Cluster(Frozen):
+    """A Kubernetes cluster whose GitOps controller reads ``clusters/<name>/``."""
+
+    name: DnsLabel
+    description: str = ""
+
+
+class Toleration(Frozen):
+    """A taint of the node that workloads put up with (Kubernetes core/v1 Toleration)."""
+
+    key: str = ""
+    operator: Literal["Exists", "Equal"] = "Equal"
+    value: str = ""
+    effect: Literal["", "NoSchedule", "PreferNoSchedule", "NoExecute"] = ""
+
+
+class Ros(Frozen):
+    """What a container on the node needs to join its ROS graph."""
+
+    domain_id: Annotated[int, Field(ge=0, le=232)] = Field(default=0, alias="domainId")
+    rmw: Literal[
+        "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"
+    ] = "rmw_cyclonedds_cpp"
+
+
+class Node(Frozen):
+    """A C-ITS entity that runs services.
+
+    ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
+    ``topics`` names, for each input role, the node's usual topic: releases and derived topics
+    for it carry the node's name alone; those for its further topics carry the topic as well.
+    """
+
+    id: NodeId
+    type: Literal["vehicle", "station", "edge", "cloud"]
+    cluster: DnsLabel
+    selector: dict[LabelKey, LabelValue] | None = None
+    topics: dict[Word, str] = Field(default_factory=dict)
+    tolerations: tuple[Toleration, ...] = Field(default=(), strict=False)
+    image_pull_secrets: tuple[DnsLabel, ...] = Field(
+        default=(), alias="imagePullSecrets", strict=False
+    )
+    host_network: bool = Field(default=True, alias="hostNetwork")
+    ros: Ros = Ros()
+
+
+class Broker(Frozen):
+    """A message broker and the node that it runs on."""
+
+    node: NodeId
+    type: Literal["mqtt"] = "mqtt"
+    host: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
+    port: Annotated[int, Field(ge=1, le=65535)] = 1883
+
+
+class AccessDomain(Frozen):
+    """A namespace and service account, and the nodes whose releases live in it."""
+
+    name: DnsLabel
+    namespace: DnsLabel
+    service_account: DnsLabel = Field(default="demandops", alias="serviceAccount")
+    nodes: tuple[str, ...] = Field(default=("*",), strict=False)
+
+
+class ClustersFile(FileModel):
+    """``inventory/clusters.yaml``."""
+
+    kind: Literal["Clusters"]
+    clusters: tuple[Cluster, ...] = Field(strict=False)
+
+
+class NodesFile(FileModel):
+    """``inventory/nodes.yaml``."""
+
+    kind: Literal["Nodes"]
+    nodes: tuple[Node, ...] = Field(strict=False)
+
+
+class BrokersFile(FileModel):
+    """``inventory/brokers.yaml``."""
+
+    kind: Literal["Brokers"]
+    brokers: tuple[Broker, ...] = Field(strict=False)
+
+
+class AccessDomainsFile(FileModel):
+    """``policy/access-domains.yaml``."""
+
+    kind: Literal["AccessDomains"]
+    domains: tuple[AccessDomain, ...] = Field(strict=False)

@@ -1,0 +1,107 @@
+"""The base of every model that is parsed from a file or a message.
+
+Frozen, strict, unknown fields refused; :func:`parse` turns pydantic's report into faults that
+name the field the way a person would look for it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
+
+from generator import yamlio
+from generator.errors import Fault, InvalidInput, fault, near
+from generator.settings import API_VERSION
+
+Model = TypeVar("Model", bound=BaseModel)
+
+DnsLabel = Annotated[
+    str, StringConstraints(pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$", max_length=63)
+]
+"""A name that Kubernetes takes as it is (RFC 1123 label)."""
+
+Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_length=63)]
+"""A name that people give to roles, services and images in definitions."""
+
+
+class Frozen(BaseModel):
+    """A value that cannot change, with no room for misspelt fields."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, populate_by_name=True)
+
+
+class FileModel(Frozen):
+    """A file that people write: it says which format it is in."""
+
+    apiVersion: Literal["demandops/v1"]
+
+
+def field_path(location: tuple[int | str, ...]) -> str:
+    """Return ``nodes[3].cluster`` for ``("nodes", 3, "cluster")``."""
+    path = ""
+    for part in location:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif part != "[key]":
+            path += f".{part}" if path else part
+    return path
+
+
+def faults_of(error: ValidationError, model: type[BaseModel], file: str = "") -> list[Fault]:
+    """Return every fault of a failed validation, told as where, what and how to mend it."""
+    return [
+        fault(field_path(item["loc"]), _message(dict(item), model)).within(file)
+        for item in error.errors(include_url=False)
+    ]
+
+
+def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
+    kind, value = item["type"], item.get("input")
+    if kind == "missing":
+        return "is missing; add it"
+    if kind == "extra_forbidden":
+        name = str(item["loc"][-1])
+        known = _fields(model) if len(item["loc"]) == 1 else []
+        return "is not a field here; remove it or mend its spelling" + (
+            near(name, known) if known else ""
+        )
+    if kind == "string_type" and isinstance(value, int | float):
+        return f"must be text, not {value!r}; put it in quotes"
+    if kind == "literal_error":
+        return f"is {value!r}, but must be {item['ctx']['expected']}"
+    if kind == "string_pattern_mismatch":
+        return (
+            f"{value!r} is not a name that can be used here; "
+            f"it must match {item['ctx']['pattern']}"
+        )
+    if kind == "value_error":
+        return str(item["ctx"]["error"])
+    shown = repr(value)
+    shown = shown if len(shown) <= 60 else shown[:57] + "…"
+    return f"{item['msg'][:1].lower()}{item['msg'][1:]}, not {shown}"
+
+
+def _fields(model: type[BaseModel]) -> list[str]:
+    return list(model.model_fields)
+
+
+def parse(model: type[Model], data: object, file: str = "") -> Model:
+    """Validate ``data``; raise :class:`InvalidInput` with every fault, each naming ``file``."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise InvalidInput(faults_of(error, model, file)) from None
+
+
+def parse_file(model: type[Model], text: str, file: str) -> Model:
+    """Parse one YAML file into ``model``; raise :class:`InvalidInput` with every fault."""
+    try:
+        data = yamlio.load(text)
+    except InvalidInput as error:
+        raise InvalidInput(yamlio.faults_in(error, file)) from None
+    if not isinstance(data, dict):
+        raise InvalidInput(
+            [fault("", f"must be a mapping that starts with apiVersion: {API_VERSION}").within(file)]
+        )
+    return parse(model, data, file)

@@ -1,0 +1,75 @@
+"""The registry: where each chart and image comes from, and in which version.
+
+A chart comes from a folder of the state repo (the default), from an OCI registry or from an HTTP
+chart repository.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints, model_validator
+
+from generator.catalog.model import DnsLabel, FileModel, Frozen
+
+ChartVersion = Annotated[
+    str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
+]
+
+
+class Chart(Frozen):
+    """A Helm chart: exactly one of ``folder``, ``oci`` and ``http`` says where it is."""
+
+    version: ChartVersion
+    folder: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")] | None = None
+    oci: Annotated[str, StringConstraints(pattern=r"^oci://[^\s]+$")] | None = None
+    http: Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$")] | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Chart:
+        given = [name for name in ("folder", "oci", "http") if getattr(self, name)]
+        if len(given) != 1:
+            raise ValueError("needs exactly one of folder, oci and http" + (
+                f", not {' and '.join(given)}" if given else ""
+            ))
+        if self.folder and ".." in self.folder.split("/"):
+            raise ValueError("folder must stay inside the state repo; remove '..'")
+        return self
+
+
+class Image(Frozen):
+    """A container image, pinned by tag, by digest or by both (the digest then decides)."""
+
+    repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")]
+    tag: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")] | None = None
+    digest: Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")] | None = None
+
+    @model_validator(mode="after")
+    def _pinned(self) -> Image:
+        if not (self.tag or self.digest):
+            raise ValueError("needs a tag or a digest; without one the image is not pinned")
+        return self
+
+    def parts(self) -> dict[str, str]:
+        """Return repository, tag and digest as the charts take them (absent ones empty)."""
+        return {
+            "repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""
+        }
+
+    def reference(self) -> str:
+        """Return the image as one reference, by digest where one is given."""
+        return f"{self.repository}@{self.digest}" if self.digest else f"{self.repository}:{self.tag}"
+
+
+class ChartsFile(FileModel):
+    """``registry/charts.yaml``."""
+
+    kind: Literal["Charts"]
+    charts: dict[DnsLabel, Chart]
+
+
+class ImagesFile(FileModel):
+    """``registry/images.yaml``."""
+
+    kind: Literal["Images"]
+    images: dict[DnsLabel, Image]

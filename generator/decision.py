@@ -1,0 +1,176 @@
+"""One demand, decided: from the goal as it came to the files that a commit will hold.
+
+The stages before this one composed into a pure function: parse, admit, book, plan, render. It
+reads the state repo only through the ``read`` it is given and writes nothing, so a dry run, a
+replay on a moved remote and the real thing are the same call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import Literal
+
+from generator.catalog.catalog import Catalog
+from generator.demand import admission, wire
+from generator.demand.claim import Subject
+from generator.demand.request import DemandRequest, Operation
+from generator.errors import Fault, InvalidInput, Refused
+from generator.ledger import ledger as booking
+from generator.ledger.ledger import Changes, Ledger
+from generator.plan.planner import affected, all_keys
+from generator.render import changeset
+from generator.render.changeset import Read, ReleaseChange
+from generator.render.engine import Engine
+
+Stage = Literal["admitted", "booked"]
+Outcome = Literal["booked", "released", "unchanged"]
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What a demand is judged against: the configuration and the books at one commit."""
+
+    catalog: Catalog
+    engine: Engine
+    ledger: Ledger
+
+    @classmethod
+    def of(cls, catalog: Catalog, ledger: Ledger) -> State:
+        """Return a state with a fresh engine for ``catalog``."""
+        return cls(catalog, Engine(catalog.files), ledger)
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What a demand does. ``files`` is empty where it changes nothing."""
+
+    request: DemandRequest
+    outcome: Outcome
+    state: State
+    changes: Changes
+    files: Mapping[str, str | None]
+    releases: tuple[ReleaseChange, ...]
+    warnings: tuple[str, ...]
+
+
+def decide(
+    state: State,
+    goal: object,
+    now: datetime,
+    read: Read,
+    on_stage: Callable[[Stage], None] = lambda stage: None,
+) -> Decision:
+    """Decide a goal of the reference's action.
+
+    Args:
+        state: configuration and books to judge against.
+        goal: the goal as plain data (:mod:`generator.demand.wire`).
+        now: when the demand was received, with time zone.
+        read: gives the text of a file of the state repo as it is, or nothing.
+        on_stage: told when the demand is admitted and when it is booked.
+
+    Raises:
+        Refused: with every fault, named by the wire's fields; nothing is to be written then.
+        InvalidInput: where the state repo's own files keep a valid demand from being rendered.
+    """
+    request = admit(state, goal)
+    on_stage("admitted")
+    try:
+        ledger, changes = booking.apply(state.ledger, request, now)
+        keys = affected(state.ledger, ledger, state.catalog, changes.subjects())
+        made = changeset.of_change(
+            state.ledger, ledger, changes.claims, keys, (state.catalog, state.engine, read)
+        )
+    except Refused as error:
+        raise Refused(_in_wire_words(error.faults, request, state.catalog)) from None
+    on_stage("booked")
+    outcome: Outcome = "unchanged"
+    if changes.claims:
+        outcome = "released" if request.operation is Operation.SHUTDOWN else "booked"
+    return Decision(
+        request=request,
+        outcome=outcome,
+        state=replace(state, ledger=ledger),
+        changes=changes,
+        files=made.files if changes.claims else {},
+        releases=made.releases,
+        warnings=tuple(_uncarried(request, ledger, state.catalog)),
+    )
+
+
+def admit(state: State, goal: object) -> DemandRequest:
+    """Parse a goal and check it against the catalog.
+
+    Raises:
+        Refused: with every fault of form and content together.
+    """
+    request, faults = wire.parse(goal, state.catalog.appdef_by_wire_type)
+    if request is None:
+        raise Refused(faults)
+    told = {found.field for found in faults}
+    content = _in_wire_words(
+        list(admission.faults(request, state.catalog)), request, state.catalog
+    )
+    faults += [found for found in content if not _told(found.field, told)]
+    if faults:
+        raise Refused(dict.fromkeys(faults))
+    return request
+
+
+def consequence(
+    state: State, before: Ledger, subjects: Iterable[Subject], read: Read
+) -> changeset.Changeset:
+    """Return what a change of the books that a person made asks of the rendered files."""
+    keys = affected(before, state.ledger, state.catalog, subjects)
+    return changeset.of_change(before, state.ledger, (), keys, (state.catalog, state.engine, read))
+
+
+def rendered(state: State) -> dict[str, str]:
+    """Return every file below ``clusters/`` that the state asks for."""
+    keys = all_keys(state.ledger, state.catalog)
+    return changeset.render_all(state.ledger, state.catalog, state.engine, keys)
+
+
+def _told(field: str, told: Iterable[str]) -> bool:
+    """Tell whether a field, or one around or inside it, was faulted for its form already."""
+    return any(
+        field == known or field.startswith((f"{known}.", f"{known}["))
+        or known.startswith((f"{field}.", f"{field}["))
+        for known in told
+    )
+
+
+def _in_wire_words(
+    faults: Iterable[Fault], request: DemandRequest, catalog: Catalog
+) -> list[Fault]:
+    return [
+        replace(found, field=wire.wire_field(found.field, request, catalog.appdefs))
+        for found in faults
+    ]
+
+
+def _uncarried(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> Iterator[str]:
+    """Yield a warning for each input that no connection brings to the application's node."""
+    if request.operation is not Operation.JOIN:
+        return
+    for app in request.applications:
+        appdef = catalog.appdefs[app.appdef]
+        at_source = {
+            service.each for service in appdef.services.values() if service.placement == "source"
+        }
+        for role, topics in sorted(app.inputs.items()):
+            for topic in topics:
+                if topic.source == app.node or role in at_source:
+                    continue
+                if not ledger.carries(app.node, topic.topic):
+                    yield (
+                        f"application '{app.id}': no connection carries {role} {topic.topic} of "
+                        f"'{topic.source}' to '{app.node}'"
+                    )
+
+
+def explain(error: InvalidInput) -> str:
+    """Return a refusal as ``<code>: <field>: <remedy>``, one line for each fault."""
+    return "\n".join(f"{found.code}: {found}" for found in error.faults)

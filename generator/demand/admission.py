@@ -1,0 +1,156 @@
+"""Admission: can what is asked be run at all, by this catalog?
+
+Checks a request against appdefs, inventory, brokers and access domains. What is booked already
+does not matter here; that is the ledger's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from generator.catalog.catalog import Catalog
+from generator.catalog.inventory import Broker
+from generator.demand import request as shape
+from generator.demand.request import (
+    ApplicationDemand,
+    ConnectionDemand,
+    ConnectionType,
+    DemandRequest,
+    Operation,
+)
+from generator.errors import Fault, fault, near
+
+SUPPORTED_CONNECTIONS = frozenset({ConnectionType.MQTT})
+"""The connection types that :mod:`generator.render.connections` can write."""
+
+
+def faults(request: DemandRequest, catalog: Catalog) -> Iterator[Fault]:
+    """Yield every reason why ``request`` cannot be honoured, whatever is booked.
+
+    A shutdown is not held to the inventory: what a removed node still holds can be released.
+    """
+    yield from shape.faults(request)
+    joining = request.operation is Operation.JOIN
+    for index, app in enumerate(request.applications):
+        yield from _application(f"applications[{index}]", app, catalog, joining)
+    for index, connection in enumerate(request.connections):
+        yield from _connection(f"connections[{index}]", connection, catalog, joining)
+
+
+def choose_broker(requested: str, source: str, target: str, catalog: Catalog) -> Broker | None:
+    """Return the broker of a connection: the requested one, the target's, the source's, the only.
+
+    Nothing where none of these exists. ``requested`` is a node id or empty.
+    """
+    if requested:
+        return catalog.brokers.get(requested)
+    for node in (target, source):
+        if node in catalog.brokers:
+            return catalog.brokers[node]
+    if len(catalog.brokers) == 1:
+        return next(iter(catalog.brokers.values()))
+    return None
+
+
+def _application(
+    where: str, app: ApplicationDemand, catalog: Catalog, joining: bool
+) -> Iterator[Fault]:
+    appdef = catalog.appdefs.get(app.appdef)
+    if appdef is None:
+        known = ", ".join(
+            f"{known.deployment_request.type} ({known.name})"
+            for known in catalog.appdefs.values()
+            if known.deployment_request
+        )
+        yield fault(
+            f"{where}.appdef",
+            f"{app.appdef.removeprefix('#')} names no application definition; known: {known}",
+            code="unknown-application",
+        )
+    else:
+        for role, topics in app.inputs.items():
+            if role not in appdef.inputs and topics:
+                yield fault(
+                    f"{where}.inputs.{role}",
+                    f"{appdef.name} takes no such input" + near(role, appdef.inputs),
+                )
+        for name in app.parameters:
+            if name not in appdef.parameters:
+                yield fault(
+                    f"{where}.parameters.{name}",
+                    f"{appdef.name} has no such parameter" + near(name, appdef.parameters),
+                )
+    if not joining:
+        return
+    yield from _node(f"{where}.node", app.node, catalog)
+    for role, topics in app.inputs.items():
+        for position, topic in enumerate(topics):
+            yield from _node(f"{where}.inputs.{role}[{position}].source", topic.source, catalog)
+    if appdef is not None and not any(app.inputs.values()):
+        yield fault(
+            f"{where}.inputs",
+            f"is empty; list at least one topic of {' or '.join(sorted(appdef.inputs))}",
+        )
+
+
+def _connection(
+    where: str, connection: ConnectionDemand, catalog: Catalog, joining: bool
+) -> Iterator[Fault]:
+    types = {known.value: known for known in ConnectionType}
+    kind = types.get(connection.type)
+    if kind is None:
+        known = ", ".join(f"{number} ({item.name})" for number, item in types.items())
+        yield fault(
+            f"{where}.type", f"{connection.type} is no connection type; known: {known}",
+            code="unknown-connection-type",
+        )
+    if not joining:
+        return
+    yield from _node(f"{where}.source", connection.source, catalog)
+    yield from _node(f"{where}.target", connection.target, catalog)
+    if kind is None:
+        return
+    if kind not in SUPPORTED_CONNECTIONS:
+        usable = ", ".join(f"{item.value} ({item.name})" for item in SUPPORTED_CONNECTIONS)
+        yield fault(
+            f"{where}.type",
+            f"{kind.value} ({kind.name}) is not carried by this version; use {usable}",
+            code="unsupported-connection-type",
+        )
+        return
+    if choose_broker(connection.broker, connection.source, connection.target, catalog) is None:
+        yield _no_broker(where, connection, catalog)
+
+
+def _no_broker(where: str, connection: ConnectionDemand, catalog: Catalog) -> Fault:
+    known = ", ".join(sorted(catalog.brokers)) or "none"
+    if connection.broker:
+        message = f"no broker runs on '{connection.broker}'; brokers run on: {known}"
+    else:
+        message = (
+            f"is open, and no broker runs on '{connection.target}' or '{connection.source}'; "
+            f"name one of: {known}"
+        )
+    return fault(f"{where}.broker", message, code="no-broker")
+
+
+def _node(where: str, node: str, catalog: Catalog) -> Iterator[Fault]:
+    if not node:
+        return  # told by the request's own checks
+    if node not in catalog.nodes:
+        yield fault(
+            where,
+            f"'{_short(node)}' is not in inventory/nodes.yaml" + near(node, catalog.nodes),
+            code="unknown-node",
+        )
+    elif node not in catalog.domain_of:
+        yield fault(
+            where,
+            f"'{node}' is in no access domain; a platform engineer adds it to "
+            "policy/access-domains.yaml",
+            code="no-access-domain",
+        )
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 80 else text[:77] + "…"

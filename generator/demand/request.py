@@ -1,0 +1,218 @@
+"""One demand request: applications and connections wanted, or no longer wanted.
+
+The same value comes from the ROS 2 action and from YAML (:mod:`generator.demand.wire`). It is
+structurally sound by construction; :func:`faults` says what its contents break, all together.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from types import MappingProxyType
+
+from generator.errors import Fault, fault
+
+MAX_ID = 1024
+"""Characters that an id may have; file and object names are shortened and hashed anyway."""
+
+MAX_TOPIC = 247
+"""Characters of a topic name, ``RMW_TOPIC_MAX_NAME_LENGTH`` of ROS 2's rmw."""
+
+_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
+_BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+
+
+class Operation(Enum):
+    """What a request does to the ledger."""
+
+    JOIN = "join"
+    SHUTDOWN = "shutdown"
+
+
+class ConnectionType(Enum):
+    """How a connection carries its topics; the values are the wire's numbers."""
+
+    ROS = 0
+    MQTT = 1
+    ZENOH = 2
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class InputTopic:
+    """A topic that an application takes in, and the node that publishes it."""
+
+    topic: str
+    source: str
+    type: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ApplicationDemand:
+    """One application of a request. ``appdef`` is empty where the wire's number is unknown."""
+
+    id: str
+    appdef: str
+    node: str
+    requesters: tuple[str, ...]
+    inputs: Mapping[str, tuple[InputTopic, ...]]
+    parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionDemand:
+    """One connection of a request; ``topics`` are pairs of source topic and target topic.
+
+    ``type`` is the wire's number, known or not; ``broker`` is empty where it is left open.
+    """
+
+    id: str
+    type: int
+    source: str
+    target: str
+    topics: tuple[tuple[str, str], ...]
+    broker: str
+    requesters: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DemandRequest:
+    """A whole request: booked as a whole or refused as a whole."""
+
+    id: str
+    operation: Operation
+    applications: tuple[ApplicationDemand, ...] = ()
+    connections: tuple[ConnectionDemand, ...] = ()
+
+    def requesters(self) -> tuple[str, ...]:
+        """Return everybody in whose name something is asked, in the order listed, each once."""
+        subjects = (*self.applications, *self.connections)
+        return tuple(dict.fromkeys(who for subject in subjects for who in subject.requesters))
+
+
+def absolute(topic: str) -> str:
+    """Return a topic name as ROS resolves it in the root namespace: ``scan`` is ``/scan``."""
+    return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
+
+
+def id_problem(value: str) -> str:
+    """Return what is wrong with an id, or nothing.
+
+    Ids name entities of the field, so nearly all text is taken; what could hide from a reader or
+    climb out of a folder is not.
+    """
+    if not value:
+        return "is empty; give an id"
+    if len(value) > MAX_ID:
+        return f"has {len(value)} characters; at most {MAX_ID} are taken"
+    if ".." in value:
+        return f"{_shown(value)} holds '..'; choose an id without it"
+    for char in value:
+        if unicodedata.category(char) in _UNSEEN or char in _BIDI:
+            return (
+                f"{_shown(value)} holds the control character U+{ord(char):04X}; "
+                "choose an id without it"
+            )
+    return ""
+
+
+def topic_problem(name: str) -> str:
+    """Return what ROS 2 forbids in a fully qualified topic name (rmw's validation), or nothing."""
+    if not name:
+        return "is empty; give a topic name"
+    if name.startswith("~"):
+        return f"{_shown(name)} is private to a node; give the full name, starting with '/'"
+    if not _TOPIC.fullmatch(name):
+        return (
+            f"{_shown(name)} is not a topic name that ROS 2 allows; use letters, digits and '_' "
+            "between single '/', no part starting with a digit"
+        )
+    if len(name) > MAX_TOPIC:
+        return f"has {len(name)} characters; ROS 2 takes at most {MAX_TOPIC}"
+    return ""
+
+
+def _shown(value: str) -> str:
+    text = value.encode("unicode_escape").decode() if not value.isprintable() else value
+    return f"'{text if len(text) <= 80 else text[:77] + '…'}'"
+
+
+def faults(request: DemandRequest) -> Iterator[Fault]:
+    """Yield every fault of a request that shows without looking at catalog or ledger."""
+    joining = request.operation is Operation.JOIN
+    if request.id:
+        yield from _id("id", request.id)
+    if not (request.applications or request.connections):
+        yield fault("id", "the request lists no application and no connection; list what it is for")
+    for index, app in enumerate(request.applications):
+        where = f"applications[{index}]"
+        yield from _id(f"{where}.id", app.id)
+        yield from _requesters(f"{where}.requesters", app.requesters)
+        if joining or app.node:
+            yield from _id(f"{where}.node", app.node)
+        for role, topics in app.inputs.items():
+            for position, topic in enumerate(topics):
+                yield from _input(f"{where}.inputs.{role}[{position}]", topic, joining)
+    for index, connection in enumerate(request.connections):
+        yield from _connection(f"connections[{index}]", connection, joining)
+
+
+def _input(where: str, topic: InputTopic, joining: bool) -> Iterator[Fault]:
+    problem = topic_problem(topic.topic)
+    if problem:
+        yield fault(f"{where}.topic", problem)
+    if joining or topic.source:
+        yield from _id(f"{where}.source", topic.source)
+    if topic.type:
+        yield from _id(f"{where}.type", topic.type)
+
+
+def _connection(where: str, connection: ConnectionDemand, joining: bool) -> Iterator[Fault]:
+    yield from _id(f"{where}.id", connection.id)
+    yield from _requesters(f"{where}.requesters", connection.requesters)
+    for end in ("source", "target"):
+        node = getattr(connection, end)
+        if joining or node:
+            yield from _id(f"{where}.{end}", node)
+    if connection.broker:
+        yield from _id(f"{where}.broker", connection.broker)
+    if joining and not connection.topics:
+        yield fault(
+            f"{where}.topics", "is empty; a connection carries at least one topic, list it"
+        )
+    targets: dict[str, str] = {}
+    for index, (source, target) in enumerate(connection.topics):
+        for side, name in (("source", source), ("target", target)):
+            problem = topic_problem(name)
+            if problem:
+                yield fault(f"{where}.topics[{index}].{side}", problem)
+        if targets.setdefault(source, target) != target:
+            yield fault(
+                f"{where}.topics[{index}].target",
+                f"'{source}' goes to '{targets[source]}' and to '{target}'; one source topic has "
+                "one target, use a second connection",
+            )
+        if connection.source == connection.target and source == target:
+            yield fault(
+                f"{where}.topics[{index}].target",
+                f"'{target}' would feed itself, for source and target are both "
+                f"'{connection.source}'; name another target node or topic",
+            )
+
+
+def _id(where: str, value: str) -> Iterator[Fault]:
+    problem = id_problem(value)
+    if problem:
+        yield fault(where, problem)
+
+
+def _requesters(where: str, requesters: Iterable[str]) -> Iterator[Fault]:
+    empty = True
+    for index, requester in enumerate(requesters):
+        empty = False
+        yield from _id(f"{where}[{index}]", requester)
+    if empty:
+        yield fault(where, "is empty; say for whom this is asked")

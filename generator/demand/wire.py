@@ -1,0 +1,228 @@
+"""The reference's ``DeploymentRequest`` goal as plain data, parsed into a :class:`DemandRequest`.
+
+The ROS 2 node and ``demandops request FILE`` both come through :func:`parse`, so a file is judged
+exactly as a message is. Absent fields take ROS's defaults, enums are integers, unknown fields are
+errors. Faults name the wire's own fields (``apps[0].header.node_id``).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from generator.catalog.appdef import ApplicationDefinition
+from generator.catalog.model import Frozen, faults_of
+from generator.demand.request import (
+    ApplicationDemand,
+    ConnectionDemand,
+    DemandRequest,
+    InputTopic,
+    Operation,
+    absolute,
+)
+from generator.errors import Fault, fault
+
+Uint8 = Annotated[int, Field(ge=0, le=255)]
+AppdefByType = Callable[[int], ApplicationDefinition | None]
+AppdefByName = Mapping[str, ApplicationDefinition]
+
+
+class WireTopic(Frozen):
+    """``application_manager_interfaces/msg/Topic``."""
+
+    topic_name: str = ""
+    source_node_id: str = ""
+    type: str = ""
+
+
+class WireHeader(Frozen):
+    """``application_manager_interfaces/msg/ApplicationHeader``."""
+
+    id: str = ""
+    node_id: str = ""
+
+
+class WireBody(Frozen):
+    """``application_manager_interfaces/msg/ObjectDetectionFusionApp``."""
+
+    requester_ids: list[str] = []
+    ego_data_topics: list[WireTopic] = []
+    pointcloud_topics: list[WireTopic] = []
+
+
+class WireApplication(Frozen):
+    """``application_manager_interfaces/msg/Application``."""
+
+    header: WireHeader = WireHeader()
+    type: Uint8 = 0
+    object_detection_fusion_app: WireBody = WireBody()
+
+
+class WireConnection(Frozen):
+    """``application_manager_interfaces/msg/Connection``."""
+
+    id: str = ""
+    broker_node_id: str = ""
+    requester_ids: list[str] = []
+    source_node_id: str = ""
+    source_topics: list[str] = []
+    target_node_id: str = ""
+    target_topics: list[str] = []
+    type: Uint8 = 0
+
+
+class WireGoal(Frozen):
+    """``application_manager_interfaces/action/DeploymentRequest``, the goal."""
+
+    apps: list[WireApplication] = []
+    connections: list[WireConnection] = []
+    id: str = ""
+    shutdown: bool = False
+
+
+_BODY = "object_detection_fusion_app"
+_INPUT = re.compile(r"^applications\[(\d+)\]\.inputs\.(\w+)(\[\d+\])?(.*)$")
+_WIRE_NAMES = (
+    (re.compile(r"^applications(\[\d+\])\.id$"), r"apps\1.header.id"),
+    (re.compile(r"^applications(\[\d+\])\.node$"), r"apps\1.header.node_id"),
+    (re.compile(r"^applications(\[\d+\])\.requesters"), rf"apps\1.{_BODY}.requester_ids"),
+    (re.compile(r"^applications(\[\d+\])\.appdef$"), r"apps\1.type"),
+    (re.compile(r"^(connections\[\d+\])\.requesters"), r"\1.requester_ids"),
+    (re.compile(r"^(connections\[\d+\])\.(source|target)$"), r"\1.\2_node_id"),
+    (re.compile(r"^(connections\[\d+\])\.broker$"), r"\1.broker_node_id"),
+    (re.compile(r"^(connections\[\d+\])\.topics(\[\d+\])\.(source|target)$"), r"\1.\3_topics\2"),
+    (re.compile(r"^(connections\[\d+\])\.topics$"), r"\1.source_topics"),
+)
+
+
+def parse(
+    data: object, appdef_by_type: AppdefByType
+) -> tuple[DemandRequest | None, list[Fault]]:
+    """Parse a goal given as plain data.
+
+    Args:
+        data: the goal as a mapping, as ``ros2 action send_goal`` takes it.
+        appdef_by_type: the appdef that the wire's number names, or nothing.
+
+    Returns:
+        The request and the faults of its form. Where a field has the wrong form it is left out
+        and the rest is parsed all the same, so that the caller can report further faults with
+        these; a request with faults must not be booked. No request where ``data`` is no mapping.
+    """
+    if not isinstance(data, dict):
+        return None, [fault("", "a request is a mapping with id, apps, connections and shutdown")]
+    goal, faults = _sound_part(data)
+    request = DemandRequest(
+        id=goal.id,
+        operation=Operation.SHUTDOWN if goal.shutdown else Operation.JOIN,
+        applications=tuple(_application(app, appdef_by_type(app.type)) for app in goal.apps),
+        connections=tuple(_connection(connection) for connection in goal.connections),
+    )
+    for index, connection in enumerate(goal.connections):
+        sources, targets = len(connection.source_topics), len(connection.target_topics)
+        if sources != targets:
+            faults.append(
+                fault(
+                    f"connections[{index}].target_topics",
+                    f"has {targets} names for {sources} in source_topics; source topic i goes to "
+                    "target topic i, so list as many of each",
+                )
+            )
+    return request, faults
+
+
+def _sound_part(data: dict[str, Any]) -> tuple[WireGoal, list[Fault]]:
+    """Return what of ``data`` has the right form, and the faults of the rest."""
+    try:
+        return WireGoal.model_validate(data), []
+    except ValidationError as error:
+        faults = faults_of(error, WireGoal)
+        pruned = data
+        # from the back, so that removing a list's item leaves the places before it as they are
+        locations = sorted((item["loc"] for item in error.errors()), key=_place, reverse=True)
+        for location in locations:
+            pruned = _without(pruned, location)
+        return WireGoal.model_validate(pruned), faults
+
+
+def _place(location: tuple[int | str, ...]) -> tuple[tuple[int, str], ...]:
+    return tuple((part, "") if isinstance(part, int) else (-1, part) for part in location)
+
+
+def _without(data: Any, location: tuple[int | str, ...]) -> Any:  # noqa: ANN401
+    head, *rest = location
+    if isinstance(data, list) and isinstance(head, int):
+        inner = [_without(data[head], tuple(rest))] if rest else []
+        return [*data[:head], *inner, *data[head + 1 :]]
+    if isinstance(data, dict) and head in data:
+        if rest:
+            return {**data, head: _without(data[head], tuple(rest))}
+        return {key: value for key, value in data.items() if key != head}
+    return data
+
+
+def _application(app: WireApplication, appdef: ApplicationDefinition | None) -> ApplicationDemand:
+    body = app.object_detection_fusion_app
+    wire_names: Mapping[str, str] = (
+        appdef.deployment_request.inputs if appdef and appdef.deployment_request else {}
+    )
+    inputs: dict[str, tuple[InputTopic, ...]] = {}
+    for name in ("ego_data_topics", "pointcloud_topics"):
+        topics: list[WireTopic] = getattr(body, name)
+        role = wire_names.get(name)
+        if role and topics:
+            inputs[role] = (*inputs.get(role, ()), *_topics(topics))
+        elif topics:
+            inputs[name] = _topics(topics)
+    return ApplicationDemand(
+        id=app.header.id,
+        appdef=appdef.name if appdef else f"#{app.type}",
+        node=app.header.node_id,
+        requesters=tuple(dict.fromkeys(body.requester_ids)),
+        inputs=MappingProxyType(inputs),
+    )
+
+
+def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
+    return tuple(
+        InputTopic(absolute(topic.topic_name), topic.source_node_id, topic.type)
+        for topic in topics
+    )
+
+
+def _connection(connection: WireConnection) -> ConnectionDemand:
+    pairs = zip(connection.source_topics, connection.target_topics, strict=False)
+    return ConnectionDemand(
+        id=connection.id,
+        type=connection.type,
+        source=connection.source_node_id,
+        target=connection.target_node_id,
+        topics=tuple((absolute(source), absolute(target)) for source, target in pairs),
+        broker=connection.broker_node_id,
+        requesters=tuple(dict.fromkeys(connection.requester_ids)),
+    )
+
+
+def wire_field(path: str, request: DemandRequest, appdefs: AppdefByName) -> str:
+    """Return the wire's name for a field of ``request``.
+
+    ``applications[0].node`` is ``apps[0].header.node_id`` in the message, and a role is the topic
+    list that the appdef says it comes from.
+    """
+    for pattern, replacement in _WIRE_NAMES:
+        if pattern.match(path):
+            path = pattern.sub(replacement, path)
+            break
+    match = _INPUT.match(path)
+    if not match:
+        return path
+    app, role, place, leaf = match.groups()
+    appdef = appdefs.get(request.applications[int(app)].appdef)
+    wire = appdef.deployment_request.inputs if appdef and appdef.deployment_request else {}
+    names: Mapping[str, str] = {wire_role: name for name, wire_role in wire.items()}
+    leaf = {".topic": ".topic_name", ".source": ".source_node_id"}.get(leaf, leaf)
+    return f"apps[{app}].{_BODY}.{names.get(role, role)}{place or ''}{leaf}"

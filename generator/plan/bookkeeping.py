@@ -1,0 +1,75 @@
+"""Bookkeeping: for each service and connection, who requests it.
+
+The view of the paper's Table III, column 4, derived from claims; nothing stores it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from generator.catalog.catalog import Catalog
+from generator.demand.claim import SubjectKind
+from generator.ledger.ledger import Ledger
+from generator.plan.planner import all_keys, connection_topics, plan
+from generator.plan.release import ServiceRelease
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceEntry:
+    """Who requests one service, and what it takes in (role → sorted topics)."""
+
+    applications: tuple[str, ...]
+    service: str
+    node: str
+    source: str | None
+    source_topic: str | None
+    inputs: dict[str, list[str]]
+    requesters: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionEntry:
+    """Who requests one connection, and which source topics it carries."""
+
+    source: str
+    target: str
+    topics: tuple[str, ...]
+    requesters: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Bookkeeping:
+    """The whole view: services by release name, connections by id, both sorted."""
+
+    services: dict[str, ServiceEntry]
+    connections: dict[str, ConnectionEntry]
+
+
+def bookkeeping(ledger: Ledger, catalog: Catalog) -> Bookkeeping:
+    """Return who requests what."""
+    services = {}
+    for key in all_keys(ledger, catalog):
+        release = plan(ledger, catalog, key)
+        if isinstance(release, ServiceRelease):
+            services[release.name] = ServiceEntry(
+                applications=release.applications,
+                service=release.key.service,
+                node=release.node.id,
+                source=release.key.source,
+                source_topic=release.key.topic,
+                inputs={
+                    role: sorted({topic.topic for topic in topics})
+                    for role, topics in release.inputs.items()
+                },
+                requesters=release.requesters,
+            )
+    connections = {}
+    for id in ledger.subjects(SubjectKind.CONNECTION):
+        claims = ledger.connection(id)
+        connections[id] = ConnectionEntry(
+            source=claims[0].source,
+            target=claims[0].target,
+            topics=tuple(connection_topics(claims)),
+            requesters=tuple(sorted({who for claim in claims for who in claim.requesters})),
+        )
+    return Bookkeeping(services=dict(sorted(services.items())), connections=connections)

@@ -1,0 +1,280 @@
+"""From claims to releases.
+
+:func:`affected` names what a change of claims may have touched, :func:`plan` derives just those
+releases: the cost of a demand does not grow with the number of others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+from generator.catalog.appdef import ApplicationDefinition, Service
+from generator.catalog.catalog import Catalog
+from generator.catalog.inventory import AccessDomain, Node
+from generator.demand.admission import choose_broker
+from generator.demand.claim import ApplicationClaim, ConnectionClaim, Subject, SubjectKind
+from generator.demand.request import ConnectionType, InputTopic
+from generator.errors import Refused, fault
+from generator.ledger.ledger import Ledger
+from generator.plan import naming, parameters, scaling
+from generator.plan.release import ConnectionEnd, Release, ServiceKey, ServiceRelease
+
+Side = Literal["source", "target"]
+
+
+@dataclass(frozen=True, slots=True)
+class EndKey:
+    """One end of a connection."""
+
+    connection: str
+    side: Side
+
+
+ReleaseKey = ServiceKey | EndKey
+
+
+def keys_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
+    """Yield what must run because ``subject`` is held."""
+    if subject.kind is SubjectKind.CONNECTION:
+        if ledger.of(subject):
+            yield EndKey(subject.id, "source")
+            yield EndKey(subject.id, "target")
+        return
+    claims = ledger.application(subject.id)
+    if not claims:
+        return
+    appdef = catalog.appdefs.get(claims[0].appdef)
+    for name, service in (appdef.services if appdef else {}).items():
+        if service.each is None:
+            yield ServiceKey(name, claims[0].node, application=subject.id)
+            continue
+        topics = {
+            (topic.source, topic.topic)
+            for claim in claims
+            for topic in claim.inputs.get(service.each, ())
+        }
+        for source, topic in sorted(topics):
+            node = source if service.placement == "source" else claims[0].node
+            yield ServiceKey(name, node, source=source, topic=topic)
+
+
+def affected(
+    before: Ledger, after: Ledger, catalog: Catalog, subjects: Iterable[Subject]
+) -> tuple[ReleaseKey, ...]:
+    """Return every release that a change of ``subjects`` may have added, altered or removed."""
+    keys = (
+        key
+        for subject in subjects
+        for ledger in (before, after)
+        for key in keys_of(ledger, catalog, subject)
+    )
+    return tuple(dict.fromkeys(keys))
+
+
+def all_keys(ledger: Ledger, catalog: Catalog) -> tuple[ReleaseKey, ...]:
+    """Return every release that the ledger asks for."""
+    subjects = [Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)]
+    return tuple(dict.fromkeys(key for s in subjects for key in keys_of(ledger, catalog, s)))
+
+
+def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
+    """Return the release at ``key``, or nothing where no claim needs it.
+
+    Raises:
+        Refused: where claims contradict each other in a parameter, or what a claim names is no
+            longer in the catalog.
+    """
+    if isinstance(key, EndKey):
+        return _end(ledger, catalog, key)
+    return _service(ledger, catalog, key)
+
+
+def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceRelease | None:
+    if key.application is not None:
+        claims = ledger.application(key.application)
+        users = (key.application,)
+    else:
+        users = tuple(
+            application
+            for application in ledger.taking(str(key.source), str(key.topic))
+            if key in keys_of(ledger, catalog, Subject(SubjectKind.APPLICATION, application))
+        )
+        claims = tuple(claim for user in users for claim in ledger.application(user))
+    if not claims:
+        return None
+    appdef = _appdef(catalog, claims[0].appdef)
+    service = appdef.services[key.service]
+    node, domain = _place(catalog, key.node)
+    if service.each is not None:
+        claims = tuple(claim for claim in claims if _takes(claim, service.each, key))
+        inputs = {service.each: _shared_input(claims, service.each, key)}
+    else:
+        inputs = _application_inputs(catalog, appdef, service, claims)
+    values: dict[str, object] = {}
+    for name in sorted({claim.appdef for claim in claims}):
+        of_appdef = [claim for claim in claims if claim.appdef == name]
+        values |= parameters.merged(_appdef(catalog, name), of_appdef)
+    return ServiceRelease(
+        key=key,
+        name=service_name(catalog, service, key),
+        node=node,
+        domain=domain,
+        appdef=min(
+            name for name, known in catalog.appdefs.items()
+            if known.services.get(key.service) == service
+        ),
+        service=service,
+        inputs=MappingProxyType(inputs),
+        outputs=MappingProxyType(_outputs(catalog, service, key)),
+        parameters=MappingProxyType(values),
+        replicas=scaling.replicas(service.scaling, sum(map(len, inputs.values()))),
+        applications=users,
+        requesters=_requesters(claims),
+    )
+
+
+def _requesters(claims: Iterable[ApplicationClaim | ConnectionClaim]) -> tuple[str, ...]:
+    return tuple(sorted({who for claim in claims for who in claim.requesters}))
+
+
+def _takes(claim: ApplicationClaim, role: str, key: ServiceKey) -> bool:
+    return any(
+        (topic.source, topic.topic) == (key.source, key.topic)
+        for topic in claim.inputs.get(role, ())
+    )
+
+
+def _shared_input(
+    claims: Iterable[ApplicationClaim], role: str, key: ServiceKey
+) -> tuple[InputTopic, ...]:
+    types = {
+        topic.type
+        for claim in claims
+        for topic in claim.inputs.get(role, ())
+        if (topic.source, topic.topic) == (key.source, key.topic) and topic.type
+    }
+    return (InputTopic(str(key.topic), str(key.source), min(types, default="")),)
+
+
+def _application_inputs(
+    catalog: Catalog,
+    appdef: ApplicationDefinition,
+    service: Service,
+    claims: tuple[ApplicationClaim, ...],
+) -> dict[str, tuple[InputTopic, ...]]:
+    inputs: dict[str, tuple[InputTopic, ...]] = {}
+    for role, origin in sorted(service.inputs.items()):
+        producer_name, _, output = origin.partition(".")
+        if not output:
+            inputs[role] = _united(claims, origin)
+            continue
+        producer = appdef.services[producer_name]
+        found = set()
+        for topic in _united(claims, str(producer.each)):
+            node = topic.source if producer.placement == "source" else claims[0].node
+            key = ServiceKey(producer_name, node, source=topic.source, topic=topic.topic)
+            found.add(InputTopic(_outputs(catalog, producer, key)[output], topic.source))
+        inputs[role] = tuple(sorted(found))
+    return inputs
+
+
+def _united(claims: Iterable[ApplicationClaim], role: str) -> tuple[InputTopic, ...]:
+    types: dict[tuple[str, str], set[str]] = {}
+    for claim in claims:
+        for topic in claim.inputs.get(role, ()):
+            types.setdefault((topic.topic, topic.source), set()).add(topic.type)
+    return tuple(InputTopic(*key, max(found)) for key, found in sorted(types.items()))
+
+
+def service_name(catalog: Catalog, service: Service, key: ServiceKey) -> str:
+    """Return the release name of a service instance.
+
+    A source's usual topic (``topics`` of its inventory entry) needs no mention:
+    ``od-edge-vehicle00``. Others carry a slug of the topic.
+    """
+    if key.application is not None:
+        return naming.object_name(service.prefix, key.application)
+    source, topic = str(key.source), str(key.topic)
+    if _is_usual(catalog, service, source, topic):
+        return naming.object_name(service.prefix, key.node, source)
+    return naming.object_name(service.prefix, key.node, source, topic)
+
+
+def _is_usual(catalog: Catalog, service: Service, source: str, topic: str) -> bool:
+    node = catalog.nodes.get(source)
+    return node is not None and node.topics.get(str(service.each)) == topic
+
+
+def _outputs(catalog: Catalog, service: Service, key: ServiceKey) -> dict[str, str]:
+    if key.application is not None:
+        instance = naming.topic_part(key.application)
+    elif _is_usual(catalog, service, str(key.source), str(key.topic)):
+        instance = naming.topic_part(str(key.source))
+    else:
+        instance = naming.topic_part(str(key.source), str(key.topic))
+    return {
+        name: pattern.replace("{instance}", instance)
+        for name, pattern in sorted(service.outputs.items())
+    }
+
+
+def _end(ledger: Ledger, catalog: Catalog, key: EndKey) -> ConnectionEnd | None:
+    claims = ledger.connection(key.connection)
+    if not claims:
+        return None
+    first = claims[0]
+    wanted = next((claim.broker for claim in claims if claim.broker), "")
+    broker = choose_broker(wanted, first.source, first.target, catalog)
+    if broker is None:
+        raise Refused([
+            fault("broker", f"connection '{key.connection}' finds no broker; add one to "
+                  "inventory/brokers.yaml", code="no-broker")
+        ])
+    own, peer = (first.source, first.target) if key.side == "source" else (
+        first.target, first.source
+    )
+    node, domain = _place(catalog, own)
+    prefix = first.type.name.lower()
+    channel = naming.object_name(prefix, key.connection)
+    return ConnectionEnd(
+        connection=key.connection,
+        type=ConnectionType(first.type),
+        side=key.side,
+        name=naming.object_name(prefix, key.connection, key.side),
+        node=node,
+        peer=peer,
+        domain=domain,
+        broker=broker,
+        topics=MappingProxyType(connection_topics(claims)),
+        channel=channel,
+    )
+
+
+def connection_topics(claims: Iterable[ConnectionClaim]) -> dict[str, str]:
+    """Return source topic → target topic, united over a connection's claims and sorted."""
+    return dict(sorted({s: t for claim in claims for s, t in claim.topics.items()}.items()))
+
+
+def _appdef(catalog: Catalog, name: str) -> ApplicationDefinition:
+    appdef = catalog.appdefs.get(name)
+    if appdef is None:
+        raise Refused([
+            fault("appdef", f"'{name}' is in use, but appdefs/{name} is gone; restore it",
+                  code="unknown-application")
+        ])
+    return appdef
+
+
+def _place(catalog: Catalog, node_id: str) -> tuple[Node, AccessDomain]:
+    """Return the node and its access domain: where a release goes."""
+    node, domain = catalog.nodes.get(node_id), catalog.domain_of.get(node_id)
+    if node is None or domain is None:
+        missing = "inventory/nodes.yaml" if node is None else "any access domain"
+        raise Refused([
+            fault("node", f"'{node_id}' is in use, but not in {missing}; restore it",
+                  code="unknown-node")
+        ])
+    return node, domain

@@ -1,0 +1,143 @@
+"""What a decision changes in the state repo: files by path, and releases in words.
+
+Rendering gives text, this compares it with what is there: a file that would be written with the
+bytes it has already does not appear, so an unchanged release costs no commit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from generator.catalog.catalog import Catalog
+from generator.errors import Refused
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import ClaimChange, Ledger
+from generator.plan.planner import ReleaseKey, plan
+from generator.plan.release import Release, ServiceRelease
+from generator.render import flux
+from generator.render.check import check_files
+from generator.render.engine import Engine
+
+Read = Callable[[str], str | None]
+"""Returns the text of a file of the state repo, or nothing where there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseChange:
+    """One release that starts, changes or stops, and in what."""
+
+    name: str
+    change: Literal["start", "change", "stop"]
+    what: str
+    details: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Changeset:
+    """Files to write (``None``: to remove) and the releases behind them."""
+
+    files: Mapping[str, str | None]
+    releases: tuple[ReleaseChange, ...]
+
+
+def of_change(
+    before: Ledger,
+    after: Ledger,
+    claims: Iterable[ClaimChange],
+    keys: Iterable[ReleaseKey],
+    world: tuple[Catalog, Engine, Read],
+) -> Changeset:
+    """Return what it takes to get from one ledger to the other.
+
+    Args:
+        before, after: the ledgers.
+        claims: the claims that differ.
+        keys: the releases that may differ (:func:`generator.plan.planner.affected`).
+        world: the catalog, its engine and how to read the state repo as it is.
+
+    Raises:
+        Refused, InvalidInput: where a release cannot be planned or rendered.
+    """
+    catalog, engine, read = world
+    files: dict[str, str | None] = {
+        ledger_format.path_of(change.key): ledger_format.write(change.after)
+        if change.after
+        else None
+        for change in claims
+    }
+    releases = []
+    for key in keys:
+        old, new = _plan_leniently(before, catalog, key), plan(after, catalog, key)
+        old_path = flux.path_of(old) if old else None
+        new_path = flux.path_of(new) if new else None
+        if old_path and old_path != new_path and read(old_path) is not None:
+            files[old_path] = None
+        text = flux.render(new, catalog, engine) if new else None
+        standing = read(new_path) if new_path else None
+        if new_path and text != standing:
+            files[new_path] = text
+        if text is not None and text == standing:
+            continue
+        if old or new:
+            releases.append(_described(old, new, standing is not None))
+    check_files(files)
+    return Changeset(files=files, releases=tuple(sorted(releases, key=_order)))
+
+
+def render_all(ledger: Ledger, catalog: Catalog, engine: Engine, keys: Iterable[ReleaseKey]
+               ) -> dict[str, str]:
+    """Return every generated file below ``clusters/`` that ledger and catalog ask for."""
+    files = flux.standing_files(catalog, engine)
+    for key in keys:
+        release = plan(ledger, catalog, key)
+        if release is not None:
+            files[flux.path_of(release)] = flux.render(release, catalog, engine)
+    return files
+
+
+def _plan_leniently(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
+    """Plan what stood; where that is no longer possible there is nothing to compare with."""
+    try:
+        return plan(ledger, catalog, key)
+    except Refused:
+        return None
+
+
+def _order(change: ReleaseChange) -> tuple[int, str]:
+    return ["start", "change", "stop"].index(change.change), change.name
+
+
+def _described(old: Release | None, new: Release | None, stood: bool) -> ReleaseChange:
+    release = new or old
+    assert release is not None  # noqa: S101 - the caller has one of them
+    if isinstance(release, ServiceRelease):
+        what = f"{release.key.service} on {release.node.id}"
+        what += f" for {release.key.source or release.key.application}"
+    else:
+        what = f"{release.type.name} {release.side} of connection {release.connection}"
+        what += f" on {release.node.id}"
+    kind: Literal["start", "change", "stop"] = "stop" if not new else "start"
+    if new and stood:
+        kind = "change"
+    details = _differences(old, new) if kind == "change" else ()
+    return ReleaseChange(release.name, kind, what, details)
+
+
+def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
+    before, after = _facts(old), _facts(new)
+    gone = [f"- {fact}" for fact in before if fact not in after]
+    come = [f"+ {fact}" for fact in after if fact not in before]
+    return (*gone, *come)
+
+
+def _facts(release: Release | None) -> list[str]:
+    if release is None:
+        return []
+    if isinstance(release, ServiceRelease):
+        facts = [f"{role} {t.topic}" for role, topics in release.inputs.items() for t in topics]
+        facts += [f"{name} = {value}" for name, value in release.parameters.items()]
+        return [*facts, f"replicas {release.replicas}"]
+    topics = [f"topic {source} to {target}" for source, target in release.topics.items()]
+    return [*topics, f"broker {release.broker.node}"]

@@ -1,0 +1,359 @@
+"""The one use case: submit a demand, get a receipt when it is published.
+
+One worker thread owns the state repo. Demands that arrive together are committed one by one and
+published once; a lone one at once. Everything received is in the outbox first, so a crash loses
+nothing, and when the remote has moved the demands themselves are judged again on the new tip.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import threading
+import uuid
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Literal
+
+from generator import settings
+from generator.decision import Decision, Outcome, decide
+from generator.errors import (
+    DemandOpsError,
+    InvalidInput,
+    QueueFull,
+    Refused,
+    ShuttingDown,
+    StateRepoError,
+    Withdrawn,
+)
+from generator.staterepo import history, remote, snapshot as snapshots, writer
+from generator.staterepo.outbox import Entry, Slot
+from generator.staterepo.remote import PushDenied, RemoteAway, StateRepository
+from generator.staterepo.snapshot import Progress, Snapshot
+
+log = logging.getLogger("demandops")
+
+Stage = Literal["admitted", "booked", "committed", "pushed"]
+Listener = Callable[[Stage, str], None]
+
+_FIRST_PAUSE_S = 0.05
+_LONGEST_PAUSE_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Receipt:
+    """What came of a demand: the commit that holds it is published and durable.
+
+    ``commit`` is the tip where the demand changed nothing.
+    """
+
+    operation: str
+    request_id: str
+    outcome: Outcome
+    commit: str
+    warnings: tuple[str, ...] = ()
+    not_held: tuple[str, ...] = ()
+
+
+@dataclass(eq=False)
+class Ticket:
+    """A demand under way. ``future`` gives its receipt, or raises why there is none."""
+
+    operation: str
+    goal: Any
+    received: datetime
+    listener: Listener
+    future: Future[Receipt] = field(default_factory=Future)
+    base: str = ""
+    state: Literal["waiting", "committed", "withdrawn", "done"] = "waiting"
+    told: set[str] = field(default_factory=set)
+
+
+class Generator:
+    """Takes demands from any thread and turns them into commits of one state repo."""
+
+    def __init__(
+        self,
+        state_repo: str,
+        *,
+        data: Path | None = None,
+        queue_limit: int = settings.QUEUE_LIMIT,
+        progress: Progress = lambda done, total: None,
+    ) -> None:
+        """Open the state repo and start the worker; what an earlier run left over comes first.
+
+        Raises:
+            StateRepoError, InvalidInput: where the state repo cannot be used.
+        """
+        self._slot = Slot(data or settings.data_home(state_repo))
+        try:
+            self._repository = remote.connect(state_repo, self._slot.folder, log.info)
+            self._snapshot, self._tip = writer.first_snapshot(self._repository, progress)
+        except BaseException:
+            self._slot.close()
+            raise
+        self._queue: deque[Ticket] = deque()
+        self._queue_limit = queue_limit
+        self._changed = threading.Condition()
+        self._tickets: dict[str, Ticket] = {}
+        self._stopping = False
+        self._giving_up = threading.Event()
+        for entry in self._slot.outbox.pending.values():
+            log.info("taking up demand %s from the outbox", entry.operation)
+            self._enqueue(_ticket_of(entry))
+        self._worker = threading.Thread(target=self._run, name="demandops-writer", daemon=True)
+        self._worker.start()
+
+    @property
+    def address(self) -> str:
+        """The state repo, without secrets."""
+        return self._repository.address
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The newest published state; safe to read from any thread."""
+        return self._snapshot
+
+    def submit(
+        self,
+        goal: object,
+        operation: str | None = None,
+        listener: Listener = lambda stage, text: None,
+    ) -> Ticket:
+        """Hand in a demand; returns at once.
+
+        Args:
+            goal: the reference's action goal as plain data (:mod:`generator.demand.wire`).
+            operation: a unique id for this hand-in; one is made where it is left out.
+            listener: told each stage, from the worker thread.
+
+        Returns:
+            A ticket whose future gives the :class:`Receipt`, or raises ``Refused`` with every
+            fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``.
+
+        Raises:
+            ShuttingDown, QueueFull: where the demand is not taken at all.
+        """
+        ticket = Ticket(operation or str(uuid.uuid4()), goal, _now(), listener)
+        with self._changed:
+            if self._stopping:
+                raise ShuttingDown("the generator is shutting down; send the demand again later")
+            if len(self._queue) >= self._queue_limit:
+                raise QueueFull(
+                    f"{self._queue_limit} demands are waiting already; send it again later"
+                )
+            ticket.base = str(self._snapshot.commit)
+            self._enqueue(ticket)
+        return ticket
+
+    def _enqueue(self, ticket: Ticket) -> None:
+        with self._changed:
+            self._queue.append(ticket)
+            self._tickets[ticket.operation] = ticket
+            self._changed.notify()
+
+    def withdraw(self, operation: str) -> bool:
+        """Take a demand back. False once it is committed, or was never known."""
+        with self._changed:
+            ticket = self._tickets.get(operation)
+            if ticket is None or ticket.state != "waiting":
+                return ticket is not None and ticket.state == "withdrawn"
+            ticket.state = "withdrawn"
+        return True
+
+    def close(self, timeout: float | None = None) -> bool:
+        """Finish what is in hand and stop. Further demands are refused.
+
+        Args:
+            timeout: seconds to wait for a remote that is away; then what is left stays in the
+                outbox for the next start, and its futures raise ``ShuttingDown``.
+
+        Returns:
+            Whether everything was published.
+        """
+        with self._changed:
+            self._stopping = True
+            self._changed.notify()
+        self._worker.join(timeout)
+        self._giving_up.set()
+        self._worker.join()
+        finished = not self._slot.outbox.pending
+        self._slot.close()
+        return finished
+
+    # ---- the worker thread ----
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._queue and not self._stopping:
+                    self._changed.wait()
+                if not self._queue:
+                    return
+            batch: list[Ticket] = []
+            try:
+                self._settle(batch)
+            except ShuttingDown as error:
+                self._fail(batch, error, keep=True)
+            except DemandOpsError as error:
+                self._fail(batch, error)
+            except Exception as error:
+                log.exception("a fault of the generator")
+                fault = StateRepoError(f"a fault of the generator: {error!r}; its log says more")
+                self._fail(batch, fault)
+
+    def _take_up(self, batch: list[Ticket]) -> None:
+        """Move what waits into the batch, journaled before anything is done with it."""
+        with self._changed:
+            fresh = list(self._queue)
+            self._queue.clear()
+        self._slot.outbox.append(
+            Entry(ticket.operation, ticket.goal, ticket.received.isoformat(), ticket.base)
+            for ticket in fresh
+            if ticket.operation not in self._slot.outbox.pending
+        )
+        batch += fresh
+
+    def _settle(self, batch: list[Ticket]) -> None:
+        """Take up what waits and bring it to an end, however often the remote moves."""
+        pause = _FIRST_PAUSE_S
+        verdict_is_current = self._repository.always_current
+        while True:
+            self._take_up(batch)
+            try:
+                line = self._line()
+                results = [(ticket, self._judge(line, ticket)) for ticket in batch]
+                nothing_to_push = line.head.commit == line.start.commit
+                if nothing_to_push and not verdict_is_current:
+                    # only a push would have shown that the remote has moved
+                    verdict_is_current = True
+                    if self._repository.refresh() != line.start.commit:
+                        continue
+                if line.publish():
+                    self._snapshot, self._tip = line.head, line.head.commit
+                    self._answer(batch, results)
+                    return
+                log.info("the state repo has moved; judging %d demands again", len(batch))
+                self._repository.refresh()
+                pause = min(pause, 1.0)
+            except RemoteAway as error:
+                log.warning("%s; trying again in %.1f s", error, pause)
+            if self._giving_up.wait(pause * random.uniform(0.5, 1.0)):  # noqa: S311 - no secret
+                raise ShuttingDown(
+                    "the remote is away; the demand stays in the outbox for the next start"
+                )
+            pause = min(pause * 2, _LONGEST_PAUSE_S)
+
+    def _line(self) -> writer.Line:
+        """Start a line on the newest tip that is known, people's changes taken in."""
+        tip = self._repository.tip()
+        before = self._snapshot
+        if tip == before.commit:
+            return writer.Line(self._repository, before)
+        advance = snapshots.advance(self._repository.objects, before, tip)
+        for found in advance.snapshot.problems:
+            log.error("%s (its last valid version stays in force)", found)
+        line = writer.Line(self._repository, advance.snapshot)
+        try:
+            line.follow(advance, before, _now())
+        except InvalidInput as error:
+            log.error("what people changed up to %s cannot be carried out: %s", tip, error)
+        else:
+            return line
+        return writer.Line(self._repository, advance.snapshot)
+
+    def _judge(self, line: writer.Line, ticket: Ticket) -> Receipt | DemandOpsError:
+        if ticket.state == "withdrawn":
+            return Withdrawn("the demand was taken back before it was committed")
+        if ticket.base != str(line.start.commit):
+            arrived = self._arrived(line.start, ticket)
+            if arrived:
+                return Receipt(ticket.operation, _request_id(ticket.goal), "booked", arrived)
+        try:
+            decision = decide(
+                line.head.state, ticket.goal, ticket.received, line.read,
+                lambda stage: self._tell(ticket, stage, stage),
+            )
+        except InvalidInput as error:
+            return error
+        with self._changed:  # from here on it cannot be taken back
+            if ticket.state == "withdrawn":
+                return Withdrawn("the demand was taken back before it was committed")
+            ticket.state = "committed"
+        return self._commit(line, ticket, decision)
+
+    def _commit(self, line: writer.Line, ticket: Ticket, decision: Decision) -> Receipt:
+        if decision.files:
+            commit = line.commit(decision, ticket.operation, ticket.received, _now())
+            self._tell(ticket, "committed", f"committed {commit}")
+        else:
+            commit = str(line.head.commit)
+        return Receipt(
+            operation=ticket.operation,
+            request_id=decision.request.id,
+            outcome=decision.outcome,
+            commit=commit,
+            warnings=decision.warnings,
+            not_held=decision.changes.not_held,
+        )
+
+    def _arrived(self, start: Snapshot, ticket: Ticket) -> str | None:
+        """Return the commit of a demand that was published before the connection was cut."""
+        found = history.operations_since(self._repository.objects, start.commit, ticket.base)
+        ticket.base = str(start.commit)
+        return found.get(ticket.operation)
+
+    def _answer(
+        self, batch: list[Ticket], results: list[tuple[Ticket, Receipt | DemandOpsError]]
+    ) -> None:
+        self._slot.outbox.done(ticket.operation for ticket in batch)
+        for ticket, result in results:
+            self._forget(ticket)
+            if isinstance(result, Receipt):
+                self._tell(ticket, "pushed", f"pushed {result.commit}")
+                ticket.future.set_result(result)
+            else:
+                ticket.future.set_exception(result)
+        batch.clear()
+
+    def _fail(self, batch: list[Ticket], error: DemandOpsError, keep: bool = False) -> None:
+        """Answer every demand of a batch with an error; ``keep`` leaves them in the outbox."""
+        if not keep:
+            self._slot.outbox.done(ticket.operation for ticket in batch)
+        for ticket in batch:
+            self._forget(ticket)
+            ticket.future.set_exception(error)
+
+    def _forget(self, ticket: Ticket) -> None:
+        with self._changed:
+            ticket.state = "done"
+            self._tickets.pop(ticket.operation, None)
+
+    def _tell(self, ticket: Ticket, stage: Stage, text: str) -> None:
+        """Tell a stage once, also where a demand is judged again."""
+        if stage in ticket.told:
+            return
+        ticket.told.add(stage)
+        try:
+            ticket.listener(stage, text)
+        except Exception:
+            log.exception("a listener failed")
+
+
+def _ticket_of(entry: Entry) -> Ticket:
+    received = datetime.fromisoformat(entry.received)
+    ticket = Ticket(entry.operation, entry.goal, received, lambda stage, text: None)
+    ticket.base = entry.base
+    return ticket
+
+
+def _request_id(goal: object) -> str:
+    return str(goal.get("id", "")) if isinstance(goal, dict) else ""
+
+
+def _now() -> datetime:
+    return datetime.now(timezone.utc)

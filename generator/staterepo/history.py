@@ -1,0 +1,115 @@
+"""Reading the state repo's history: what the log says, and which commits are the generator's.
+
+Everything is in commit messages and trailers, so plain git says the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+
+import pygit2
+from pygit2 import Commit, Oid, Repository
+from pygit2.enums import SortMode
+
+from generator.errors import StateRepoError
+from generator.staterepo.snapshot import commit_of
+
+
+@dataclass(frozen=True, slots=True)
+class LogEntry:
+    """One commit of the state repo, as its message tells it."""
+
+    commit: str
+    time: datetime
+    author: str
+    summary: str
+    trailers: dict[str, list[str]]
+
+    def one(self, key: str) -> str:
+        """Return the first value of a trailer, or nothing."""
+        return next(iter(self.trailers.get(key, ())), "")
+
+    @property
+    def by_generator(self) -> bool:
+        """Tell whether the generator made the commit, so that its files fit its books."""
+        return "Render-Version" in self.trailers
+
+
+def trailers_of(message: str) -> dict[str, list[str]]:
+    """Return the trailers of a commit message: the lines ``Key: value`` of its last paragraph."""
+    found: dict[str, list[str]] = {}
+    paragraph = message.rstrip("\n").rsplit("\n\n", 1)
+    if len(paragraph) < 2:
+        return found
+    for line in paragraph[1].split("\n"):
+        key, colon, value = line.partition(": ")
+        if not colon or " " in key:
+            return {}
+        found.setdefault(key, []).append(value)
+    return found
+
+
+def entry_of(commit: Commit) -> LogEntry:
+    """Return what a commit says."""
+    return LogEntry(
+        commit=str(commit.id),
+        time=datetime.fromtimestamp(commit.commit_time, tz=timezone.utc),
+        author=commit.author.name,
+        summary=commit.message.split("\n", 1)[0],
+        trailers=trailers_of(commit.message),
+    )
+
+
+def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> Iterator[LogEntry]:
+    """Yield the commits from ``tip`` back, newest first, without those that ``until`` has too."""
+    walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
+    if until is not None:
+        walker.hide(commit_of(repo, until).id)
+    for commit in walker:
+        yield entry_of(commit)
+
+
+def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, str]:
+    """Return operation id → commit of every demand that arrived after ``base``.
+
+    Where ``base`` is not known here (a remote that was laid anew), all of history is read.
+    """
+    try:
+        known = bool(base) and repo.descendant_of(tip, base)
+    except (pygit2.GitError, KeyError, ValueError):
+        known = False
+    until = base if known else None
+    if str(tip) == base:
+        return {}
+    found = {}
+    for entry in walk(repo, tip, until):
+        operation = entry.one("Operation-Id")
+        if operation:
+            found[operation] = entry.commit
+    return found
+
+
+def last_generated(repo: Repository, tip: Oid) -> Oid | None:
+    """Return the newest commit of the generator on the first-parent line, or nothing."""
+    commit: Commit | None = commit_of(repo, tip)
+    while commit is not None:
+        if entry_of(commit).by_generator:
+            return commit.id
+        commit = commit.parents[0] if commit.parents else None
+    return None
+
+
+def revisions(repo: Repository, tip: str | Oid, spec: str) -> list[str]:
+    """Return the commits that ``REV`` or ``A..B`` names, oldest first.
+
+    Raises:
+        StateRepoError: where a side is no commit.
+    """
+    first, dots, last = spec.partition("..")
+    if not dots:
+        return [str(commit_of(repo, first or tip).id)]
+    if not first:
+        raise StateRepoError(f"'{spec}' has no start; write A..B")
+    return [entry.commit for entry in walk(repo, last or tip, first)][::-1]

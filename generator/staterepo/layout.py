@@ -1,0 +1,87 @@
+"""``demandops init``: a new state repo from the skeleton, with everything rendered once."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+
+import pygit2
+
+from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.decision import State, rendered
+from generator.errors import StateRepoError
+from generator.ledger.ledger import Ledger
+from generator.settings import MAIN_BRANCH, RENDER_VERSION, data_folder
+from generator.staterepo import message, tree as trees
+
+
+def files(skeleton: Path | None = None, appdefs: Path | None = None) -> dict[str, str]:
+    """Return every file of a new state repo by path: skeleton, appdefs and what they render to."""
+    found = _read(skeleton or data_folder("skeleton"), "")
+    found |= _read(appdefs or data_folder("appdefs"), "appdefs/")
+    catalog = load({p: text for p, text in found.items() if p.split("/")[0] in CONFIG_ROOTS})
+    return found | rendered(State.of(catalog, Ledger()))
+
+
+def _read(folder: Path, prefix: str) -> dict[str, str]:
+    return {
+        prefix + path.relative_to(folder).as_posix(): path.read_text()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.suffix != ".pyc" and path.name != "__init__.py"
+    }
+
+
+def init(target: Path, now: datetime, *, bare: bool, gitops: str) -> str:
+    """Make a state repo and return its first commit.
+
+    Args:
+        target: a folder that does not exist or is empty.
+        now: the time of the commit.
+        bare: whether to make a bare repository, which the generator can use in place.
+        gitops: which controller reads it.
+
+    Raises:
+        StateRepoError: where the folder is in use. Nothing is written then.
+    """
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise StateRepoError(
+            f"{target} exists and is not empty; name a new folder (nothing was changed)"
+        )
+    content = _chosen(files(), gitops)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        commit = _write(partial, content, now, bare)
+        if target.exists():
+            target.rmdir()
+        partial.rename(target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return commit
+
+
+def _chosen(content: Mapping[str, str], gitops: str) -> dict[str, str]:
+    root = content["demandops.yaml"].replace("gitops: flux", f"gitops: {gitops}")
+    return {**content, "demandops.yaml": root}
+
+
+def _write(folder: Path, content: Mapping[str, str], now: datetime, bare: bool) -> str:
+    repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
+    repo.config["core.fsync"] = "committed"  # what is pushed here is on the disk when told so
+    repo.config["core.fsyncObjectFiles"] = True  # the same, for a git before 2.36
+    tree = trees.write(repo, None, content)
+    text = (
+        "Lay down the state repo\n\n"
+        "Why: `demandops init` made it from the skeleton. README.md says what each folder holds.\n\n"
+        f"Operation: init\nRender-Version: {RENDER_VERSION}\n"
+    )
+    signature = message.generator_signature(now)
+    commit = repo.create_commit(
+        f"refs/heads/{MAIN_BRANCH}", signature, signature, text, tree, []
+    )
+    if not bare:
+        repo.checkout_head(strategy=pygit2.enums.CheckoutStrategy.FORCE)
+    return str(commit)

@@ -1,0 +1,265 @@
+"""Where the state repo is: a bare repository on this disk, or anything that Git can clone.
+
+Both give a pygit2 repository to read and write objects in and one way to publish a commit, which
+succeeds only on top of what was there: never a forced push, never a merge of texts.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+
+import git
+import pygit2
+from pygit2 import Oid, Repository
+
+from generator.errors import StateRepoError
+from generator.settings import MAIN_BRANCH
+
+_MAIN = f"refs/heads/{MAIN_BRANCH}"
+_REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
+_URL = re.compile(r"^([a-z][a-z0-9+.-]*://|[^/\s]+@[^/\s:]+:|[A-Za-z0-9.-]+:[^/\\])")
+_ALLOWED = re.compile(r"^(https?|ssh|git|file|git\+ssh)://")
+_PASSWORD = re.compile(r"(://)[^/@\s]*@")
+_HAS_PASSWORD = re.compile(r"://[^/@\s]*:[^/@\s]*@")
+_MOVED = ("non-fast-forward", "fetch first", "stale info", "cannot lock ref", "failed to update ref",
+          "remote rejected", "incorrect old value")
+_ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
+
+Say = Callable[[str], None]
+
+
+class RemoteAway(StateRepoError):
+    """The remote did not answer; what is kept in the outbox goes there when it is back."""
+
+
+class PushDenied(StateRepoError):
+    """The remote answers and takes no push (a hook, a protected branch, missing rights)."""
+
+
+def without_secrets(text: str) -> str:
+    """Return ``text`` with the user part of every URL taken out: it may hold a password."""
+    return _PASSWORD.sub(r"\1", text)
+
+
+class StateRepository(ABC):
+    """A state repo: objects to read and write, and a tip that moves forward only."""
+
+    objects: Repository
+    address: str
+
+    @abstractmethod
+    def tip(self) -> Oid:
+        """Return the newest published commit that is known here, without asking anybody."""
+
+    @abstractmethod
+    def refresh(self) -> Oid:
+        """Ask where the state repo is now and return its newest commit.
+
+        Raises:
+            RemoteAway: where it cannot be reached.
+        """
+
+    @abstractmethod
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Make ``commit`` the tip if the tip is ``expected``, durably; else return false.
+
+        Raises:
+            RemoteAway, PushDenied: where it could not be published for another reason.
+        """
+
+    @property
+    @abstractmethod
+    def always_current(self) -> bool:
+        """Tell whether :meth:`tip` can never be behind (a repository on this disk)."""
+
+
+class EmbeddedRepository(StateRepository):
+    """A bare repository on this disk, written in place and fsynced."""
+
+    def __init__(self, path: Path) -> None:
+        self.address = str(path)
+        try:
+            self.objects = Repository(str(path))
+        except pygit2.GitError:
+            raise StateRepoError(
+                f"{path} is no Git repository; make one with `demandops init {path} --bare`"
+            ) from None
+        if not self.objects.is_bare:
+            _refuse_checked_out(path)
+        if _MAIN not in self.objects.references:
+            raise StateRepoError(
+                f"{path} has no branch '{MAIN_BRANCH}'; make a state repo with "
+                "`demandops init DIR --bare`"
+            )
+
+    def tip(self) -> Oid:
+        """Return the branch's commit, read anew: others may write here too."""
+        target = self.objects.references[_MAIN].target
+        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
+        return target
+
+    def refresh(self) -> Oid:
+        """Return the tip; it is never behind."""
+        return self.tip()
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Move the branch if it still is at ``expected`` (checked under Git's own lock)."""
+        reference = self.objects.references[_MAIN]
+        if reference.target != expected:
+            return False
+        try:
+            reference.set_target(commit, "demandops")
+        except pygit2.GitError:
+            return False  # another writer holds the lock or was first: judge anew
+        return True
+
+    @property
+    def always_current(self) -> bool:
+        """Say yes: there is no copy that could be behind."""
+        return True
+
+
+def _refuse_checked_out(path: Path) -> None:
+    with git.Repo(path) as repo:
+        heads = [
+            line.removeprefix("branch ")
+            for line in repo.git.worktree("list", "--porcelain").splitlines()
+            if line.startswith("branch ")
+        ]
+    if _MAIN in heads:
+        raise StateRepoError(
+            f"{path} has '{MAIN_BRANCH}' checked out, and its files would fall behind the commits; "
+            f"use a bare clone: git clone --bare {path} {path}.git"
+        )
+
+
+class ClonedRepository(StateRepository):
+    """A bare clone of a remote; clone, fetch and push run git itself, with the user's set-up."""
+
+    def __init__(self, url: str, folder: Path, say: Say) -> None:
+        if not _ALLOWED.match(url) and "://" in url:
+            scheme = url.split("://")[0]
+            raise StateRepoError(
+                f"'{scheme}://' is no way to reach a state repo; use https, ssh, git or file"
+            )
+        if _HAS_PASSWORD.search(url):
+            raise StateRepoError(
+                "the state repo's address holds a password, which process lists would show; leave "
+                "it out and give it to git by a credential helper, ~/.netrc or an SSH key"
+            )
+        self.address = without_secrets(url)
+        self._url = url
+        self._folder = folder
+        if not self._is_sound():
+            self._clone(say)
+        self._git = git.Repo(folder)
+        self.objects = Repository(str(folder))
+        self.refresh()
+
+    def _is_sound(self) -> bool:
+        """Tell whether the clone of an earlier run can be used (a crash may have cut it off)."""
+        try:
+            repo = Repository(str(self._folder))
+            target = repo.references[_REMOTE_MAIN].target
+            return isinstance(repo[target], pygit2.Commit)  # type: ignore[index]
+        except (pygit2.GitError, KeyError):
+            return False
+
+    def _clone(self, say: Say) -> None:
+        say(f"cloning {self.address}")
+        if self._folder.exists():
+            shutil.rmtree(self._folder)
+        self._folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = self._folder.with_name(self._folder.name + ".partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        with git.Repo.init(partial, bare=True) as repo:
+            with repo.config_writer() as config:
+                config.set_value('remote "origin"', "url", self._url)
+                config.set_value('remote "origin"', "fetch", f"+{_MAIN}:{_REMOTE_MAIN}")
+            partial.joinpath("config").chmod(0o600)
+            self._fetch(repo)
+        partial.rename(self._folder)
+
+    def _fetch(self, repo: git.Repo) -> None:
+        try:
+            with repo.git.custom_environment(**_ENVIRONMENT):
+                repo.git.fetch("origin", "--no-tags", "--quiet", kill_after_timeout=120)
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+            if "couldn't find remote ref" in text:
+                raise StateRepoError(
+                    f"{self.address} has no branch '{MAIN_BRANCH}'; push one made by "
+                    "`demandops init DIR`"
+                ) from None
+            raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
+
+    def tip(self) -> Oid:
+        """Return the remote's commit as of the last fetch or push."""
+        target = self.objects.references[_REMOTE_MAIN].target
+        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
+        return target
+
+    def refresh(self) -> Oid:
+        """Fetch and return the remote's commit."""
+        self._fetch(self._git)
+        return self.tip()
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Push ``commit``; the remote takes it only on top of what it has."""
+        try:
+            with self._git.git.custom_environment(**_ENVIRONMENT):
+                self._git.git.push(
+                    "origin", f"{commit}:{_MAIN}", "--porcelain", "--quiet", kill_after_timeout=120
+                )
+        except git.GitCommandError as error:
+            text = without_secrets(f"{error.stdout}\n{error.stderr}")
+            if self.refresh() != expected:
+                return self.objects.descendant_of(self.tip(), commit) or self.tip() == commit
+            if any(sign in text for sign in _MOVED) and "hook declined" not in text:
+                return False
+            if "rejected" in text or "denied" in text or "403" in text:
+                raise PushDenied(f"{self.address} takes no push: {_last_line(text)}") from None
+            raise RemoteAway(f"{self.address} cannot be pushed to: {_last_line(text)}") from None
+        self.objects.references.create(_REMOTE_MAIN, commit, force=True)
+        return True
+
+    @property
+    def always_current(self) -> bool:
+        """Say no: the remote may have moved since the last fetch."""
+        return False
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
+    fatal = [line for line in lines if line.startswith(("fatal:", "error:", "remote:", "!"))]
+    return (fatal or lines or ["git gave no reason"])[-1]
+
+
+def is_url(address: str) -> bool:
+    """Tell a Git URL (``https://…``, ``ssh://…``, ``user@host:path``) from a folder."""
+    return bool(_URL.match(address)) and not Path(address).exists()
+
+
+def connect(address: str, folder: Path, say: Say = lambda text: None) -> StateRepository:
+    """Open the state repo at ``address``.
+
+    Args:
+        address: a folder with a bare repository, or any URL that git clones.
+        folder: where the clone of a URL is kept.
+        say: told about work that takes a while.
+
+    Raises:
+        StateRepoError: saying what is wrong with the address and how to mend it.
+    """
+    if is_url(address):
+        return ClonedRepository(address, folder / "clone.git", say)
+    path = Path(address).expanduser()
+    if not path.is_dir():
+        raise StateRepoError(
+            f"{address} does not exist; make a state repo with `demandops init {address} --bare`"
+        )
+    return EmbeddedRepository(path)

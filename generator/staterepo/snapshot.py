@@ -1,0 +1,200 @@
+"""What a commit of the state repo says: catalog and ledger, loaded whole or brought forward.
+
+Loading costs what is there, :func:`advance` what changed. A file that a person broke keeps its
+last valid version in force and is reported; nothing else stops for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import pygit2
+from pygit2 import Commit, Oid, Repository, Tree
+from rpds import HashTrieMap
+
+from generator.catalog.catalog import CONFIG_ROOTS, Catalog, load as load_catalog
+from generator.decision import State
+from generator.demand.claim import ClaimKey, Subject
+from generator.errors import Fault, InvalidInput, StateRepoError
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger
+from generator.staterepo import tree as trees
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """A commit and what it says.
+
+    ``keys`` finds the claim behind a ledger file, so that a removed file is understood.
+    ``problems`` are files that are not valid and whose last valid version is in force.
+    """
+
+    commit: Oid
+    state: State
+    keys: HashTrieMap[str, ClaimKey]
+    problems: tuple[Fault, ...] = ()
+
+    def after(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
+        """Return the snapshot of a commit of our own, whose state is known already."""
+        keys = self.keys
+        for key in changes:
+            path = ledger_format.path_of(key)
+            if state.ledger.get(key) is not None:
+                keys = keys.insert(path, key)
+            elif path in keys:
+                keys = keys.remove(path)
+        return replace(self, commit=commit, state=state, keys=keys)
+
+
+@dataclass(frozen=True, slots=True)
+class Advance:
+    """A snapshot brought forward: what people or other writers changed on the way."""
+
+    snapshot: Snapshot
+    subjects: tuple[Subject, ...]
+    catalog_changed: bool
+
+
+def commit_of(repo: Repository, revision: str | Oid) -> Commit:
+    """Return a commit by any name that Git knows.
+
+    Raises:
+        StateRepoError: where there is none.
+    """
+    try:
+        found = repo[revision] if isinstance(revision, Oid) else repo.revparse_single(revision)
+        return found.peel(Commit)
+    except (KeyError, ValueError, pygit2.GitError):
+        raise StateRepoError(
+            f"'{revision}' is no commit of the state repo; `demandops log` lists them"
+        ) from None
+
+
+def load(
+    repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
+) -> Snapshot:
+    """Load a commit whole.
+
+    Args:
+        progress: told (files read, files in all) while the ledger is read.
+
+    Raises:
+        InvalidInput: with every fault of every file.
+        StateRepoError: where the commit holds no state repo.
+    """
+    commit = commit_of(repo, revision)
+    catalog = catalog_at(commit.tree)
+    ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
+    if faults:
+        raise InvalidInput(faults)
+    return Snapshot(commit.id, State.of(catalog, ledger), keys)
+
+
+def catalog_at(tree: Tree) -> Catalog:
+    """Return the catalog of one tree.
+
+    Raises:
+        StateRepoError: where it is no state repo.
+        InvalidInput: with every fault of every file.
+    """
+    files = trees.texts(tree, CONFIG_ROOTS)
+    if "demandops.yaml" not in files:
+        raise StateRepoError(
+            "this is no state repo, for it has no demandops.yaml; `demandops init DIR` makes one"
+        )
+    return load_catalog(files)
+
+
+def _ledger_at(
+    repo: Repository, tree: Tree, progress: Progress
+) -> tuple[Ledger, HashTrieMap[str, ClaimKey], list[Fault]]:
+    paths = [
+        (path, blob) for path, blob in _ledger_files(tree) if ledger_format.kind_of(path)
+    ]
+    ledger, faults = Ledger(), list[Fault]()
+    keys: HashTrieMap[str, ClaimKey] = HashTrieMap()
+    for done, (path, blob) in enumerate(paths):
+        if done % 200 == 0:
+            progress(done, len(paths))
+        try:
+            claim = ledger_format.read(_text(repo, blob), path)
+        except InvalidInput as error:
+            faults += error.faults
+            continue
+        ledger = ledger.replace(claim.key, claim)
+        keys = keys.insert(path, claim.key)
+    progress(len(paths), len(paths))
+    return ledger, keys, faults
+
+
+def _ledger_files(tree: Tree) -> Iterable[tuple[str, Oid]]:
+    root = ledger_format.LEDGER_ROOT
+    if root in tree and isinstance(tree[root], Tree):
+        yield from trees.entries(tree[root], f"{root}/")  # type: ignore[arg-type]
+
+
+def _text(repo: Repository, blob: Oid) -> str:
+    return repo[blob].data.decode("utf-8", "replace")  # type: ignore[attr-defined,no-any-return]
+
+
+def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
+    """Bring a snapshot forward to another commit, reading only what differs.
+
+    What is not valid there is left as it was before, and told in the new snapshot's problems.
+    """
+    before, after = commit_of(repo, snapshot.commit).tree, commit_of(repo, to).tree
+    state, problems, catalog_changed = snapshot.state, list[Fault](), False
+    if any(_id(before, root) != _id(after, root) for root in CONFIG_ROOTS) or snapshot.problems:
+        try:
+            catalog = catalog_at(after)
+            catalog_changed = catalog != state.catalog
+            state = State(catalog, State.of(catalog, state.ledger).engine, state.ledger)
+        except (InvalidInput, StateRepoError) as error:
+            problems += _as_faults(error)
+    ledger, keys, subjects = state.ledger, snapshot.keys, list[Subject]()
+    seen = set()
+    for path, blob in trees.differences(
+        repo, _subtree(before, "ledger"), _subtree(after, "ledger"), "ledger/"
+    ):
+        if ledger_format.kind_of(path) is None:
+            continue
+        seen.add(path)
+        known = keys.get(path)
+        if blob is None:
+            if known is not None:
+                ledger = ledger.replace(known, None)
+                subjects.append(known.subject)
+                keys = keys.remove(path)
+            continue
+        try:
+            claim = ledger_format.read(_text(repo, blob), path)
+        except InvalidInput as error:
+            problems += error.faults
+            continue
+        if ledger.get(claim.key) != claim:
+            ledger = ledger.replace(claim.key, claim)
+            subjects.append(claim.subject)
+        keys = keys.insert(path, claim.key)
+    problems += [p for p in snapshot.problems if p.file.startswith("ledger/") and p.file not in seen]
+    state = replace(state, ledger=ledger)
+    return Advance(
+        Snapshot(to, state, keys, tuple(problems)), tuple(dict.fromkeys(subjects)), catalog_changed
+    )
+
+
+def _as_faults(error: InvalidInput | StateRepoError) -> list[Fault]:
+    if isinstance(error, InvalidInput):
+        return list(error.faults)
+    return [Fault("invalid", "", str(error))]
+
+
+def _subtree(tree: Tree, name: str) -> Tree | None:
+    entry = tree[name] if name in tree else None
+    return entry if isinstance(entry, Tree) else None
+
+
+def _id(tree: Tree, name: str) -> Oid | None:
+    return tree[name].id if name in tree else None

@@ -1,0 +1,119 @@
+"""The writer: a line of commits on top of a snapshot, published together or laid anew.
+
+Each demand is one commit with its ledger and rendered files. :class:`Line` holds what is committed
+here and not yet published; when the remote has moved it is dropped and the demands are judged
+again on the new tip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+
+from pygit2 import Oid, Signature
+
+from generator.decision import Decision, State, consequence, rendered
+from generator.render.changeset import Changeset, ReleaseChange
+from generator.staterepo import history, message, snapshot as snapshots, tree as trees
+from generator.staterepo.remote import StateRepository
+from generator.staterepo.snapshot import Advance, Progress, Snapshot
+
+
+class Line:
+    """Commits made on top of one published tip, in the order of the demands."""
+
+    def __init__(self, repository: StateRepository, start: Snapshot) -> None:
+        self._repository = repository
+        self._objects = repository.objects
+        self._tree = snapshots.commit_of(self._objects, start.commit).tree
+        self.start = start
+        self.head = start
+
+    def read(self, path: str) -> str | None:
+        """Return a file as it is at the head of the line."""
+        return trees.read_text(self._tree, path)
+
+    def commit(self, decision: Decision, operation: str, received: datetime, now: datetime) -> str:
+        """Commit one demand on top of the line and return the commit's id."""
+        text = message.of_decision(decision, operation, received)
+        made = self._write(decision.files, text, message.author(decision, received), now)
+        keys = [change.key for change in decision.changes.claims]
+        self.head = self.head.after(made, decision.state, keys)
+        return str(made)
+
+    def follow(self, advance: Advance, before: Snapshot, now: datetime) -> str | None:
+        """Commit what people's changes ask of the rendered files, if anything.
+
+        Raises:
+            Refused, InvalidInput: where what they changed cannot be planned or rendered.
+        """
+        state = advance.snapshot.state
+        if advance.catalog_changed:
+            change = self._everything(state)
+        else:
+            change = consequence(state, before.state.ledger, advance.subjects, self.read)
+        if not change.files:
+            return None
+        text = message.of_follow(
+            change.releases, str(advance.snapshot.commit), str(before.commit),
+            advance.snapshot.problems,
+        )
+        made = self._write(change.files, text, message.generator_signature(now), now)
+        self.head = self.head.after(made, state, ())
+        return str(made)
+
+    def _everything(self, state: State) -> Changeset:
+        files: dict[str, str | None] = dict(rendered(state))
+        changes = []
+        standing = {
+            path for path in trees.texts(self._tree, ("clusters",)) if path.endswith(".yaml")
+        }
+        for path in standing - set(files):
+            files[path] = None
+        for path in sorted(files):
+            old = self.read(path)
+            if old == files[path]:
+                del files[path]
+                continue
+            kind = "stop" if files[path] is None else "start" if old is None else "change"
+            name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
+            changes.append(ReleaseChange(name, kind, path, ()))
+        return Changeset(files, tuple(changes))
+
+    def _write(
+        self, files: Mapping[str, str | None], text: str, author: Signature, now: datetime
+    ) -> Oid:
+        tree = trees.write(self._objects, self._tree, files)
+        committer = message.generator_signature(now)
+        made = self._objects.create_commit(
+            None, author, committer, text, tree, [self.head.commit]
+        )
+        self._tree = snapshots.commit_of(self._objects, made).tree
+        return made
+
+    def publish(self) -> bool:
+        """Publish the line; false where the state repo has moved meanwhile.
+
+        Raises:
+            RemoteAway, PushDenied: where it could not be published for another reason.
+        """
+        if self.head.commit == self.start.commit:
+            return True
+        return self._repository.publish(self.start.commit, self.head.commit)
+
+
+def first_snapshot(repository: StateRepository, progress: Progress) -> tuple[Snapshot, Oid]:
+    """Load the books at the generator's last commit, and return them with the tip.
+
+    What people changed since then is taken in by :func:`generator.staterepo.snapshot.advance`,
+    as it would have been had the generator been running.
+
+    Raises:
+        InvalidInput: with every fault, where that commit is not valid.
+        StateRepoError: where this is no state repo.
+    """
+    tip = repository.tip()
+    base = history.last_generated(repository.objects, tip)
+    return snapshots.load(repository.objects, base or tip, progress), tip
+
+

@@ -1,0 +1,151 @@
+"""YAML in and out, strictly and always the same way.
+
+Every file that the program reads passes :func:`load` (duplicate keys, anchors and several
+documents are errors with a line number), every file it writes passes :func:`dump`, whose strings
+mean the same in YAML 1.1 and 1.2: PyYAML, Go's parsers and a person must read one value.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Hashable, Iterator, Mapping
+from typing import Any
+
+import yaml
+
+from generator.errors import Fault, InvalidInput, fault
+
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+_PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*(?:[:@=][A-Za-z0-9_./-]+)*")
+_WORDS = frozenset(
+    "y n yes no on off true false null nan inf infinity none".split()
+)  # some parser somewhere reads one of these as something other than text
+
+_UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
+
+
+class _StrictLoader(_Loader):  # type: ignore[misc]
+    """A safe loader that refuses duplicate keys and leaves dates as text."""
+
+
+def _mapping(loader: Any, node: yaml.MappingNode) -> dict[Hashable, Any]:  # noqa: ANN401
+    seen: dict[Hashable, Any] = {}
+    for key_node, value_node in node.value:
+        key = loader.construct_object(key_node, deep=True)
+        if not isinstance(key, Hashable):
+            raise yaml.constructor.ConstructorError(
+                None, None, "a key must be a plain value", key_node.start_mark
+            )
+        if key in seen:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"the key {key!r} stands twice", key_node.start_mark
+            )
+        seen[key] = loader.construct_object(value_node, deep=True)
+    return seen
+
+
+_StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping)
+_StrictLoader.add_constructor(
+    "tag:yaml.org,2002:timestamp", lambda loader, node: loader.construct_scalar(node)
+)
+
+
+class _PlainDumper(_Dumper):  # type: ignore[misc]
+    """A dumper that never writes anchors and quotes whatever a parser could misread."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        """Say yes always: the same list twice is written out twice."""
+        return True
+
+
+def _text(dumper: Any, text: str) -> yaml.ScalarNode:  # noqa: ANN401
+    tag = "tag:yaml.org,2002:str"
+    if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
+        return dumper.represent_scalar(tag, text)  # type: ignore[no-any-return]
+    style = "|" if _readable_block(text) else '"'
+    return dumper.represent_scalar(tag, text, style=style)  # type: ignore[no-any-return]
+
+
+def _readable_block(text: str) -> bool:
+    """Tell whether a literal block shows ``text`` unchanged (a parameter file in a ConfigMap)."""
+    return (
+        text.endswith("\n")
+        and not text.startswith((" ", "\n"))
+        and text.count("\n") > 1
+        and not re.search(r"[ \t]\n|[^\x20-\x7e\n]", text)
+    )
+
+
+_PlainDumper.add_representer(str, _text)
+
+
+def _mark(error: yaml.YAMLError) -> str:
+    mark = getattr(error, "problem_mark", None)
+    return f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+
+
+def load_all(text: str) -> Iterator[Any]:
+    """Yield the documents of ``text``; raise :class:`InvalidInput` for what is not strict YAML."""
+    try:
+        for event in yaml.parse(text, Loader=_Loader):
+            if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+                where = f"line {event.start_mark.line + 1}"
+                raise InvalidInput(
+                    [fault(where, "anchors and aliases (& and *) are not taken; write it out")]
+                )
+        yield from yaml.load_all(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
+    except yaml.YAMLError as error:
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise InvalidInput([fault(_mark(error), f"not valid YAML: {problem}")]) from error
+    except ValueError as error:  # an impossible number, say
+        raise InvalidInput([fault("", f"not valid YAML: {error}")]) from error
+    except RecursionError:
+        raise InvalidInput([fault("", "not valid YAML: nested too deeply")]) from None
+
+
+def load(text: str) -> Any:  # noqa: ANN401 - raw YAML is parsed into models right behind this
+    """Return the one document of ``text`` (``None`` where it is empty)."""
+    documents = list(load_all(text))
+    if len(documents) > 1:
+        raise InvalidInput([fault("", f"holds {len(documents)} documents; only one is taken")])
+    return documents[0] if documents else None
+
+
+def load_trusted(text: str) -> Any:  # noqa: ANN401
+    """Parse what this program rendered itself, once through the fast parser, unchecked."""
+    return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
+
+
+def dump(data: Mapping[str, Any]) -> str:
+    """Return ``data`` as block YAML in the order given, ending in a newline."""
+    return str(
+        yaml.dump(
+            data,
+            Dumper=_PlainDumper,
+            sort_keys=False,
+            allow_unicode=True,
+            default_flow_style=False,
+            width=4096,
+        )
+    )
+
+
+def scalar(value: object) -> str:
+    """Return ``value`` as JSON that is also YAML: what a template's ``{{ … }}`` writes.
+
+    Characters that YAML does not print are written as ``\\uXXXX``; others stay readable.
+    """
+    text = json.dumps(value, ensure_ascii=False, sort_keys=False, default=_unknown)
+    return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+
+
+def _unknown(value: object) -> object:
+    raise TypeError(f"a template may write text, numbers, lists and mappings, not {type(value)}")
+
+
+def faults_in(error: InvalidInput, file: str) -> list[Fault]:
+    """Return the faults of ``error``, told to be in ``file``."""
+    return [fault.within(file) for fault in error.faults]
