@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timezone
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
 from generator.demand import admission, wire
 from generator.demand.claim import Subject
-from generator.demand.request import DemandRequest, Operation
+from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from generator.errors import Fault, InvalidInput, Refused
 from generator.ledger import ledger as booking
 from generator.ledger.ledger import Changes, Ledger
@@ -174,3 +174,36 @@ def _uncarried(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> Iter
 def explain(error: InvalidInput) -> str:
     """Return a refusal as ``<code>: <field>: <remedy>``, one line for each fault."""
     return "\n".join(f"{found.code}: {found}" for found in error.faults)
+
+
+def rehearse(state: State) -> None:
+    """Render every service of every appdef once, for invented claims on a real node.
+
+    An appdef that nobody has demanded yet is checked before the first demand comes.
+
+    Raises:
+        Refused, InvalidInput: naming the template or the values that do not work.
+    """
+    place = next(iter(sorted(state.catalog.domain_of)), None)
+    if place is None:
+        return
+    for appdef in state.catalog.appdefs.values():
+        request = DemandRequest(
+            id="rehearsal",
+            operation=Operation.JOIN,
+            applications=(
+                ApplicationDemand(
+                    id=f"rehearsal/{appdef.name}",
+                    appdef=appdef.name,
+                    node=place,
+                    requesters=("rehearsal",),
+                    inputs={
+                        role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", place),)
+                        for role in appdef.inputs
+                    },
+                ),
+            ),
+        )
+        ledger, changes = booking.apply(Ledger(), request, datetime.fromtimestamp(0, timezone.utc))
+        keys = affected(Ledger(), ledger, state.catalog, changes.subjects())
+        changeset.render_all(ledger, state.catalog, state.engine, keys)

@@ -14,7 +14,7 @@ from pydantic import Field, StringConstraints, model_validator
 from generator.catalog.model import DnsLabel, FileModel, Frozen, Word
 from generator.errors import near
 
-TopicPattern = Annotated[str, StringConstraints(pattern=r"^(/([A-Za-z_]\w*|\w*\{instance\}\w*))+$")]
+TopicPattern = Annotated[str, StringConstraints(pattern=r"^(/([A-Za-z_]\w*|([A-Za-z_]\w*)?\{instance\}\w*))+$")]
 """A topic name; ``{instance}`` stands for the source or the application that the service is for."""
 
 

@@ -114,7 +114,7 @@ def parse(
         these; a request with faults must not be booked. No request where ``data`` is no mapping.
     """
     if not isinstance(data, dict):
-        return None, [fault("", "a request is a mapping with id, apps, connections and shutdown")]
+        return None, [_no_mapping()]
     goal, faults = _sound_part(data)
     request = DemandRequest(
         id=goal.id,
@@ -133,6 +133,17 @@ def parse(
                 )
             )
     return request, faults
+
+
+def form_faults(data: object) -> list[Fault]:
+    """Return what of ``data`` has not the form of a goal: unknown fields, wrong types."""
+    if not isinstance(data, dict):
+        return [_no_mapping()]
+    return _sound_part(data)[1]
+
+
+def _no_mapping() -> Fault:
+    return fault("", "a request is a mapping with id, apps, connections and shutdown")
 
 
 def _sound_part(data: dict[str, Any]) -> tuple[WireGoal, list[Fault]]:

@@ -84,7 +84,7 @@ class _ApplicationFile(_Claim):
     application: str = Field(min_length=1)
     definition: str
     node: str
-    inputs: dict[str, tuple[_Topic, ...]] = Field(default_factory=dict, strict=False)
+    inputs: dict[str, list[_Topic]] = Field(default_factory=dict)
     parameters: dict[str, Any] = Field(default_factory=dict)
 
 

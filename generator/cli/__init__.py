@@ -1,0 +1,1 @@
+"""The command line: ``demandops``. Formats what the stages return; decides nothing."""

@@ -1,0 +1,189 @@
+"""``demandops request``: book requests from files, without ROS."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import click
+
+from generator import yamlio
+from generator.cli.output import console, errors, output_option, print_json, progress, state_repo_option
+from generator.decision import Decision, decide
+from generator.demand import wire
+from generator.errors import DemandOpsError, Fault, InvalidInput, fault
+from generator.service import Generator, Receipt
+from generator.staterepo import reader
+
+_SIGNS = {"start": "+", "change": "~", "stop": "-"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Document:
+    file: str
+    goal: Any
+
+    @property
+    def request_id(self) -> str:
+        return str(self.goal.get("id", "")) if isinstance(self.goal, dict) else ""
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, metavar="FILE…")
+@state_repo_option
+@click.option("--dry-run", is_flag=True, help="Show the consequence and book nothing.")
+@output_option
+@click.pass_context
+def request(
+    ctx: click.Context, files: tuple[str, ...], state_repo: str, dry_run: bool, output: str
+) -> None:
+    """Book demand requests from files.
+
+    FILE is the action goal of DeploymentRequest as YAML, as `ros2 action send_goal` takes it, or -
+    for standard input. Several files, or documents in one, are taken in order; one that is refused
+    does not stop the next. All are parsed before any is booked.
+    """
+    documents = [document for file in files for document in _documents(file)]
+    if not documents:
+        raise InvalidInput([fault("", "no request in " + ", ".join(files))])
+    faulty = [wire.form_faults(document.goal) for document in documents]
+    if any(faulty):
+        rows = [_unbooked(i, d, found) for i, (d, found) in enumerate(zip(documents, faulty))]
+    elif dry_run:
+        rows = _rehearse(documents, state_repo, output)
+    else:
+        rows = _book(documents, state_repo)
+    if output == "json":
+        print_json(rows)
+    else:
+        _print(rows, documents, dry_run)
+    if any(row["outcome"] == "refused" for row in rows):
+        ctx.exit(1)
+
+
+def _documents(file: str) -> Iterable[_Document]:
+    name = "standard input" if file == "-" else file
+    try:
+        text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InvalidInput([fault("", f"cannot be read: {reason}").within(name)]) from None
+    except UnicodeDecodeError:
+        raise InvalidInput([fault("", "is no UTF-8 text").within(name)]) from None
+    try:
+        return [_Document(name, goal) for goal in yamlio.load_all(text) if goal is not None]
+    except InvalidInput as error:
+        raise InvalidInput(yamlio.faults_in(error, name)) from None
+
+
+def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str, Any]:
+    return {
+        "index": index, "request_id": request_id, "outcome": outcome, "commit": None,
+        "errors": [], "warnings": [], "not_held": [],
+    } | more
+
+
+def _unbooked(index: int, document: _Document, faults: list[Fault]) -> dict[str, Any]:
+    found = faults or [fault("", "not booked, for another request of this call does not parse")]
+    return _row(index, document.request_id, "refused", errors=_errors(found))
+
+
+def _errors(faults: Iterable[Fault]) -> list[dict[str, str]]:
+    return [{"field": found.field, "message": _message(found)} for found in faults]
+
+
+def _message(found: Fault) -> str:
+    return f"{found.file}: {found.message}" if found.file else found.message
+
+
+def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str, Any]:
+    faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
+    return _row(index, document.request_id, "refused", errors=_errors(faults))
+
+
+def _book(documents: list[_Document], state_repo: str) -> list[dict[str, Any]]:
+    with progress("reading the ledger") as tell:
+        generator = Generator(state_repo, progress=tell)
+    try:
+        tickets = [generator.submit(document.goal) for document in documents]
+        rows = []
+        for index, (document, ticket) in enumerate(zip(documents, tickets, strict=True)):
+            try:
+                rows.append(_booked(index, ticket.future.result()))
+            except DemandOpsError as error:
+                rows.append(_refused(index, document, error))
+        return rows
+    finally:
+        generator.close(timeout=0)
+
+
+def _booked(index: int, receipt: Receipt) -> dict[str, Any]:
+    return _row(
+        index,
+        receipt.request_id,
+        receipt.outcome,
+        commit=receipt.commit,
+        warnings=list(receipt.warnings),
+        not_held=list(receipt.not_held),
+    )
+
+
+def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[dict[str, Any]]:
+    """Decide every request on top of the one before, in memory only."""
+    rows = []
+    with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
+        state = repo.snapshot(progress=tell).state
+        standing, written = repo.file_reader(), dict[str, str | None]()
+
+        def read(path: str) -> str | None:
+            return written[path] if path in written else standing(path)
+
+        for index, document in enumerate(documents):
+            try:
+                decision = decide(state, document.goal, datetime.now(timezone.utc), read)
+            except InvalidInput as error:
+                rows.append(_refused(index, document, error))
+                continue
+            state = decision.state
+            written.update(decision.files)
+            if output == "text":
+                _show_consequence(index, decision)
+            rows.append(
+                _row(
+                    index, decision.request.id, decision.outcome,
+                    warnings=list(decision.warnings), not_held=list(decision.changes.not_held),
+                )
+            )
+    return rows
+
+
+def _show_consequence(index: int, decision: Decision) -> None:
+    out = console()
+    out.print(f"Request {index}: '{decision.request.id}' would be {decision.outcome}")
+    for release in decision.releases:
+        out.print(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
+        for detail in release.details:
+            out.print(f"      {detail}")
+    for path, text in sorted(decision.files.items()):
+        out.print(f"  {'remove' if text is None else 'write '} {path}")
+
+
+def _print(rows: list[dict[str, Any]], documents: list[_Document], dry_run: bool) -> None:
+    out = console()
+    for row, document in zip(rows, documents, strict=True):
+        title = f"{document.file}: request {row['index']} '{row['request_id']}'"
+        if row["outcome"] == "refused":
+            errors.print(f"{title} refused")
+            for error in row["errors"]:
+                where = f"{error['field']}: " if error["field"] else ""
+                errors.print(f"  {where}{error['message']}")
+        elif not dry_run:
+            out.print(f"{title} {row['outcome']} in {row['commit']}")
+        for warning in row["warnings"]:
+            errors.print(f"  warning: {warning}")
+        for item in row["not_held"]:
+            errors.print(f"  not held: {item}")

@@ -1,0 +1,185 @@
+"""Looking into a state repo without writing: for the command line's views, a dry run and checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from pygit2 import Commit
+
+from generator import settings
+from generator.catalog.catalog import CONFIG_ROOTS, load as load_catalog
+from generator.decision import State, rendered
+from generator.errors import InvalidInput, StateRepoError, fault
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger
+from generator.render.changeset import Read
+from generator.settings import RENDER_VERSION
+from generator.staterepo import history, remote, snapshot as snapshots, tree as trees
+from generator.staterepo.history import LogEntry
+from generator.staterepo.outbox import Slot
+from generator.staterepo.snapshot import Progress, Snapshot
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether the rendered files of one commit are those that its books and settings give."""
+
+    commit: str
+    summary: str
+    holds: bool
+    skipped: str = ""
+    differing: tuple[str, ...] = ()
+
+
+class Reader:
+    """An open state repo, at its newest commit."""
+
+    def __init__(self, address: str) -> None:
+        """Open the state repo; of a URL a clone is kept, and fetched.
+
+        Raises:
+            StateRepoError: where it cannot be read.
+        """
+        self._slot: Slot | None = None
+        folder = Path()
+        if remote.is_url(address):
+            self._slot = Slot(settings.data_home(address) / "reader")
+            folder = self._slot.folder
+        try:
+            self._repository = remote.connect(address, folder)
+            self._tip = self._repository.refresh()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Give the clone back."""
+        if self._slot is not None:
+            self._slot.close()
+
+    def commit(self, revision: str | None = None) -> str:
+        """Return the id of a commit; the newest where no revision is given."""
+        return str(snapshots.commit_of(self._repository.objects, revision or self._tip).id)
+
+    def snapshot(
+        self, revision: str | None = None, progress: Progress = lambda done, total: None
+    ) -> Snapshot:
+        """Load the books and the configuration at a commit.
+
+        Raises:
+            InvalidInput, StateRepoError: where it holds no valid state repo.
+        """
+        return snapshots.load(self._repository.objects, self.commit(revision), progress)
+
+    def file_reader(self, revision: str | None = None) -> Read:
+        """Return a function that gives the text of a file at a commit."""
+        tree = snapshots.commit_of(self._repository.objects, self.commit(revision)).tree
+        return lambda path: trees.read_text(tree, path)
+
+    def log(self, spec: str | None = None) -> Iterator[LogEntry]:
+        """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
+        first, dots, last = (spec or "").partition("..")
+        if dots:
+            yield from history.walk(self._repository.objects, last or self._tip, first)
+        else:
+            yield from history.walk(self._repository.objects, first or self._tip)
+
+    def revisions(self, spec: str | None) -> list[str]:
+        """Return the commits that ``REV`` or ``A..B`` names, oldest first."""
+        return history.revisions(self._repository.objects, self._tip, spec or str(self._tip))
+
+    def verify(self, revision: str) -> Verdict:
+        """Render the books of a commit again and compare the bytes."""
+        commit = snapshots.commit_of(self._repository.objects, revision)
+        entry = history.entry_of(commit)
+        if not entry.by_generator:
+            return Verdict(entry.commit, entry.summary, True, "made by a person")
+        version = entry.one("Render-Version")
+        if version != str(RENDER_VERSION):
+            return Verdict(
+                entry.commit, entry.summary, True,
+                f"rendered by version {version}, this is version {RENDER_VERSION}",
+            )
+        try:
+            snapshot = snapshots.load(self._repository.objects, commit.id)
+        except InvalidInput as error:
+            return Verdict(entry.commit, entry.summary, False, differing=tuple(
+                str(found) for found in error.faults
+            ))
+        differing = _differing(rendered(snapshot.state), commit)
+        return Verdict(entry.commit, entry.summary, not differing, differing=differing)
+
+
+def _differing(wanted: dict[str, str], commit: Commit) -> tuple[str, ...]:
+    standing = trees.texts(commit.tree, ("clusters",))
+    return tuple(
+        path
+        for path in sorted({*wanted, *standing})
+        if wanted.get(path) != standing.get(path) and not _is_note(path)
+    )
+
+
+def _is_note(path: str) -> bool:
+    """Tell what people may put below ``clusters/`` for themselves: a README is no manifest."""
+    return path.rsplit("/", 1)[-1] == "README.md"
+
+
+def check_folder(folder: Path) -> State:
+    """Check a checked-out state repo: configuration, ledger, and that everything renders.
+
+    Raises:
+        StateRepoError: where it is no state repo.
+        InvalidInput: with every fault that was found, among them generated files that differ
+            from what the books give.
+    """
+    if not (folder / "demandops.yaml").is_file():
+        raise StateRepoError(
+            f"{folder} is no state repo, for it has no demandops.yaml; `demandops init` makes one"
+        )
+    files = dict(_texts(folder))
+    catalog = load_catalog({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
+    ledger, faults = Ledger(), []
+    for path, text in sorted(files.items()):
+        if ledger_format.kind_of(path) is None:
+            continue
+        try:
+            claim = ledger_format.read(text, path)
+        except InvalidInput as error:
+            faults += error.faults
+        else:
+            ledger = ledger.replace(claim.key, claim)
+    if faults:
+        raise InvalidInput(faults)
+    state = State.of(catalog, ledger)
+    wanted = rendered(state)
+    for path in sorted({*wanted, *(p for p in files if p.startswith("clusters/"))}):
+        if wanted.get(path) != files.get(path) and not _is_note(path):
+            faults.append(
+                fault("", "differs from what ledger and configuration give; leave it to the "
+                      "generator, which writes it after the next demand").within(path)
+            )
+    if faults:
+        raise InvalidInput(faults)
+    return state
+
+
+def _texts(folder: Path) -> Iterator[tuple[str, str]]:
+    for root in (*CONFIG_ROOTS, "ledger", "clusters"):
+        top = folder / root
+        paths = [top] if top.is_file() else sorted(top.rglob("*"))
+        for path in paths:
+            if path.is_file():
+                yield path.relative_to(folder).as_posix(), path.read_text(errors="replace")
+
+
+@contextmanager
+def opened(address: str) -> Iterator[Reader]:
+    """Open a state repo for reading and close it again."""
+    reader = Reader(address)
+    try:
+        yield reader
+    finally:
+        reader.close()
