@@ -110,9 +110,7 @@ def admit(state: State, goal: object) -> DemandRequest:
     if request is None:
         raise Refused(faults)
     told = {found.field for found in faults}
-    content = _in_wire_words(
-        list(admission.faults(request, state.catalog)), request, state.catalog
-    )
+    content = _in_wire_words(list(admission.faults(request, state.catalog)), request, state.catalog)
     faults += [found for found in content if not _told(found.field, told)]
     if faults:
         raise Refused(dict.fromkeys(faults))
@@ -136,7 +134,8 @@ def rendered(state: State) -> dict[str, str]:
 def _told(field: str, told: Iterable[str]) -> bool:
     """Tell whether a field, or one around or inside it, was faulted for its form already."""
     return any(
-        field == known or field.startswith((f"{known}.", f"{known}["))
+        field == known
+        or field.startswith((f"{known}.", f"{known}["))
         or known.startswith((f"{field}.", f"{field}["))
         for known in told
     )

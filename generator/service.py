@@ -25,14 +25,14 @@ from generator.errors import (
     DemandOpsError,
     InvalidInput,
     QueueFull,
-    Refused,
     ShuttingDown,
     StateRepoError,
     Withdrawn,
 )
-from generator.staterepo import history, remote, snapshot as snapshots, writer
+from generator.staterepo import history, remote, writer
+from generator.staterepo import snapshot as snapshots
 from generator.staterepo.outbox import Entry, Slot
-from generator.staterepo.remote import PushDenied, RemoteAway, StateRepository
+from generator.staterepo.remote import RemoteAway
 from generator.staterepo.snapshot import Progress, Snapshot
 
 log = logging.getLogger("demandops")
@@ -42,6 +42,8 @@ Listener = Callable[[Stage, str], None]
 
 _FIRST_PAUSE_S = 0.05
 _LONGEST_PAUSE_S = 10.0
+_STOP_TIMEOUT_S = 20.0
+_TAKEN_BACK = "the demand was taken back before it was committed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +98,9 @@ class Generator:
         except BaseException:
             self._slot.close()
             raise
+        self.given_address = state_repo
+        self.queue_limit = queue_limit
         self._queue: deque[Ticket] = deque()
-        self._queue_limit = queue_limit
         self._changed = threading.Condition()
         self._tickets: dict[str, Ticket] = {}
         self._stopping = False
@@ -142,9 +145,9 @@ class Generator:
         with self._changed:
             if self._stopping:
                 raise ShuttingDown("the generator is shutting down; send the demand again later")
-            if len(self._queue) >= self._queue_limit:
+            if len(self._queue) >= self.queue_limit:
                 raise QueueFull(
-                    f"{self._queue_limit} demands are waiting already; send it again later"
+                    f"{self.queue_limit} demands are waiting already; send it again later"
                 )
             ticket.base = str(self._snapshot.commit)
             self._enqueue(ticket)
@@ -165,25 +168,36 @@ class Generator:
             ticket.state = "withdrawn"
         return True
 
-    def close(self, timeout: float | None = None) -> bool:
-        """Finish what is in hand and stop. Further demands are refused.
+    def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
+        """Refuse further demands, finish what is in hand and stop; returns at once.
 
         Args:
             timeout: seconds to wait for a remote that is away; then what is left stays in the
                 outbox for the next start, and its futures raise ``ShuttingDown``.
 
         Returns:
-            Whether everything was published.
+            A future that tells, when all has ended, whether everything was published.
         """
         with self._changed:
             self._stopping = True
             self._changed.notify()
+        finished: Future[bool] = Future()
+        threading.Thread(
+            target=self._end, args=(timeout, finished), name="demandops-stop", daemon=True
+        ).start()
+        return finished
+
+    def _end(self, timeout: float, finished: Future[bool]) -> None:
         self._worker.join(timeout)
         self._giving_up.set()
         self._worker.join()
-        finished = not self._slot.outbox.pending
+        left = len(self._slot.outbox.pending)
         self._slot.close()
-        return finished
+        finished.set_result(not left)
+
+    def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
+        """Stop and wait for the end; return whether everything was published."""
+        return self.stop(timeout).result()
 
     # ---- the worker thread ----
 
@@ -268,23 +282,31 @@ class Generator:
 
     def _judge(self, line: writer.Line, ticket: Ticket) -> Receipt | DemandOpsError:
         if ticket.state == "withdrawn":
-            return Withdrawn("the demand was taken back before it was committed")
+            return Withdrawn(_TAKEN_BACK)
         if ticket.base != str(line.start.commit):
             arrived = self._arrived(line.start, ticket)
             if arrived:
                 return Receipt(ticket.operation, _request_id(ticket.goal), "booked", arrived)
         try:
             decision = decide(
-                line.head.state, ticket.goal, ticket.received, line.read,
+                line.head.state,
+                ticket.goal,
+                ticket.received,
+                line.read,
                 lambda stage: self._tell(ticket, stage, stage),
             )
         except InvalidInput as error:
             return error
-        with self._changed:  # from here on it cannot be taken back
-            if ticket.state == "withdrawn":
-                return Withdrawn("the demand was taken back before it was committed")
-            ticket.state = "committed"
+        if not self._hold(ticket):
+            return Withdrawn(_TAKEN_BACK)
         return self._commit(line, ticket, decision)
+
+    def _hold(self, ticket: Ticket) -> bool:
+        """Make a demand one that cannot be taken back any more; false where it was."""
+        with self._changed:
+            if ticket.state != "withdrawn":
+                ticket.state = "committed"
+            return ticket.state == "committed"
 
     def _commit(self, line: writer.Line, ticket: Ticket, decision: Decision) -> Receipt:
         if decision.files:

@@ -21,7 +21,7 @@ _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 _PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*(?:[:@=][A-Za-z0-9_./-]+)*")
 _WORDS = frozenset(
-    "y n yes no on off true false null nan inf infinity none".split()
+    ["y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "none"]
 )  # some parser somewhere reads one of these as something other than text
 
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
@@ -92,11 +92,11 @@ def load_all(text: str) -> Iterator[Any]:
     try:
         for event in yaml.parse(text, Loader=_Loader):
             if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
-                where = f"line {event.start_mark.line + 1}"
+                where = f"line {event.start_mark.line + 1}" if event.start_mark else ""
                 raise InvalidInput(
                     [fault(where, "anchors and aliases (& and *) are not taken; write it out")]
                 )
-        yield from yaml.load_all(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
+        yield from yaml.load_all(text, Loader=_StrictLoader)
     except yaml.YAMLError as error:
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise InvalidInput([fault(_mark(error), f"not valid YAML: {problem}")]) from error

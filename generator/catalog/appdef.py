@@ -14,7 +14,9 @@ from pydantic import Field, StringConstraints, model_validator
 from generator.catalog.model import DnsLabel, FileModel, Frozen, Word
 from generator.errors import near
 
-TopicPattern = Annotated[str, StringConstraints(pattern=r"^(/([A-Za-z_]\w*|([A-Za-z_]\w*)?\{instance\}\w*))+$")]
+TopicPattern = Annotated[
+    str, StringConstraints(pattern=r"^(/([A-Za-z_]\w*|([A-Za-z_]\w*)?\{instance\}\w*))+$")
+]
 """A topic name; ``{instance}`` stands for the source or the application that the service is for."""
 
 
@@ -34,7 +36,7 @@ class Parameter(Frozen):
 
 
 class Scaling(Frozen):
-    """How many replicas a service has: one for each ``topics_per_replica`` inputs, within bounds."""
+    """How many replicas a service has: one for ``topics_per_replica`` inputs, within bounds."""
 
     min: Annotated[int, Field(ge=0, le=1000)] = 1
     max: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -45,7 +47,9 @@ class Scaling(Frozen):
     @model_validator(mode="after")
     def _ordered(self) -> Scaling:
         if self.min > self.max:
-            raise ValueError(f"min {self.min} is above max {self.max}; lower the one or raise the other")
+            raise ValueError(
+                f"min {self.min} is above max {self.max}; lower the one or raise the other"
+            )
         return self
 
 

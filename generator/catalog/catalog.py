@@ -163,8 +163,9 @@ def _read_appdefs(
             continue
         if appdef.name != parts[1]:
             faults.append(
-                fault("name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them one")
-                .within(path)
+                fault(
+                    "name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them one"
+                ).within(path)
             )
         appdefs[appdef.name] = appdef
     return MappingProxyType(appdefs)
@@ -194,8 +195,11 @@ def _domains_of_nodes(
         if len(matching) > 1:
             names = " and ".join(f"'{domain.name}'" for domain in matching)
             faults.append(
-                fault(f"nodes[{index}].id", f"'{node.id}' is in the access domains {names}; "
-                      "narrow their patterns so that it is in one").within(NODES_FILE)
+                fault(
+                    f"nodes[{index}].id",
+                    f"'{node.id}' is in the access domains {names}; "
+                    "narrow their patterns so that it is in one",
+                ).within(NODES_FILE)
             )
         elif matching:
             owner[node.id] = matching[0]
@@ -204,7 +208,11 @@ def _domains_of_nodes(
 
 def _cross_check(catalog: Catalog) -> list[Fault]:
     checks: tuple[Callable[[Catalog], Iterable[Fault]], ...] = (
-        _check_inventory, _check_namespaces, _check_charts, _check_services, _check_wire_types,
+        _check_inventory,
+        _check_namespaces,
+        _check_charts,
+        _check_services,
+        _check_wire_types,
         _check_clients,
     )
     return [found for check in checks for found in check(catalog)]
@@ -267,14 +275,15 @@ def _check_services(catalog: Catalog) -> Iterable[Fault]:
             where = f"services.{name}"
             if service.chart not in catalog.charts:
                 yield fault(
-                    f"{where}.chart", f"'{service.chart}' is not in {CHARTS_FILE}"
-                    + near(service.chart, catalog.charts)
+                    f"{where}.chart",
+                    f"'{service.chart}' is not in {CHARTS_FILE}"
+                    + near(service.chart, catalog.charts),
                 ).within(file)
             for image in service.images:
                 if image not in catalog.images:
                     yield fault(
-                        f"{where}.images", f"'{image}' is not in {IMAGES_FILE}"
-                        + near(image, catalog.images)
+                        f"{where}.images",
+                        f"'{image}' is not in {IMAGES_FILE}" + near(image, catalog.images),
                     ).within(file)
             if catalog.values_template(appdef.name, service) not in catalog.files:
                 yield fault(f"{where}.values", f"'{service.values}' does not exist").within(file)
@@ -297,9 +306,9 @@ def _same_service(one: Service, other: Service) -> bool:
 
 def _check_clients(catalog: Catalog) -> Iterable[Fault]:
     if catalog.brokers and MQTT_CLIENT_IMAGE not in catalog.images:
-        yield fault(
-            "images", f"'{MQTT_CLIENT_IMAGE}' is missing; MQTT connections run it"
-        ).within(IMAGES_FILE)
+        yield fault("images", f"'{MQTT_CLIENT_IMAGE}' is missing; MQTT connections run it").within(
+            IMAGES_FILE
+        )
 
 
 def _check_wire_types(catalog: Catalog) -> Iterable[Fault]:

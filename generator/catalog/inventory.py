@@ -43,9 +43,9 @@ class Ros(Frozen):
     """What a container on the node needs to join its ROS graph."""
 
     domain_id: Annotated[int, Field(ge=0, le=232)] = Field(default=0, alias="domainId")
-    rmw: Literal[
-        "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"
-    ] = "rmw_cyclonedds_cpp"
+    rmw: Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"] = (
+        "rmw_cyclonedds_cpp"
+    )
 
 
 class Node(Frozen):

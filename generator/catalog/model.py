@@ -72,8 +72,7 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
         return f"is {value!r}, but must be {item['ctx']['expected']}"
     if kind == "string_pattern_mismatch":
         return (
-            f"{value!r} is not a name that can be used here; "
-            f"it must match {item['ctx']['pattern']}"
+            f"{value!r} is not a name that can be used here; it must match {item['ctx']['pattern']}"
         )
     if kind == "value_error":
         return str(item["ctx"]["error"])
@@ -102,6 +101,10 @@ def parse_file(model: type[Model], text: str, file: str) -> Model:
         raise InvalidInput(yamlio.faults_in(error, file)) from None
     if not isinstance(data, dict):
         raise InvalidInput(
-            [fault("", f"must be a mapping that starts with apiVersion: {API_VERSION}").within(file)]
+            [
+                fault("", f"must be a mapping that starts with apiVersion: {API_VERSION}").within(
+                    file
+                )
+            ]
         )
     return parse(model, data, file)

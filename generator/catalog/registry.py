@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import StringConstraints, model_validator
 
 from generator.catalog.model import DnsLabel, FileModel, Frozen
 
@@ -21,7 +21,9 @@ class Chart(Frozen):
     """A Helm chart: exactly one of ``folder``, ``oci`` and ``http`` says where it is."""
 
     version: ChartVersion
-    folder: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")] | None = None
+    folder: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")] | None = (
+        None
+    )
     oci: Annotated[str, StringConstraints(pattern=r"^oci://[^\s]+$")] | None = None
     http: Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$")] | None = None
 
@@ -29,9 +31,10 @@ class Chart(Frozen):
     def _one_source(self) -> Chart:
         given = [name for name in ("folder", "oci", "http") if getattr(self, name)]
         if len(given) != 1:
-            raise ValueError("needs exactly one of folder, oci and http" + (
-                f", not {' and '.join(given)}" if given else ""
-            ))
+            raise ValueError(
+                "needs exactly one of folder, oci and http"
+                + (f", not {' and '.join(given)}" if given else "")
+            )
         if self.folder and ".." in self.folder.split("/"):
             raise ValueError("folder must stay inside the state repo; remove '..'")
         return self
@@ -41,7 +44,9 @@ class Image(Frozen):
     """A container image, pinned by tag, by digest or by both (the digest then decides)."""
 
     repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")]
-    tag: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")] | None = None
+    tag: (
+        Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")] | None
+    ) = None
     digest: Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")] | None = None
 
     @model_validator(mode="after")
@@ -52,13 +57,13 @@ class Image(Frozen):
 
     def parts(self) -> dict[str, str]:
         """Return repository, tag and digest as the charts take them (absent ones empty)."""
-        return {
-            "repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""
-        }
+        return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
 
     def reference(self) -> str:
         """Return the image as one reference, by digest where one is given."""
-        return f"{self.repository}@{self.digest}" if self.digest else f"{self.repository}:{self.tag}"
+        return (
+            f"{self.repository}@{self.digest}" if self.digest else f"{self.repository}:{self.tag}"
+        )
 
 
 class ChartsFile(FileModel):

@@ -23,11 +23,15 @@ from generator.staterepo import layout, reader
 @click.command()
 @click.argument("directory", type=click.Path(path_type=Path), metavar="DIR")
 @click.option(
-    "--gitops", type=click.Choice(["flux"]), default="flux", show_default=True,
+    "--gitops",
+    type=click.Choice(["flux"]),
+    default="flux",
+    show_default=True,
     help="The controller that reads the state repo.",
 )
 @click.option(
-    "--bare", is_flag=True,
+    "--bare",
+    is_flag=True,
     help="Make a bare repository, which `serve` and `request` use in place. Without it DIR has the "
     "files checked out, ready to be pushed to a Git server.",
 )
@@ -50,7 +54,9 @@ def init(directory: Path, gitops: str, bare: bool, output: str) -> None:
 
 @click.command()
 @click.argument(
-    "directory", type=click.Path(path_type=Path, exists=True, file_okay=False), metavar="DIR",
+    "directory",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    metavar="DIR",
     default=Path(),
 )
 @output_option
@@ -62,10 +68,12 @@ def check(directory: Path, output: str) -> None:
     except InvalidInput as error:
         faults = list(error.faults)
     if output == "json":
-        print_json([
-            {"file": found.file, "field": found.field, "message": found.message}
-            for found in faults
-        ])
+        print_json(
+            [
+                {"file": found.file, "field": found.field, "message": found.message}
+                for found in faults
+            ]
+        )
     else:
         for found in faults:
             errors.print(f"error: {found}")
@@ -89,13 +97,18 @@ def verify(revisions: str | None, state_repo: str, output: str) -> None:
             verdicts.append(repo.verify(commit))
     broken = [verdict for verdict in verdicts if not verdict.holds]
     if output == "json":
-        print_json([
-            {
-                "commit": verdict.commit, "summary": verdict.summary, "holds": verdict.holds,
-                "skipped": verdict.skipped or None, "differing": list(verdict.differing),
-            }
-            for verdict in verdicts
-        ])
+        print_json(
+            [
+                {
+                    "commit": verdict.commit,
+                    "summary": verdict.summary,
+                    "holds": verdict.holds,
+                    "skipped": verdict.skipped or None,
+                    "differing": list(verdict.differing),
+                }
+                for verdict in verdicts
+            ]
+        )
     else:
         out = console()
         for verdict in verdicts:

@@ -12,7 +12,14 @@ from typing import Any
 import click
 
 from generator import yamlio
-from generator.cli.output import console, errors, output_option, print_json, progress, state_repo_option
+from generator.cli.output import (
+    console,
+    errors,
+    output_option,
+    print_json,
+    progress,
+    state_repo_option,
+)
 from generator.decision import Decision, decide
 from generator.demand import wire
 from generator.errors import DemandOpsError, Fault, InvalidInput, fault
@@ -52,7 +59,8 @@ def request(
         raise InvalidInput([fault("", "no request in " + ", ".join(files))])
     faulty = [wire.form_faults(document.goal) for document in documents]
     if any(faulty):
-        rows = [_unbooked(i, d, found) for i, (d, found) in enumerate(zip(documents, faulty))]
+        pairs = enumerate(zip(documents, faulty, strict=True))
+        rows = [_unbooked(index, document, found) for index, (document, found) in pairs]
     elif dry_run:
         rows = _rehearse(documents, state_repo, output)
     else:
@@ -82,8 +90,13 @@ def _documents(file: str) -> Iterable[_Document]:
 
 def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str, Any]:
     return {
-        "index": index, "request_id": request_id, "outcome": outcome, "commit": None,
-        "errors": [], "warnings": [], "not_held": [],
+        "index": index,
+        "request_id": request_id,
+        "outcome": outcome,
+        "commit": None,
+        "errors": [],
+        "warnings": [],
+        "not_held": [],
     } | more
 
 
@@ -154,8 +167,11 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
                 _show_consequence(index, decision)
             rows.append(
                 _row(
-                    index, decision.request.id, decision.outcome,
-                    warnings=list(decision.warnings), not_held=list(decision.changes.not_held),
+                    index,
+                    decision.request.id,
+                    decision.outcome,
+                    warnings=list(decision.warnings),
+                    not_held=list(decision.changes.not_held),
                 )
             )
     return rows

@@ -11,24 +11,13 @@ import click
 from rich.table import Table
 
 from generator.cli.output import console, output_option, print_json, progress, state_repo_option
-from generator.plan.bookkeeping import Bookkeeping, bookkeeping as derive
+from generator.plan.bookkeeping import Bookkeeping, as_data
+from generator.plan.bookkeeping import bookkeeping as derive
 from generator.staterepo import reader
 from generator.staterepo.history import LogEntry
 from generator.staterepo.reader import Reader
 
 _NONE = "(nothing)"
-
-
-def as_data(books: Bookkeeping, commit: str) -> dict[str, Any]:
-    """Return the bookkeeping as plain data, as ``--output json`` prints it."""
-    data = asdict(books)
-    for entry in data["services"].values():
-        entry["applications"] = list(entry["applications"])
-        entry["requesters"] = list(entry["requesters"])
-    for entry in data["connections"].values():
-        entry["topics"] = sorted(entry["topics"])
-        entry["requesters"] = list(entry["requesters"])
-    return data | {"commit": commit}
 
 
 def _books(repo: Reader, revision: str | None) -> tuple[Bookkeeping, str]:
@@ -60,8 +49,12 @@ def services_table(books: Bookkeeping) -> Table:
     for name, entry in books.services.items():
         inputs = [topic for topics in entry.inputs.values() for topic in topics]
         table.add_row(
-            name, entry.service, entry.node, entry.source or ", ".join(entry.applications),
-            "\n".join(inputs), "\n".join(entry.requesters),
+            name,
+            entry.service,
+            entry.node,
+            entry.source or ", ".join(entry.applications),
+            "\n".join(inputs),
+            "\n".join(entry.requesters),
         )
     if not books.services:
         table.add_row(_NONE, *[""] * 5)

@@ -101,7 +101,8 @@ def _connection(
     if kind is None:
         known = ", ".join(f"{number} ({item.name})" for number, item in types.items())
         yield fault(
-            f"{where}.type", f"{connection.type} is no connection type; known: {known}",
+            f"{where}.type",
+            f"{connection.type} is no connection type; known: {known}",
             code="unknown-connection-type",
         )
     if not joining:

@@ -89,6 +89,7 @@ class DemandRequest:
 
     def requesters(self) -> tuple[str, ...]:
         """Return everybody in whose name something is asked, in the order listed, each once."""
+        subjects: tuple[ApplicationDemand | ConnectionDemand, ...]
         subjects = (*self.applications, *self.connections)
         return tuple(dict.fromkeys(who for subject in subjects for who in subject.requesters))
 
@@ -180,9 +181,7 @@ def _connection(where: str, connection: ConnectionDemand, joining: bool) -> Iter
     if connection.broker:
         yield from _id(f"{where}.broker", connection.broker)
     if joining and not connection.topics:
-        yield fault(
-            f"{where}.topics", "is empty; a connection carries at least one topic, list it"
-        )
+        yield fault(f"{where}.topics", "is empty; a connection carries at least one topic, list it")
     targets: dict[str, str] = {}
     for index, (source, target) in enumerate(connection.topics):
         for side, name in (("source", source), ("target", target)):

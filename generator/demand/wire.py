@@ -49,9 +49,9 @@ class WireHeader(Frozen):
 class WireBody(Frozen):
     """``application_manager_interfaces/msg/ObjectDetectionFusionApp``."""
 
-    requester_ids: list[str] = []
-    ego_data_topics: list[WireTopic] = []
-    pointcloud_topics: list[WireTopic] = []
+    requester_ids: list[str] = Field(default_factory=list)
+    ego_data_topics: list[WireTopic] = Field(default_factory=list)
+    pointcloud_topics: list[WireTopic] = Field(default_factory=list)
 
 
 class WireApplication(Frozen):
@@ -67,19 +67,19 @@ class WireConnection(Frozen):
 
     id: str = ""
     broker_node_id: str = ""
-    requester_ids: list[str] = []
+    requester_ids: list[str] = Field(default_factory=list)
     source_node_id: str = ""
-    source_topics: list[str] = []
+    source_topics: list[str] = Field(default_factory=list)
     target_node_id: str = ""
-    target_topics: list[str] = []
+    target_topics: list[str] = Field(default_factory=list)
     type: Uint8 = 0
 
 
 class WireGoal(Frozen):
     """``application_manager_interfaces/action/DeploymentRequest``, the goal."""
 
-    apps: list[WireApplication] = []
-    connections: list[WireConnection] = []
+    apps: list[WireApplication] = Field(default_factory=list)
+    connections: list[WireConnection] = Field(default_factory=list)
     id: str = ""
     shutdown: bool = False
 
@@ -99,9 +99,7 @@ _WIRE_NAMES = (
 )
 
 
-def parse(
-    data: object, appdef_by_type: AppdefByType
-) -> tuple[DemandRequest | None, list[Fault]]:
+def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | None, list[Fault]]:
     """Parse a goal given as plain data.
 
     Args:
@@ -176,11 +174,16 @@ def _without(data: Any, location: tuple[int | str, ...]) -> Any:  # noqa: ANN401
     return data
 
 
+def _wire_inputs(appdef: ApplicationDefinition | None) -> Mapping[str, str]:
+    """Return topic list of the message → role, as the appdef says."""
+    if appdef is None or appdef.deployment_request is None:
+        return {}
+    return {str(name): role for name, role in appdef.deployment_request.inputs.items()}
+
+
 def _application(app: WireApplication, appdef: ApplicationDefinition | None) -> ApplicationDemand:
     body = app.object_detection_fusion_app
-    wire_names: Mapping[str, str] = (
-        appdef.deployment_request.inputs if appdef and appdef.deployment_request else {}
-    )
+    wire_names = _wire_inputs(appdef)
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for name in ("ego_data_topics", "pointcloud_topics"):
         topics: list[WireTopic] = getattr(body, name)
@@ -200,8 +203,7 @@ def _application(app: WireApplication, appdef: ApplicationDefinition | None) -> 
 
 def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
     return tuple(
-        InputTopic(absolute(topic.topic_name), topic.source_node_id, topic.type)
-        for topic in topics
+        InputTopic(absolute(topic.topic_name), topic.source_node_id, topic.type) for topic in topics
     )
 
 
@@ -233,7 +235,7 @@ def wire_field(path: str, request: DemandRequest, appdefs: AppdefByName) -> str:
         return path
     app, role, place, leaf = match.groups()
     appdef = appdefs.get(request.applications[int(app)].appdef)
-    wire = appdef.deployment_request.inputs if appdef and appdef.deployment_request else {}
-    names: Mapping[str, str] = {wire_role: name for name, wire_role in wire.items()}
+    wire = _wire_inputs(appdef)
+    names = {wire_role: name for name, wire_role in wire.items()}
     leaf = {".topic": ".topic_name", ".source": ".source_node_id"}.get(leaf, leaf)
     return f"apps[{app}].{_BODY}.{names.get(role, role)}{place or ''}{leaf}"

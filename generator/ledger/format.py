@@ -150,24 +150,37 @@ def read(text: str, path: str) -> Claim:
     kind = data.get("kind") if isinstance(data, dict) else None
     version = _VERSION.match(str(data.get("apiVersion", ""))) if isinstance(data, dict) else None
     if version and int(version[1]) > 1:
-        raise InvalidInput([
-            fault("apiVersion", f"is {data['apiVersion']}, newer than this generator's "
-                  f"{LEDGER_API_VERSION}; update the generator").within(path)
-        ])
+        raise InvalidInput(
+            [
+                fault(
+                    "apiVersion",
+                    f"is {data['apiVersion']}, newer than this generator's "
+                    f"{LEDGER_API_VERSION}; update the generator",
+                ).within(path)
+            ]
+        )
     if kind == "ApplicationClaim":
         claim = _application(parse(_ApplicationFile, data, path))
     elif kind == "ConnectionClaim":
         claim = _connection(parse(_ConnectionFile, data, path))
     else:
-        raise InvalidInput([
-            fault("kind", f"is {kind!r}, but must be ApplicationClaim or ConnectionClaim")
-            .within(path)
-        ])
+        raise InvalidInput(
+            [
+                fault(
+                    "kind", f"is {kind!r}, but must be ApplicationClaim or ConnectionClaim"
+                ).within(path)
+            ]
+        )
     if path_of(claim.key) != path:
-        raise InvalidInput([
-            fault("", f"its ids belong to {path_of(claim.key)}; move the file there, or restore "
-                  "the ids").within(path)
-        ])
+        raise InvalidInput(
+            [
+                fault(
+                    "",
+                    f"its ids belong to {path_of(claim.key)}; move the file there, or restore "
+                    "the ids",
+                ).within(path)
+            ]
+        )
     return claim
 
 

@@ -8,7 +8,7 @@ what the request touches and not what is booked. Semantics: ``docs/architecture.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from types import MappingProxyType
 from typing import TypeAlias, TypeVar
@@ -75,9 +75,9 @@ class Ledger:
     ``carriers``: (target node, target topic) → connections that bring it there.
     """
 
-    claims: HashTrieMap[Subject, Claims] = HashTrieMap()
-    takers: HashTrieMap[tuple[str, str], HashTrieSet[str]] = HashTrieMap()
-    carriers: HashTrieMap[tuple[str, str], HashTrieSet[str]] = HashTrieMap()
+    claims: HashTrieMap[Subject, Claims] = field(default_factory=HashTrieMap)
+    takers: HashTrieMap[tuple[str, str], HashTrieSet[str]] = field(default_factory=HashTrieMap)
+    carriers: HashTrieMap[tuple[str, str], HashTrieSet[str]] = field(default_factory=HashTrieMap)
 
     def of(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
@@ -125,11 +125,17 @@ class Ledger:
         )
         old = before.get(key.demand)
         if key.subject.kind is SubjectKind.APPLICATION:
-            takers = _reindex(self.takers, key.subject.id, _taken([old]), _taken(after.values()),
-                              _taken([claim]))
+            takers = _reindex(
+                self.takers, key.subject.id, _taken([old]), _taken(after.values()), _taken([claim])
+            )
             return replace(self, claims=claims, takers=takers)
-        carriers = _reindex(self.carriers, key.subject.id, _brought([old]),
-                            _brought(after.values()), _brought([claim]))
+        carriers = _reindex(
+            self.carriers,
+            key.subject.id,
+            _brought([old]),
+            _brought(after.values()),
+            _brought([claim]),
+        )
         return replace(self, claims=claims, carriers=carriers)
 
     def __iter__(self) -> Iterator[Claim]:
@@ -304,9 +310,7 @@ def _joined_application(
     return claim if claim == standing else replace(claim, booked=now)
 
 
-def _united(
-    known: Iterable[InputTopic], asked: Iterable[InputTopic]
-) -> tuple[InputTopic, ...]:
+def _united(known: Iterable[InputTopic], asked: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
     """Unite topics by (topic, source); a type that is given later fills in one that was not."""
     types: dict[tuple[str, str], str] = {}
     for topic in (*known, *asked):
@@ -465,6 +469,7 @@ def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
         ]
     shown = "; ".join(dict.fromkeys(near[:5])) or "none"
     return fault(
-        where, f"nothing that the shutdown lists is held; claims that come near: {shown}",
+        where,
+        f"nothing that the shutdown lists is held; claims that come near: {shown}",
         code="not-held",
     )

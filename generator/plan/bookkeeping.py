@@ -5,7 +5,8 @@ The view of the paper's Table III, column 4, derived from claims; nothing stores
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from generator.catalog.catalog import Catalog
 from generator.demand.claim import SubjectKind
@@ -73,3 +74,15 @@ def bookkeeping(ledger: Ledger, catalog: Catalog) -> Bookkeeping:
             requesters=tuple(sorted({who for claim in claims for who in claim.requesters})),
         )
     return Bookkeeping(services=dict(sorted(services.items())), connections=connections)
+
+
+def as_data(books: Bookkeeping, commit: str) -> dict[str, Any]:
+    """Return the bookkeeping as plain data, the contract of ``bookkeeping --output json``."""
+    data = asdict(books)
+    for entry in data["services"].values():
+        entry["applications"] = list(entry["applications"])
+        entry["requesters"] = list(entry["requesters"])
+    for entry in data["connections"].values():
+        entry["topics"] = sorted(entry["topics"])
+        entry["requesters"] = list(entry["requesters"])
+    return data | {"commit": commit}

@@ -39,8 +39,9 @@ def object_name(prefix: str, *ids: str) -> str:
         exact = exact and not any("-" in part for part in ids)
     if exact and len(plain) <= MAX_NAME and not _LOOKS_HASHED.fullmatch(plain):
         return plain
-    readable = "-".join((prefix, *(_slug(part) for part in ids)) if prefix
-                        else (_slug(part) for part in ids))
+    readable = "-".join(
+        (prefix, *(_slug(part) for part in ids)) if prefix else (_slug(part) for part in ids)
+    )
     readable = re.sub(r"-{2,}", "-", readable).strip("-")[: MAX_NAME - _HASH - 1].rstrip("-")
     return f"{readable}-{digest(prefix, *ids)}" if readable else digest(prefix, *ids)
 
@@ -51,9 +52,9 @@ def topic_part(id: str, extra: str = "") -> str:
     ``extra`` tells further instances of the same id apart, such as a source's second point cloud;
     it appears as a slug with a hash.
     """
-    if not extra and _TOPIC_PATH.fullmatch(id) and len(id) <= _MAX_TOKEN:
-        if not _LOOKS_HASHED.fullmatch(id):
-            return id
+    exact = not extra and len(id) <= _MAX_TOKEN and _TOPIC_PATH.fullmatch(id)
+    if exact and not _LOOKS_HASHED.fullmatch(id):
+        return id
     words = re.sub(r"[^A-Za-z0-9]+", "_", f"{id}_{extra}" if extra else id).strip("_")[:80]
     words = words.rstrip("_")
     safe = words if words[:1].isalpha() else f"x_{words}" if words else "x"

@@ -13,9 +13,7 @@ from generator.demand.claim import ApplicationClaim
 from generator.errors import Refused, fault
 
 
-def merged(
-    appdef: ApplicationDefinition, claims: Iterable[ApplicationClaim]
-) -> dict[str, object]:
+def merged(appdef: ApplicationDefinition, claims: Iterable[ApplicationClaim]) -> dict[str, object]:
     """Return the value of every parameter of ``appdef``.
 
     Raises:
@@ -34,31 +32,42 @@ def _one(name: str, parameter: Parameter, claims: list[ApplicationClaim]) -> obj
     if parameter.merge == "latest":
         return max(claims, key=lambda claim: (claim.booked, claim.demand)).parameters[name]
     if parameter.merge == "union":
-        items = [item for value in given for item in (value if _is_list(value) else [value])]
+        items = [
+            item for value in given for item in (value if isinstance(value, list) else [value])
+        ]
         unique = {json.dumps(item, sort_keys=True): item for item in items}
         return [unique[key] for key in sorted(unique)]
     if parameter.merge in ("max", "min"):
-        numbers = [value for value in given if _is_number(value)]
+        numbers = [
+            value
+            for value in given
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        ]
         if len(numbers) != len(given):
-            odd = next(value for value in given if not _is_number(value))
-            raise Refused([fault(f"parameters.{name}", f"{odd!r} is no number, and the application "
-                                 f"definition takes the {parameter.merge}")])
+            odd = next(value for value in given if value not in numbers)
+            raise Refused(
+                [
+                    fault(
+                        f"parameters.{name}",
+                        f"{odd!r} is no number, and the application "
+                        f"definition takes the {parameter.merge}",
+                    )
+                ]
+            )
         return max(numbers) if parameter.merge == "max" else min(numbers)
     if any(value != given[0] for value in given):
         shown = " and ".join(
             f"{json.dumps(claim.parameters[name])} for {', '.join(claim.requesters)}"
             for claim in claims[:3]
         )
-        raise Refused([
-            fault(f"parameters.{name}", f"demands contradict each other: {shown}; agree, or have "
-                  "the application definition say how to merge them", code="conflict")
-        ])
+        raise Refused(
+            [
+                fault(
+                    f"parameters.{name}",
+                    f"demands contradict each other: {shown}; agree, or have "
+                    "the application definition say how to merge them",
+                    code="conflict",
+                )
+            ]
+        )
     return given[0]
-
-
-def _is_list(value: object) -> bool:
-    return isinstance(value, list | tuple)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -93,6 +93,7 @@ def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
 
 
 def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceRelease | None:
+    users: tuple[str, ...]
     if key.application is not None:
         claims = ledger.application(key.application)
         users = (key.application,)
@@ -123,7 +124,8 @@ def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceReleas
         node=node,
         domain=domain,
         appdef=min(
-            name for name, known in catalog.appdefs.items()
+            name
+            for name, known in catalog.appdefs.items()
             if known.services.get(key.service) == service
         ),
         service=service,
@@ -229,12 +231,18 @@ def _end(ledger: Ledger, catalog: Catalog, key: EndKey) -> ConnectionEnd | None:
     wanted = next((claim.broker for claim in claims if claim.broker), "")
     broker = choose_broker(wanted, first.source, first.target, catalog)
     if broker is None:
-        raise Refused([
-            fault("broker", f"connection '{key.connection}' finds no broker; add one to "
-                  "inventory/brokers.yaml", code="no-broker")
-        ])
-    own, peer = (first.source, first.target) if key.side == "source" else (
-        first.target, first.source
+        raise Refused(
+            [
+                fault(
+                    "broker",
+                    f"connection '{key.connection}' finds no broker; add one to "
+                    "inventory/brokers.yaml",
+                    code="no-broker",
+                )
+            ]
+        )
+    own, peer = (
+        (first.source, first.target) if key.side == "source" else (first.target, first.source)
     )
     node, domain = _place(catalog, own)
     prefix = first.type.name.lower()
@@ -261,10 +269,15 @@ def connection_topics(claims: Iterable[ConnectionClaim]) -> dict[str, str]:
 def _appdef(catalog: Catalog, name: str) -> ApplicationDefinition:
     appdef = catalog.appdefs.get(name)
     if appdef is None:
-        raise Refused([
-            fault("appdef", f"'{name}' is in use, but appdefs/{name} is gone; restore it",
-                  code="unknown-application")
-        ])
+        raise Refused(
+            [
+                fault(
+                    "appdef",
+                    f"'{name}' is in use, but appdefs/{name} is gone; restore it",
+                    code="unknown-application",
+                )
+            ]
+        )
     return appdef
 
 
@@ -273,8 +286,13 @@ def _place(catalog: Catalog, node_id: str) -> tuple[Node, AccessDomain]:
     node, domain = catalog.nodes.get(node_id), catalog.domain_of.get(node_id)
     if node is None or domain is None:
         missing = "inventory/nodes.yaml" if node is None else "any access domain"
-        raise Refused([
-            fault("node", f"'{node_id}' is in use, but not in {missing}; restore it",
-                  code="unknown-node")
-        ])
+        raise Refused(
+            [
+                fault(
+                    "node",
+                    f"'{node_id}' is in use, but not in {missing}; restore it",
+                    code="unknown-node",
+                )
+            ]
+        )
     return node, domain

@@ -20,6 +20,8 @@ from generator.render import flux
 from generator.render.check import check_files
 from generator.render.engine import Engine
 
+Change = Literal["start", "change", "stop"]
+
 Read = Callable[[str], str | None]
 """Returns the text of a file of the state repo, or nothing where there is none."""
 
@@ -29,7 +31,7 @@ class ReleaseChange:
     """One release that starts, changes or stops, and in what."""
 
     name: str
-    change: Literal["start", "change", "stop"]
+    change: Change
     what: str
     details: tuple[str, ...]
 
@@ -86,8 +88,9 @@ def of_change(
     return Changeset(files=files, releases=tuple(sorted(releases, key=_order)))
 
 
-def render_all(ledger: Ledger, catalog: Catalog, engine: Engine, keys: Iterable[ReleaseKey]
-               ) -> dict[str, str]:
+def render_all(
+    ledger: Ledger, catalog: Catalog, engine: Engine, keys: Iterable[ReleaseKey]
+) -> dict[str, str]:
     """Return every generated file below ``clusters/`` that ledger and catalog ask for."""
     files = flux.standing_files(catalog, engine)
     for key in keys:
@@ -118,7 +121,7 @@ def _described(old: Release | None, new: Release | None, stood: bool) -> Release
     else:
         what = f"{release.type.name} {release.side} of connection {release.connection}"
         what += f" on {release.node.id}"
-    kind: Literal["start", "change", "stop"] = "stop" if not new else "start"
+    kind: Change = "stop" if not new else "start"
     if new and stood:
         kind = "change"
     details = _differences(old, new) if kind == "change" else ()

@@ -44,8 +44,10 @@ def check_values(values: Mapping[str, Any], chart: Chart, catalog: Catalog, temp
         return
     whole = _laid_over(_defaults(catalog.files.get(f"{chart.folder}/values.yaml", "")), values)
     faults = [
-        fault(f"values.{path}" if path else "values",
-              f"{message}; mend the template or {chart.folder}").within(template)
+        fault(
+            f"values.{path}" if path else "values",
+            f"{message}; mend the template or {chart.folder}",
+        ).within(template)
         for path, message in _problems(_values_validator(schema), whole)
     ]
     if faults:

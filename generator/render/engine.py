@@ -59,8 +59,11 @@ def _plain(value: object) -> object:
 def _block(value: Mapping[str, Any], indent: int) -> _Verbatim:
     text = yamlio.dump(value) if value else "{}\n"
     pad = " " * indent
-    return _Verbatim("".join(pad + line if line.strip() else line
-                             for line in text.splitlines(keepends=True)).rstrip("\n"))
+    return _Verbatim(
+        "".join(
+            pad + line if line.strip() else line for line in text.splitlines(keepends=True)
+        ).rstrip("\n")
+    )
 
 
 def _literal(value: str, indent: int) -> _Verbatim:
@@ -116,8 +119,11 @@ class Engine:
             raise InvalidInput(yamlio.faults_in(error, template)) from None
         except TemplateSyntaxError as error:
             raise InvalidInput(
-                [fault(f"line {error.lineno}", f"{error.message}; mend the template")
-                 .within(template)]
+                [
+                    fault(f"line {error.lineno}", f"{error.message}; mend the template").within(
+                        template
+                    )
+                ]
             ) from None
         except (TemplateError, TypeError, ValueError, ArithmeticError, LookupError) as error:
             raise InvalidInput(

@@ -14,7 +14,8 @@ from generator.decision import State, rendered
 from generator.errors import StateRepoError
 from generator.ledger.ledger import Ledger
 from generator.settings import MAIN_BRANCH, RENDER_VERSION, data_folder
-from generator.staterepo import message, tree as trees
+from generator.staterepo import message
+from generator.staterepo import tree as trees
 
 
 def files(skeleton: Path | None = None, appdefs: Path | None = None) -> dict[str, str]:
@@ -75,13 +76,14 @@ def _write(folder: Path, content: Mapping[str, str], now: datetime, bare: bool) 
     tree = trees.write(repo, None, content)
     text = (
         "Lay down the state repo\n\n"
-        "Why: `demandops init` made it from the skeleton. README.md says what each folder holds.\n\n"
+        "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
+        "\n\n"
         f"Operation: init\nRender-Version: {RENDER_VERSION}\n"
     )
     signature = message.generator_signature(now)
-    commit = repo.create_commit(
-        f"refs/heads/{MAIN_BRANCH}", signature, signature, text, tree, []
-    )
+    commit = repo.create_commit(f"refs/heads/{MAIN_BRANCH}", signature, signature, text, tree, [])
     if not bare:
-        repo.checkout_head(strategy=pygit2.enums.CheckoutStrategy.FORCE)
+        repo.checkout_head(  # type: ignore[no-untyped-call]
+            strategy=pygit2.enums.CheckoutStrategy.FORCE
+        )
     return str(commit)

@@ -78,14 +78,18 @@ def of_follow(
     """Return the message of a commit that carries out what people changed in the state repo."""
     problems = list(problems)
     body = [
-        "Carry out changes made in the state repo", "",
-        f"Why: commits up to {cause[:12]} changed what is configured or booked.", "",
+        "Carry out changes made in the state repo",
+        "",
+        f"Why: commits up to {cause[:12]} changed what is configured or booked.",
+        "",
         *_desired_state(tuple(releases)),
     ]
     if problems:
         body += ["", "Not taken in, for it is not valid:", *(f"  {found}" for found in problems)]
     trailers = [
-        ("Operation", "follow"), ("Follows", cause), ("Since", since),
+        ("Operation", "follow"),
+        ("Follows", cause),
+        ("Since", since),
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"

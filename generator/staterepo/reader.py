@@ -10,14 +10,17 @@ from pathlib import Path
 from pygit2 import Commit
 
 from generator import settings
-from generator.catalog.catalog import CONFIG_ROOTS, load as load_catalog
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.catalog import load as load_catalog
 from generator.decision import State, rendered
-from generator.errors import InvalidInput, StateRepoError, fault
+from generator.errors import Fault, InvalidInput, StateRepoError, fault
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger
 from generator.render.changeset import Read
 from generator.settings import RENDER_VERSION
-from generator.staterepo import history, remote, snapshot as snapshots, tree as trees
+from generator.staterepo import history, remote
+from generator.staterepo import snapshot as snapshots
+from generator.staterepo import tree as trees
 from generator.staterepo.history import LogEntry
 from generator.staterepo.outbox import Slot
 from generator.staterepo.snapshot import Progress, Snapshot
@@ -100,15 +103,20 @@ class Reader:
         version = entry.one("Render-Version")
         if version != str(RENDER_VERSION):
             return Verdict(
-                entry.commit, entry.summary, True,
+                entry.commit,
+                entry.summary,
+                True,
                 f"rendered by version {version}, this is version {RENDER_VERSION}",
             )
         try:
             snapshot = snapshots.load(self._repository.objects, commit.id)
         except InvalidInput as error:
-            return Verdict(entry.commit, entry.summary, False, differing=tuple(
-                str(found) for found in error.faults
-            ))
+            return Verdict(
+                entry.commit,
+                entry.summary,
+                False,
+                differing=tuple(str(found) for found in error.faults),
+            )
         differing = _differing(rendered(snapshot.state), commit)
         return Verdict(entry.commit, entry.summary, not differing, differing=differing)
 
@@ -140,8 +148,10 @@ def check_folder(folder: Path) -> State:
             f"{folder} is no state repo, for it has no demandops.yaml; `demandops init` makes one"
         )
     files = dict(_texts(folder))
-    catalog = load_catalog({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
-    ledger, faults = Ledger(), []
+    catalog = load_catalog(
+        {p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS}
+    )
+    ledger, faults = Ledger(), list[Fault]()
     for path, text in sorted(files.items()):
         if ledger_format.kind_of(path) is None:
             continue
@@ -158,8 +168,11 @@ def check_folder(folder: Path) -> State:
     for path in sorted({*wanted, *(p for p in files if p.startswith("clusters/"))}):
         if wanted.get(path) != files.get(path) and not _is_note(path):
             faults.append(
-                fault("", "differs from what ledger and configuration give; leave it to the "
-                      "generator, which writes it after the next demand").within(path)
+                fault(
+                    "",
+                    "differs from what ledger and configuration give; leave it to the "
+                    "generator, which writes it after the next demand",
+                ).within(path)
             )
     if faults:
         raise InvalidInput(faults)

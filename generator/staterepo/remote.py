@@ -25,8 +25,15 @@ _URL = re.compile(r"^([a-z][a-z0-9+.-]*://|[^/\s]+@[^/\s:]+:|[A-Za-z0-9.-]+:[^/\
 _ALLOWED = re.compile(r"^(https?|ssh|git|file|git\+ssh)://")
 _PASSWORD = re.compile(r"(://)[^/@\s]*@")
 _HAS_PASSWORD = re.compile(r"://[^/@\s]*:[^/@\s]*@")
-_MOVED = ("non-fast-forward", "fetch first", "stale info", "cannot lock ref", "failed to update ref",
-          "remote rejected", "incorrect old value")
+_MOVED = (
+    "non-fast-forward",
+    "fetch first",
+    "stale info",
+    "cannot lock ref",
+    "failed to update ref",
+    "remote rejected",
+    "incorrect old value",
+)
 _ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
 
 Say = Callable[[str], None]
@@ -142,7 +149,7 @@ class ClonedRepository(StateRepository):
 
     def __init__(self, url: str, folder: Path, say: Say) -> None:
         if not _ALLOWED.match(url) and "://" in url:
-            scheme = url.split("://")[0]
+            scheme = url.split("://", maxsplit=1)[0]
             raise StateRepoError(
                 f"'{scheme}://' is no way to reach a state repo; use https, ssh, git or file"
             )
@@ -165,7 +172,7 @@ class ClonedRepository(StateRepository):
         try:
             repo = Repository(str(self._folder))
             target = repo.references[_REMOTE_MAIN].target
-            return isinstance(repo[target], pygit2.Commit)  # type: ignore[index]
+            return isinstance(repo[target], pygit2.Commit)
         except (pygit2.GitError, KeyError):
             return False
 

@@ -13,7 +13,8 @@ import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 from rpds import HashTrieMap
 
-from generator.catalog.catalog import CONFIG_ROOTS, Catalog, load as load_catalog
+from generator.catalog.catalog import CONFIG_ROOTS, Catalog
+from generator.catalog.catalog import load as load_catalog
 from generator.decision import State
 from generator.demand.claim import ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
@@ -111,9 +112,7 @@ def catalog_at(tree: Tree) -> Catalog:
 def _ledger_at(
     repo: Repository, tree: Tree, progress: Progress
 ) -> tuple[Ledger, HashTrieMap[str, ClaimKey], list[Fault]]:
-    paths = [
-        (path, blob) for path, blob in _ledger_files(tree) if ledger_format.kind_of(path)
-    ]
+    paths = [(path, blob) for path, blob in _ledger_files(tree) if ledger_format.kind_of(path)]
     ledger, faults = Ledger(), list[Fault]()
     keys: HashTrieMap[str, ClaimKey] = HashTrieMap()
     for done, (path, blob) in enumerate(paths):
@@ -178,7 +177,9 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             ledger = ledger.replace(claim.key, claim)
             subjects.append(claim.subject)
         keys = keys.insert(path, claim.key)
-    problems += [p for p in snapshot.problems if p.file.startswith("ledger/") and p.file not in seen]
+    problems += [
+        p for p in snapshot.problems if p.file.startswith("ledger/") and p.file not in seen
+    ]
     state = replace(state, ledger=ledger)
     return Advance(
         Snapshot(to, state, keys, tuple(problems)), tuple(dict.fromkeys(subjects)), catalog_changed
@@ -192,9 +193,10 @@ def _as_faults(error: InvalidInput | StateRepoError) -> list[Fault]:
 
 
 def _subtree(tree: Tree, name: str) -> Tree | None:
-    entry = tree[name] if name in tree else None
+    entry = trees.child(tree, name)
     return entry if isinstance(entry, Tree) else None
 
 
 def _id(tree: Tree, name: str) -> Oid | None:
-    return tree[name].id if name in tree else None
+    entry = trees.child(tree, name)
+    return entry.id if entry is not None else None

@@ -20,6 +20,14 @@ def read_text(tree: Tree, path: str) -> str | None:
     return entry.data.decode("utf-8", "replace") if isinstance(entry, pygit2.Blob) else None
 
 
+def child(tree: Tree, name: str) -> pygit2.Object | None:
+    """Return the entry ``name`` of a tree, or nothing."""
+    try:
+        return tree[name]
+    except KeyError:
+        return None
+
+
 def entries(tree: Tree, prefix: str = "") -> Iterator[tuple[str, Oid]]:
     """Yield (path, blob id) of every file below a tree, in Git's order."""
     for entry in tree:
@@ -45,13 +53,14 @@ def texts(tree: Tree, roots: tuple[str, ...]) -> dict[str, str]:
     return found
 
 
-def differences(repo: Repository, before: Tree | None, after: Tree | None, prefix: str
-                ) -> Iterator[tuple[str, Oid | None]]:
+def differences(
+    repo: Repository, before: Tree | None, after: Tree | None, prefix: str
+) -> Iterator[tuple[str, Oid | None]]:
     """Yield (path, blob id or nothing) of each file that differs; equal subtrees are not opened."""
     if before is not None and after is not None and before.id == after.id:
         return
-    old = {entry.name: entry for entry in before} if before is not None else {}
-    new = {entry.name: entry for entry in after} if after is not None else {}
+    old = {str(entry.name): entry for entry in before} if before is not None else {}
+    new = {str(entry.name): entry for entry in after} if after is not None else {}
     for name in sorted({*old, *new}):
         left, right = old.get(name), new.get(name)
         if left is not None and right is not None and left.id == right.id:

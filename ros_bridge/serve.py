@@ -1,0 +1,146 @@
+"""``demandops serve``: run the ROS 2 node until it is told to stop."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from types import FrameType
+from typing import Any
+
+import click
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import LoggingSeverity, set_logger_level
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from generator.cli.output import errors, progress
+from generator.service import Generator
+from generator.settings import DEFAULT_ACTION_NAME
+from ros_bridge.node import DemandNode
+
+_LEVELS = ("debug", "info", "warn", "error", "fatal")
+_FLUSH_S = 0.3
+
+
+class _ToRos(logging.Handler):
+    """Brings what the generator logs into the node's log."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__()
+        self._log = node.get_logger()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log a record at the level that ROS has for it."""
+        text = self.format(record)
+        if record.levelno >= logging.ERROR:
+            self._log.error(text)
+        elif record.levelno >= logging.WARNING:
+            self._log.warning(text)
+        else:
+            self._log.info(text)
+
+
+@click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+@click.option(
+    "--state-repo",
+    envvar="DEMANDOPS_STATE_REPO",
+    metavar="URL_OR_DIR",
+    help="The state repo: a folder with a bare repository, or a URL that git clones; also the ROS "
+    "parameter state_repo [env: DEMANDOPS_STATE_REPO].",
+)
+@click.pass_context
+def serve(ctx: click.Context, state_repo: str | None) -> None:
+    """Run the ROS 2 node that takes demands over the action DeploymentRequest.
+
+    Everything after --ros-args goes to ROS. Parameters: action_name, state_repo, log_level (debug,
+    info, warn, error or fatal). Stop it with Ctrl-C or SIGTERM: it finishes what it has in hand.
+    """
+    ros_args = list(ctx.args)
+    if ros_args and ros_args[0] != "--ros-args":
+        raise click.UsageError(f"unexpected argument {ros_args[0]}; ROS's own follow --ros-args")
+    rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        settings = _parameters(state_repo)
+        with progress("reading the ledger") as tell:
+            generator = Generator(settings["state_repo"], progress=tell)
+        _run(generator, settings)
+    finally:
+        rclpy.try_shutdown()
+
+
+def _parameters(state_repo: str | None) -> dict[str, Any]:
+    """Read the node's parameters before it exists, for it needs the state repo to begin with."""
+    probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
+    try:
+        values = {
+            "action_name": probe.declare_parameter("action_name", DEFAULT_ACTION_NAME).value,
+            "state_repo": probe.declare_parameter("state_repo", state_repo or "").value,
+            "log_level": probe.declare_parameter("log_level", "info").value,
+        }
+    finally:
+        probe.destroy_node()
+    if not values["state_repo"]:
+        raise click.UsageError(
+            "which state repo? give --state-repo URL_OR_DIR, set DEMANDOPS_STATE_REPO, or the ROS "
+            "parameter state_repo"
+        )
+    if values["log_level"] not in _LEVELS:
+        raise click.UsageError(
+            f"parameter log_level is '{values['log_level']}'; it takes {', '.join(_LEVELS)}"
+        )
+    return values
+
+
+def _run(generator: Generator, settings: dict[str, Any]) -> None:
+    node = DemandNode(generator, settings["action_name"])
+    for name, value in settings.items():
+        node.declare_parameter(name, generator.address if name == "state_repo" else value)
+    set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
+    library_log = logging.getLogger("demandops")
+    library_log.handlers, library_log.propagate = [_ToRos(node)], False
+    library_log.setLevel(logging.DEBUG)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    signals = _Signals(node)
+    node.get_logger().info(f"taking demands on {settings['action_name']} for {generator.address}")
+    try:
+        while not signals.stopping:
+            executor.spin_once(timeout_sec=0.5)
+        _drain(executor, node, generator)
+    except ExternalShutdownException:
+        generator.close(timeout=0)
+    finally:
+        executor.shutdown(timeout_sec=1)
+        node.destroy_node()
+
+
+def _drain(executor: SingleThreadedExecutor, node: DemandNode, generator: Generator) -> None:
+    """Finish what is in hand: goals under way get their results before the node goes."""
+    node.get_logger().info(f"stopping: finishing {node.open_goals} goals in hand")
+    finished = generator.stop()
+    while node.open_goals:
+        executor.spin_once(timeout_sec=0.1)
+    end = node.get_clock().now().nanoseconds + int(_FLUSH_S * 1e9)
+    while node.get_clock().now().nanoseconds < end:  # results leave, clients ask for them
+        executor.spin_once(timeout_sec=0.05)
+    if not finished.result():
+        node.get_logger().warning("the outbox is not empty; it is taken up at the next start")
+
+
+class _Signals:
+    """Ctrl-C and SIGTERM ask to stop; a second one stops at once."""
+
+    def __init__(self, node: DemandNode) -> None:
+        self.stopping = False
+        self._node = node
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.stopping:
+            errors.print("stopped at once; what was not published is in the outbox")
+            sys.exit(130)
+        self.stopping = True
+        self._node.stop_accepting()
