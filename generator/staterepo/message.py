@@ -23,7 +23,7 @@ GENERATOR_EMAIL = "generator@demandops.invalid"
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
-_MAX_SUBJECT = 100
+_MAX_SUBJECT = 90
 
 
 def generator_signature(moment: datetime) -> pygit2.Signature:
@@ -47,7 +47,7 @@ def of_decision(decision: Decision, operation: str, received: datetime) -> str:
     subjects = decision.changes.subjects()
     who = ", ".join(request.requesters())
     verb = "Join" if joining else "Release"
-    subject = f"{verb} {', '.join(item.id for item in subjects)} for {who}"
+    subject = f"{verb} {', '.join(item.id for item in subjects)}"
     moment = received.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
     why = (
         f"Why: request '{request.id}', received {moment}, "

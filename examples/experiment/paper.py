@@ -1,0 +1,59 @@
+"""What the paper reports: who requests which service and connection after each of eight steps.
+
+The columns are those of its table: the detection on the station's point cloud and the connection
+that feeds it share one set of requesters, as do those of vehicle00.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+STEPS = (
+    "vehicle00 joins",
+    "vehicle01 joins",
+    "vehicle03 joins",
+    "vehicle02 joins",
+    "vehicle00 leaves",
+    "vehicle01 leaves",
+    "vehicle02 leaves",
+    "vehicle03 leaves",
+)
+
+S, V0, V1, V2, V3 = "station00", "vehicle00", "vehicle01", "vehicle02", "vehicle03"
+
+# (on the station's cloud, on vehicle00's cloud, the fusion, vehicles 1 to 3 with a connection)
+_TABLE: tuple[tuple[set[str], set[str], set[str], tuple[str, ...]], ...] = (
+    ({S, V0}, {S, V0}, {S, V0}, ()),
+    ({S, V0, V1}, {S, V0}, {S, V0, V1}, (V1,)),
+    ({S, V0, V1, V3}, {S, V0}, {S, V0, V1, V3}, (V1, V3)),
+    ({S, V0, V1, V2, V3}, {S, V0}, {S, V0, V1, V2, V3}, (V1, V2, V3)),
+    ({S, V1, V2, V3}, set(), {S, V1, V2, V3}, (V1, V2, V3)),
+    ({S, V2, V3}, set(), {S, V2, V3}, (V2, V3)),
+    ({S, V3}, set(), {S, V3}, (V3,)),
+    (set(), set(), set(), ()),
+)
+
+
+def expected(step: int) -> dict[str, list[str]]:
+    """Return subject → sorted requesters after ``step`` (1 to 8); what is gone is not listed."""
+    station, vehicle, fusion, connected = _TABLE[step - 1]
+    rows = {
+        f"object-detection {S}": station,
+        f"object-detection {V0}": vehicle,
+        "object-fusion edge/object_detection_fusion": fusion,
+        f"connection {S} to edge": station,
+        f"connection {V0} to edge": vehicle,
+        **{f"connection {node} to edge": {S, node} for node in connected},
+    }
+    return {subject: sorted(who) for subject, who in sorted(rows.items()) if who}
+
+
+def observed(books: dict[str, Any]) -> dict[str, list[str]]:
+    """Return the same rows from ``demandops bookkeeping --output json``."""
+    rows = {}
+    for entry in books["services"].values():
+        whom = entry["source"] or ", ".join(entry["applications"])
+        rows[f"{entry['service']} {whom}"] = entry["requesters"]
+    for entry in books["connections"].values():
+        rows[f"connection {entry['source']} to {entry['target']}"] = entry["requesters"]
+    return dict(sorted(rows.items()))
