@@ -15,7 +15,6 @@ from typing import Any
 
 import jsonschema_rs
 import kubernetes_validate
-import yaml
 
 from generator import yamlio
 from generator.catalog.catalog import Catalog
@@ -76,9 +75,9 @@ def check_files(files: Mapping[str, str | None]) -> None:
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterable[dict[str, Any]]:
     try:
-        documents = [yamlio.load_trusted(part) for part in text.split("\n---\n")]
-    except yaml.YAMLError as error:
-        faults.append(fault("", f"does not parse: {error}").within(path))
+        documents = [yamlio.load_rendered(part) for part in text.split("\n---\n")]
+    except InvalidInput as error:
+        faults += yamlio.faults_in(error, path)
         return []
     for document in documents:
         if not isinstance(document, dict):

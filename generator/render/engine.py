@@ -114,7 +114,7 @@ class Engine:
         """
         try:
             compiled: Template = self._catalog.get_template(template)
-            values = yamlio.load(compiled.render(**context))
+            values = yamlio.load_rendered(compiled.render(**context))
         except InvalidInput as error:
             raise InvalidInput(yamlio.faults_in(error, template)) from None
         except TemplateSyntaxError as error:

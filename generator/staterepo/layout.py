@@ -72,7 +72,6 @@ def _chosen(content: Mapping[str, str], gitops: str) -> dict[str, str]:
 def _write(folder: Path, content: Mapping[str, str], now: datetime, bare: bool) -> str:
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # what is pushed here is on the disk when told so
-    repo.config["core.fsyncObjectFiles"] = True  # the same, for a git before 2.36
     tree = trees.write(repo, None, content)
     text = (
         "Lay down the state repo\n\n"

@@ -9,6 +9,8 @@ from pygit2 import Oid, Repository, Tree
 from pygit2.enums import FileMode
 
 pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)  # a commit told of is on the disk
+# By default libgit2 forgets trees over 4 KiB at once and parses them again at every look-up.
+pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
 
 def read_text(tree: Tree, path: str) -> str | None:

@@ -1,0 +1,111 @@
+"""A fleet of any size, laid down at once: what the benchmarks measure on.
+
+Edges with ten vehicles each; every vehicle has a connection (two releases) and a detection on its
+edge, every edge a fusion. Nodes, claims and rendered files are what the generator itself writes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import pygit2
+
+from generator import yamlio
+from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.decision import State, admit, rendered
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger, apply
+from generator.staterepo import layout, message
+from generator.staterepo import tree as trees
+
+VEHICLES_PER_EDGE = 10
+RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
+SPARE = "newcomer"
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """A state repo with a fleet in it."""
+
+    path: Path
+    edges: int
+    releases: int
+
+
+def edge_id(number: int) -> str:
+    return f"edge{number:05d}"
+
+
+def goal(edge: str, vehicle: str, *, shutdown: bool = False) -> dict[str, Any]:
+    """One vehicle's demand for perception on one edge."""
+    topics = [f"/{vehicle}/ego_data", f"/{vehicle}/points"]
+    application = {
+        "header": {"id": f"{edge}/fusion", "node_id": edge},
+        "type": 1,
+        "object_detection_fusion_app": {
+            "requester_ids": [vehicle],
+            "ego_data_topics": [{"topic_name": topics[0], "source_node_id": vehicle}],
+            "pointcloud_topics": [{"topic_name": topics[1], "source_node_id": vehicle}],
+        },
+    }
+    connection = {
+        "id": f"{vehicle}/{edge}",
+        "requester_ids": [vehicle],
+        "type": 1,
+        "source_node_id": vehicle,
+        "target_node_id": edge,
+        "source_topics": topics,
+        "target_topics": topics,
+    }
+    return {
+        "id": "bench",
+        "shutdown": shutdown,
+        "apps": [application],
+        "connections": [connection],
+    }
+
+
+def _nodes(edges: int) -> str:
+    nodes: list[dict[str, str]] = [
+        {"id": "cloud", "type": "cloud", "cluster": "c-its"},
+    ]
+    for number in range(edges):
+        edge = edge_id(number)
+        nodes.append({"id": edge, "type": "edge", "cluster": "c-its"})
+        names = [f"v{number:05d}x{i}" for i in range(VEHICLES_PER_EDGE)] + [f"{SPARE}{number:05d}"]
+        nodes += [{"id": name, "type": "vehicle", "cluster": "c-its"} for name in names]
+    return yamlio.dump({"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": nodes})
+
+
+def lay_down(path: Path, releases: int) -> Fleet:
+    """Make a bare state repo with about ``releases`` releases running."""
+    edges = max(1, round(releases / RELEASES_PER_EDGE))
+    files = layout.files()
+    files["inventory/nodes.yaml"] = _nodes(edges)
+    files["inventory/brokers.yaml"] = yamlio.dump(
+        {
+            "apiVersion": "demandops/v1",
+            "kind": "Brokers",
+            "brokers": [{"node": "cloud", "host": "broker", "port": 1883}],
+        }
+    )
+    catalog = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
+    state, now = State.of(catalog, Ledger()), datetime.now(timezone.utc)
+    ledger = Ledger()
+    for number in range(edges):
+        for place in range(VEHICLES_PER_EDGE):
+            request = admit(state, goal(edge_id(number), f"v{number:05d}x{place}"))
+            ledger, _ = apply(ledger, request, now)
+    files |= {ledger_format.path_of(claim.key): ledger_format.write(claim) for claim in ledger}
+    files |= rendered(State(catalog, state.engine, ledger))
+    repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
+    tree = trees.write(repo, None, files)
+    who = message.generator_signature(now)
+    text = "A fleet\n\nOperation: init\nRender-Version: 1\n"
+    repo.create_commit("refs/heads/main", who, who, text, tree, [])
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
+    return Fleet(path, edges, edges * RELEASES_PER_EDGE)
