@@ -1,0 +1,55 @@
+"""The golden cases: requests played on a state repo's files, in memory.
+
+``tests/golden/<case>/requests/*.yaml`` are played in order; after each, everything below
+``clusters/`` and ``ledger/`` stands in ``expected/<request>/``, as real files that a reviewer and
+`kubectl` can read. A case may lay files over the skeleton's in ``state-repo/``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime, timezone
+from pathlib import Path
+
+from generator import yamlio
+from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.decision import State, decide, rendered
+from generator.ledger.ledger import Ledger
+from generator.staterepo import layout
+
+HERE = Path(__file__).parent
+EXPERIMENT = HERE.parent.parent / "examples" / "experiment"
+NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
+
+CASES = ("experiment", "differing-topic-names", "charts-from-registries")
+
+
+def requests_of(case: str) -> list[Path]:
+    """Return the request files of a case, in order; the experiment's are the example's."""
+    folder = EXPERIMENT if case == "experiment" else HERE / case / "requests"
+    return sorted(folder.glob("*.yaml"))
+
+
+def start(case: str) -> tuple[State, dict[str, str]]:
+    """Return the state before the first request, and the generated files."""
+    files = layout.files()
+    overlay = HERE / case / "state-repo"
+    for path in sorted(overlay.rglob("*.yaml")):
+        files[path.relative_to(overlay).as_posix()] = path.read_text()
+    catalog = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
+    state = State.of(catalog, Ledger())
+    return state, rendered(state)
+
+
+def play(case: str) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield (request name, all generated files) after each request."""
+    state, world = start(case)
+    for file in requests_of(case):
+        decision = decide(state, yamlio.load(file.read_text()), NOW, world.get)
+        state = decision.state
+        for path, text in decision.files.items():
+            if text is None:
+                del world[path]
+            else:
+                world[path] = text
+        yield file.stem, dict(world)

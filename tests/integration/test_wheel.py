@@ -1,0 +1,78 @@
+"""The built wheel carries templates, appdefs and skeleton: it renders where no checkout is."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent.parent
+PACKAGED = ("generator", "ros_bridge", "templates", "appdefs", "state-repo-skeleton")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    sources = folder / "sources"  # setuptools would leave its build folder in the checkout
+    sources.mkdir()
+    for name in (*PACKAGED, "pyproject.toml", "README.md", "LICENSE"):
+        if (ROOT / name).is_dir():
+            skipped = shutil.ignore_patterns("__pycache__", "*.egg-info")
+            shutil.copytree(ROOT / name, sources / name, ignore=skipped)
+        else:
+            shutil.copy(ROOT / name, sources / name)
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder),
+               str(sources)]
+    subprocess.run(command, check=True)
+    return next(folder.glob("demandops-*.whl"))
+
+
+def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for folder, packaged in (
+        ("templates", "templates"), ("appdefs", "appdefs"), ("state-repo-skeleton", "skeleton"),
+    ):
+        files = {p.relative_to(ROOT / folder).as_posix() for p in (ROOT / folder).rglob("*")
+                 if p.is_file()}
+        prefix = f"generator/_data/{packaged}/"
+        assert {n.removeprefix(prefix) for n in names if n.startswith(prefix)} == files
+    assert not [name for name in names if name.startswith(("tests/", "examples/", "docs/"))]
+
+
+def test_a_demand_is_rendered_from_the_installed_wheel(wheel: Path, tmp_path: Path) -> None:
+    venv.create(tmp_path / "env", with_pip=False)
+    site = next((tmp_path / "env" / "lib").glob("python*/site-packages"))
+    zipfile.ZipFile(wheel).extractall(site)
+    # the libraries come from this environment; a path file does not bring in the checkout
+    (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    request = ROOT / "examples" / "experiment" / "1-vehicle00-joins.yaml"
+
+    def demandops(*args: str) -> str:
+        command = [str(tmp_path / "env" / "bin" / "python"), "-m", "generator.cli.main", *args]
+        environment = {"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    where = tmp_path / "env" / "bin" / "python"
+    found = subprocess.run(
+        [str(where), "-c", "import generator; print(generator.__file__)"],
+        cwd=tmp_path, capture_output=True, text=True, check=True,
+    )
+    assert found.stdout.startswith(str(tmp_path))
+    demandops("init", "state.git", "--bare")
+    rows = json.loads(
+        demandops("request", str(request), "--state-repo", "state.git", "--output", "json")
+    )
+    assert rows[0]["outcome"] == "booked"
+    books = json.loads(demandops("bookkeeping", "--state-repo", "state.git", "--output", "json"))
+    assert "od-edge-vehicle00" in books["services"]
