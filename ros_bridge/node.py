@@ -11,12 +11,14 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from threading import Thread
 from typing import Any
 
 from application_manager_interfaces.action import DeploymentRequest
 from demandops_interfaces.srv import GetBookkeeping
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.task import Future
@@ -46,7 +48,10 @@ class DemandNode(Node):  # type: ignore[misc]
         self._open: dict[str, ServerGoalHandle] = {}
         self._events: deque[Callable[[], None]] = deque()
         self._stopping = False
-        self._wake = self.create_guard_condition(self._handle_events)
+        # a group of its own: a service that waits for an event must not keep events from coming
+        self._wake = self.create_guard_condition(
+            self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
+        )
         self._server = ActionServer(
             self,
             DeploymentRequest,
@@ -57,8 +62,14 @@ class DemandNode(Node):  # type: ignore[misc]
             goal_service_qos_profile=DEEP,
             result_service_qos_profile=DEEP,
             cancel_service_qos_profile=DEEP,
+            feedback_pub_qos_profile=DEEP,
         )
-        self.create_service(GetBookkeeping, "~/get_bookkeeping", partial(answer, generator))
+        self.create_service(
+            GetBookkeeping,
+            "~/get_bookkeeping",
+            self._bookkeeping,
+            callback_group=ReentrantCallbackGroup(),
+        )
 
     @property
     def open_goals(self) -> int:
@@ -68,6 +79,17 @@ class DemandNode(Node):  # type: ignore[misc]
     def stop_accepting(self) -> None:
         """Reject further goals; those under way go on."""
         self._stopping = True
+
+    async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
+        """Answer from a thread of its own: an old revision may take seconds to read."""
+        done = Future(executor=self.executor)
+
+        def work() -> None:
+            filled = answer(self._generator, request, response)
+            self._from_worker(partial(done.set_result, filled))
+
+        Thread(target=work, name="demandops-bookkeeping", daemon=True).start()
+        return await done
 
     # ---- callbacks of the action server, in the executor's thread ----
 

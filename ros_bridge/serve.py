@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
-import sys
+import tempfile
+import time
+from pathlib import Path
+from threading import Event, Thread
 from types import FrameType
 from typing import Any
 
 import click
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -21,7 +25,10 @@ from generator.settings import DEFAULT_ACTION_NAME
 from ros_bridge.node import DemandNode
 
 _LEVELS = ("debug", "info", "warn", "error", "fatal")
+_POLL_S = 0.02
+_TASK_S = 5.0
 _FLUSH_S = 0.3
+_EXIT_INTERRUPTED = 130
 
 
 class _ToRos(logging.Handler):
@@ -60,6 +67,9 @@ def serve(ctx: click.Context, state_repo: str | None) -> None:
     ros_args = list(ctx.args)
     if ros_args and ros_args[0] != "--ros-args":
         raise click.UsageError(f"unexpected argument {ros_args[0]}; ROS's own follow --ros-args")
+    if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
+        # a container without a home: ROS's log library would refuse to start
+        os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
         settings = _parameters(state_repo)
@@ -103,44 +113,56 @@ def _run(generator: Generator, settings: dict[str, Any]) -> None:
     library_log.setLevel(logging.DEBUG)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    signals = _Signals(node)
+    signals = _Signals()
+    # the executor spins in a thread: the main thread is free to notice a signal at once
+    spinner = Thread(target=executor.spin, name="demandops-executor")
+    spinner.start()
     node.get_logger().info(f"taking demands on {settings['action_name']} for {generator.address}")
-    try:
-        while not signals.stopping:
-            executor.spin_once(timeout_sec=0.5)
-        _drain(executor, node, generator)
-    except ExternalShutdownException:
-        generator.close(timeout=0)
-    finally:
-        executor.shutdown(timeout_sec=1)
-        node.destroy_node()
+    signals.wait()
+    _drain(executor, node, generator)
+    executor.shutdown(timeout_sec=1)
+    spinner.join(5)
+    node.destroy_node()
 
 
 def _drain(executor: SingleThreadedExecutor, node: DemandNode, generator: Generator) -> None:
     """Finish what is in hand: goals under way get their results before the node goes."""
+    node.stop_accepting()
     node.get_logger().info(f"stopping: finishing {node.open_goals} goals in hand")
     finished = generator.stop()
     while node.open_goals:
-        executor.spin_once(timeout_sec=0.1)
-    end = node.get_clock().now().nanoseconds + int(_FLUSH_S * 1e9)
-    while node.get_clock().now().nanoseconds < end:  # results leave, clients ask for them
-        executor.spin_once(timeout_sec=0.05)
+        time.sleep(_POLL_S)
+    for _ in range(2):  # results leave by tasks of the executor: let those in it pass
+        passed = Event()
+        executor.create_task(passed.set)
+        passed.wait(_TASK_S)
+    time.sleep(_FLUSH_S)  # and clients ask for them
     if not finished.result():
         node.get_logger().warning("the outbox is not empty; it is taken up at the next start")
 
 
 class _Signals:
-    """Ctrl-C and SIGTERM ask to stop; a second one stops at once."""
+    """Ctrl-C and SIGTERM ask to stop; a second one stops at once.
 
-    def __init__(self, node: DemandNode) -> None:
-        self.stopping = False
-        self._node = node
+    The kernel may hand a signal to any thread. Python writes it to the wake-up pipe in whichever,
+    so the main thread, which reads there, learns of it at once.
+    """
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._read, write = os.pipe()
+        os.set_blocking(write, False)
+        signal.set_wakeup_fd(write)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._handle)
 
+    def wait(self) -> None:
+        """Return when the process was told to stop."""
+        while not self._asked:
+            os.read(self._read, 1)
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.stopping:
+        if self._asked:
             errors.print("stopped at once; what was not published is in the outbox")
-            sys.exit(130)
-        self.stopping = True
-        self._node.stop_accepting()
+            os._exit(_EXIT_INTERRUPTED)
+        self._asked = True

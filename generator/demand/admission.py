@@ -119,6 +119,9 @@ def _connection(
             code="unsupported-connection-type",
         )
         return
+    ends_known = connection.source in catalog.nodes and connection.target in catalog.nodes
+    if not (connection.broker or ends_known):
+        return  # which broker follows from the ends, and these are told already
     if choose_broker(connection.broker, connection.source, connection.target, catalog) is None:
         yield _no_broker(where, connection, catalog)
 

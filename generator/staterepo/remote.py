@@ -34,6 +34,7 @@ _MOVED = (
     "remote rejected",
     "incorrect old value",
 )
+_TIMEOUT_S = 120
 _ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
 
 Say = Callable[[str], None]
@@ -193,8 +194,7 @@ class ClonedRepository(StateRepository):
 
     def _fetch(self, repo: git.Repo) -> None:
         try:
-            with repo.git.custom_environment(**_ENVIRONMENT):
-                repo.git.fetch("origin", "--no-tags", "--quiet", kill_after_timeout=120)
+            _git(repo, "fetch", "--no-tags", "--quiet", "origin")
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
             if "couldn't find remote ref" in text:
@@ -218,10 +218,7 @@ class ClonedRepository(StateRepository):
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Push ``commit``; the remote takes it only on top of what it has."""
         try:
-            with self._git.git.custom_environment(**_ENVIRONMENT):
-                self._git.git.push(
-                    "origin", f"{commit}:{_MAIN}", "--porcelain", "--quiet", kill_after_timeout=120
-                )
+            _git(self._git, "push", "--porcelain", "--quiet", "origin", f"{commit}:{_MAIN}")
         except git.GitCommandError as error:
             text = without_secrets(f"{error.stdout}\n{error.stderr}")
             if self.refresh() != expected:
@@ -238,6 +235,20 @@ class ClonedRepository(StateRepository):
     def always_current(self) -> bool:
         """Say no: the remote may have moved since the last fetch."""
         return False
+
+
+def _git(repo: git.Repo, *command: str) -> None:
+    """Run a git command that talks to the remote.
+
+    In a session of its own: Ctrl-C goes to every process of the terminal, and must not cut off a
+    push that the generator is waiting for.
+    """
+    with repo.git.custom_environment(**_ENVIRONMENT):
+        repo.git.execute(
+            [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
+            kill_after_timeout=_TIMEOUT_S,
+            start_new_session=True,
+        )
 
 
 def _last_line(text: str) -> str:

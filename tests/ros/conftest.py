@@ -1,0 +1,195 @@
+"""A node as people run it, and a client: real processes, real rclpy, a ROS graph of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from action_msgs.msg import GoalStatus
+from application_manager_interfaces.action import DeploymentRequest
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+
+from ros_bridge.convert import from_data
+from ros_bridge.node import DEEP
+
+ACTION = "/event_detector_operator_plugin/operator_plugin/deployment_request"
+DEADLINE_S = 60.0
+STATUS = {
+    GoalStatus.STATUS_SUCCEEDED: "succeeded",
+    GoalStatus.STATUS_ABORTED: "aborted",
+    GoalStatus.STATUS_CANCELED: "cancelled",
+}
+
+
+@pytest.fixture(scope="session")
+def ros_domain() -> int:
+    """A ROS domain for each test process, so that nothing else answers."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
+    return 120 + int(worker.removeprefix("gw") or 0) + os.getpid() % 40 * 2
+
+
+@dataclass
+class Served:
+    """A running `demandops serve`."""
+
+    process: subprocess.Popen[str]
+    state_repo: str
+    log: Path
+    environment: dict[str, str]
+
+    def demandops(self, *args: str) -> str:
+        command = [
+            sys.executable,
+            "-m",
+            "generator.cli.main",
+            *args,
+            "--state-repo",
+            self.state_repo,
+        ]
+        return subprocess.run(
+            command, env=self.environment, check=True, capture_output=True, text=True
+        ).stdout
+
+    def bookkeeping(self) -> dict[str, Any]:
+        data: dict[str, Any] = json.loads(self.demandops("bookkeeping", "--output", "json"))
+        return data
+
+    def stop(self, number: signal.Signals = signal.SIGINT) -> int:
+        self.process.send_signal(number)
+        return self.process.wait(30)
+
+
+Serve = Callable[..., Served]
+
+
+@pytest.fixture
+def serve(tmp_path: Path, ros_domain: int) -> Iterator[Serve]:
+    """Start nodes, and end those that a test leaves running."""
+    started: list[Served] = []
+    environment = {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(ros_domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(tmp_path / "ros-log"),
+        "DEMANDOPS_DATA_HOME": str(tmp_path / "data"),
+    }
+
+    def start(state_repo: str | None = None, *args: str) -> Served:
+        if state_repo is None:
+            state_repo = str(tmp_path / "state.git")
+            command = [sys.executable, "-m", "generator.cli.main", "init", state_repo, "--bare"]
+            subprocess.run(command, check=True, capture_output=True)
+        log = tmp_path / f"node-{len(started)}.log"
+        command = [sys.executable, "-m", "generator.cli.main", "serve", "--state-repo", state_repo]
+        with log.open("w") as sink:
+            process = subprocess.Popen(
+                [*command, *args], env=environment, stdout=sink, stderr=subprocess.STDOUT, text=True
+            )
+        started.append(Served(process, state_repo, log, environment))
+        return started[-1]
+
+    yield start
+    for served in started:
+        if served.process.poll() is None:
+            served.process.kill()
+            served.process.wait(10)
+
+
+@dataclass
+class Sent:
+    """A goal under way, and what was heard of it."""
+
+    handle: Any = None
+    accepted: bool | None = None
+    feedback: list[str] = field(default_factory=list)
+    status: str = ""
+    message: str = ""
+    cancel: bool | None = None
+
+    @property
+    def answered(self) -> bool:
+        return bool(self.status) or self.accepted is False
+
+
+class Client:
+    """An action client with its own executor; a test drives it."""
+
+    def __init__(self, domain: int, action: str = ACTION, deep: bool = True) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = rclpy.create_node("test_client", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        qos = (
+            {f"{service}_service_qos_profile": DEEP for service in ("goal", "result", "cancel")}
+            if deep
+            else {}
+        )
+        self._client = ActionClient(self.node, DeploymentRequest, action, **qos)
+
+    def wait(self, condition: Callable[[], bool], seconds: float = DEADLINE_S) -> None:
+        """Spin until something holds; fail the test where it does not in time."""
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, "the client waited in vain"
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def ready(self) -> None:
+        self.wait(self._client.server_is_ready)
+
+    def send(self, goal: dict[str, Any]) -> Sent:
+        """Send a goal; what is heard of it arrives while the client waits for something."""
+        sent = Sent()
+        future = self._client.send_goal_async(
+            from_data(DeploymentRequest.Goal(), goal),
+            feedback_callback=lambda told: sent.feedback.append(told.feedback.message),
+        )
+        future.add_done_callback(lambda done: self._on_response(sent, done.result()))
+        return sent
+
+    def _on_response(self, sent: Sent, handle: Any) -> None:
+        sent.handle, sent.accepted = handle, handle.accepted
+        if handle.accepted:
+            handle.get_result_async().add_done_callback(
+                lambda done: self._on_result(sent, done.result())
+            )
+
+    @staticmethod
+    def _on_result(sent: Sent, answer: Any) -> None:
+        sent.message = answer.result.message
+        sent.status = STATUS[answer.status]
+
+    def cancel(self, sent: Sent) -> bool:
+        """Ask to cancel; tell whether the server agreed."""
+        future = sent.handle.cancel_goal_async()
+        self.wait(future.done)
+        return bool(future.result().goals_canceling)
+
+    def call(self, sent: dict[str, Any]) -> Sent:
+        """Send a goal and wait for its answer."""
+        under_way = self.send(sent)
+        self.wait(lambda: under_way.answered)
+        return under_way
+
+    def close(self) -> None:
+        self._executor.shutdown(timeout_sec=1)
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+
+@pytest.fixture
+def client(ros_domain: int) -> Iterator[Client]:
+    made = Client(ros_domain)
+    yield made
+    made.close()
