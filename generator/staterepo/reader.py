@@ -111,12 +111,8 @@ class Reader:
         try:
             snapshot = snapshots.load(self._repository.objects, commit.id)
         except InvalidInput as error:
-            return Verdict(
-                entry.commit,
-                entry.summary,
-                False,
-                differing=tuple(str(found) for found in error.faults),
-            )
+            why = f"a person's file was not valid then: {error.faults[0]}"
+            return Verdict(entry.commit, entry.summary, True, why)
         differing = _differing(rendered(snapshot.state), commit)
         return Verdict(entry.commit, entry.summary, not differing, differing=differing)
 

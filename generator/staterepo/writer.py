@@ -7,12 +7,15 @@ again on the new tip.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from datetime import datetime
 
 from pygit2 import Oid, Signature
 
 from generator.decision import Decision, State, consequence, rendered
+from generator.demand.claim import Subject
+from generator.errors import Fault, InvalidInput
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.staterepo import history, message
 from generator.staterepo import snapshot as snapshots
@@ -43,28 +46,45 @@ class Line:
         self.head = self.head.after(made, decision.state, keys)
         return str(made)
 
-    def follow(self, advance: Advance, before: Snapshot, now: datetime) -> str | None:
+    def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
         """Commit what people's changes ask of the rendered files, if anything.
 
-        Raises:
-            Refused, InvalidInput: where what they changed cannot be planned or rendered.
+        What cannot be planned or rendered (a node that is in use is gone from the inventory) is
+        left as it was before, and told in the head's problems.
         """
-        state = advance.snapshot.state
+        snapshot = advance.snapshot
+        state, problems = snapshot.state, list(snapshot.problems)
+        change = Changeset({}, ())
         if advance.catalog_changed:
-            change = self._everything(state)
-        else:
-            change = consequence(state, before.state.ledger, advance.subjects, self.read)
-        if not change.files:
-            return None
-        text = message.of_follow(
-            change.releases,
-            str(advance.snapshot.commit),
-            str(before.commit),
-            advance.snapshot.problems,
-        )
-        made = self._write(change.files, text, message.generator_signature(now), now)
-        self.head = self.head.after(made, state, ())
-        return str(made)
+            try:
+                change = self._everything(state)
+            except InvalidInput as error:
+                problems += error.faults
+                state = replace(before.state, ledger=state.ledger)
+                advance = replace(advance, catalog_changed=False)
+        if not advance.catalog_changed:
+            state, change = self._carried_out(state, before, advance.subjects, problems)
+        self.head = replace(snapshot, state=state, problems=tuple(problems))
+        if change.files:
+            text = message.of_follow(
+                change.releases, str(snapshot.commit), str(before.commit), problems
+            )
+            made = self._write(change.files, text, message.generator_signature(now), now)
+            self.head = self.head.after(made, state, ())
+
+    def _carried_out(
+        self, state: State, before: Snapshot, subjects: Iterable[Subject], problems: list[Fault]
+    ) -> tuple[State, Changeset]:
+        """Plan and render the subjects that people changed; one that fails stays as it was."""
+        good = []
+        for subject in subjects:
+            try:
+                consequence(state, before.state.ledger, [subject], self.read)
+                good.append(subject)
+            except InvalidInput as error:
+                problems += error.faults
+                state = replace(state, ledger=state.ledger.restored(subject, before.state.ledger))
+        return state, consequence(state, before.state.ledger, good, self.read)
 
     def _everything(self, state: State) -> Changeset:
         files: dict[str, str | None] = dict(rendered(state))

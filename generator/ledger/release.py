@@ -1,0 +1,160 @@
+"""Releasing: which claims a shutdown means, and what remains of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from datetime import datetime
+from types import MappingProxyType
+from typing import TypeAlias
+
+from generator.demand.claim import (
+    ApplicationClaim,
+    Claim,
+    ClaimKey,
+    ConnectionClaim,
+    Subject,
+    SubjectKind,
+)
+from generator.demand.request import (
+    ApplicationDemand,
+    ConnectionDemand,
+    DemandRequest,
+    InputTopic,
+)
+from generator.errors import Fault, Refused, fault
+from generator.ledger.books import Changes, Ledger, differences
+
+
+def release(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+    """Release what a shutdown lists; raise :class:`Refused` where nothing of it is held."""
+    start = ledger
+    keys: list[ClaimKey] = []
+    not_held: list[str] = []
+    for subject, asked in _listed(request):
+        claim = _meant(ledger.of(subject), request.id, asked)
+        if claim is None:
+            not_held.append(f"{subject} for {', '.join(asked.requesters)}")
+            continue
+        rest, missing = _subtracted(claim, asked, now)
+        not_held += [f"{subject}: {name}" for name in missing]
+        ledger = ledger.replace(claim.key, rest)
+        keys.append(claim.key)
+    changes = differences(start, ledger, keys)
+    if not changes:
+        raise Refused([_nothing_held(start, request)])
+    return ledger, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
+
+
+Asked: TypeAlias = ApplicationDemand | ConnectionDemand
+
+
+def _listed(request: DemandRequest) -> Iterator[tuple[Subject, Asked]]:
+    """Yield what a shutdown lists, each once, so that a repetition does not count as not held."""
+    seen: list[Asked] = []
+    for kind, asked_of_kind in (
+        (SubjectKind.APPLICATION, request.applications),
+        (SubjectKind.CONNECTION, request.connections),
+    ):
+        for asked in asked_of_kind:
+            if asked not in seen:
+                seen.append(asked)
+                yield Subject(kind, asked.id), asked
+
+
+def _meant(claims: Iterable[Claim], request: str, asked: Asked) -> Claim | None:
+    """Return the claim that a shutdown means, or nothing: nothing is ever released by guess."""
+    claims = [claim for claim in claims if _same_ends(claim, asked)]
+    requesters = set(asked.requesters)
+    exact = [claim for claim in claims if set(claim.requesters) == requesters]
+    for claim in exact:
+        if claim.request == request:
+            return claim
+    if exact:
+        return exact[0] if len(exact) == 1 else None
+    wider = [claim for claim in claims if set(claim.requesters) >= requesters]
+    return wider[0] if len(wider) == 1 else None
+
+
+def _same_ends(claim: Claim, asked: Asked) -> bool:
+    if isinstance(claim, ApplicationClaim) and isinstance(asked, ApplicationDemand):
+        return asked.node in ("", claim.node) and asked.appdef == claim.appdef
+    if isinstance(claim, ConnectionClaim) and isinstance(asked, ConnectionDemand):
+        return (
+            asked.source in ("", claim.source)
+            and asked.target in ("", claim.target)
+            and asked.type == claim.type.value
+        )
+    return False
+
+
+def _subtracted(claim: Claim, asked: Asked, now: datetime) -> tuple[Claim | None, list[str]]:
+    """Return what remains of ``claim`` (nothing: it is dropped) and what of it was not held."""
+    if isinstance(claim, ApplicationClaim) and isinstance(asked, ApplicationDemand):
+        return _subtracted_inputs(claim, asked, now)
+    if isinstance(claim, ConnectionClaim) and isinstance(asked, ConnectionDemand):
+        return _subtracted_topics(claim, asked, now)
+    raise AssertionError("a claim and what is asked are of one kind")  # pragma: no cover
+
+
+def _subtracted_inputs(
+    claim: ApplicationClaim, asked: ApplicationDemand, now: datetime
+) -> tuple[Claim | None, list[str]]:
+    if not any(asked.inputs.values()):
+        return None, []
+    rest: dict[str, tuple[InputTopic, ...]] = {}
+    missing = []
+    for role in sorted({*claim.inputs, *asked.inputs}):
+        held = claim.inputs.get(role, ())
+        gone: set[InputTopic] = set()
+        for topic in asked.inputs.get(role, ()):
+            found = {t for t in held if t.topic == topic.topic and topic.source in ("", t.source)}
+            gone |= found
+            if not found:
+                missing.append(f"{role} {topic.topic} of {topic.source}")
+        left = tuple(topic for topic in held if topic not in gone)
+        if left:
+            rest[role] = left
+    if not rest:
+        return None, missing
+    if rest == dict(claim.inputs):
+        return claim, missing
+    return replace(claim, inputs=MappingProxyType(rest), booked=now), missing
+
+
+def _subtracted_topics(
+    claim: ConnectionClaim, asked: ConnectionDemand, now: datetime
+) -> tuple[Claim | None, list[str]]:
+    if not asked.topics:
+        return None, []
+    gone = {source for source, _ in asked.topics}
+    missing = [f"topic {topic}" for topic in sorted(gone - set(claim.topics))]
+    rest = {source: target for source, target in claim.topics.items() if source not in gone}
+    if not rest:
+        return None, missing
+    if rest == dict(claim.topics):
+        return claim, missing
+    return replace(claim, topics=MappingProxyType(rest), booked=now), missing
+
+
+def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
+    """Say that a shutdown finds nothing, with the claims that come near: a typo must show."""
+    near = [
+        f"{claim.subject} for {', '.join(claim.requesters)} (request '{claim.request}')"
+        for subject, _ in _listed(request)
+        for claim in ledger.of(subject)
+    ]
+    where = "applications[0].id" if request.applications else "connections[0].id"
+    if not near:
+        wanted = set(request.requesters())
+        near = [
+            f"{claim.subject} for {', '.join(claim.requesters)}"
+            for claim in sorted(ledger, key=lambda claim: (str(claim.subject), claim.demand))
+            if wanted & set(claim.requesters)
+        ]
+    shown = "; ".join(dict.fromkeys(near[:5])) or "none"
+    return fault(
+        where,
+        f"nothing that the shutdown lists is held; claims that come near: {shown}",
+        code="not-held",
+    )
