@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 from generator import settings
 from generator.decision import Decision, Outcome, decide
@@ -33,7 +33,7 @@ from generator.errors import (
 from generator.staterepo import history, remote, writer
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo.outbox import Entry, Slot
-from generator.staterepo.remote import RemoteAway
+from generator.staterepo.remote import PushDenied, RemoteAway
 from generator.staterepo.snapshot import Progress, Snapshot
 
 log = logging.getLogger("demandops")
@@ -80,6 +80,9 @@ class Ticket:
     told: set[str] = field(default_factory=set)
 
 
+_Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError]
+
+
 class Generator:
     """Takes demands from any thread and turns them into commits of one state repo."""
 
@@ -99,7 +102,7 @@ class Generator:
         self._slot = Slot(data or settings.data_home(state_repo))
         try:
             self._repository = remote.connect(state_repo, self._slot.folder, log.info)
-            self._snapshot, self._tip = writer.first_snapshot(self._repository, progress)
+            self._snapshot = writer.first_snapshot(self._repository, progress)
         except BaseException:
             self._slot.close()
             raise
@@ -173,6 +176,7 @@ class Generator:
             if ticket is None or ticket.state != "waiting":
                 return ticket is not None and ticket.state == "withdrawn"
             ticket.state = "withdrawn"
+            self._slot.outbox.done([operation], durably=True)  # nor may a restart take it up
         return True
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
@@ -229,15 +233,15 @@ class Generator:
 
     def _take_up(self, batch: list[Ticket]) -> None:
         """Move what waits into the batch, journaled before anything is done with it."""
-        with self._changed:
+        with self._changed:  # held while journaling: a demand is taken back before it or after
             room = self._batch_limit - len(batch)
             fresh = [self._queue.popleft() for _ in range(min(room, len(self._queue)))]
-        batch += fresh
-        self._slot.outbox.append(
-            Entry(ticket.operation, ticket.goal, ticket.received.isoformat(), ticket.base)
-            for ticket in fresh
-            if ticket.operation not in self._slot.outbox.pending
-        )
+            batch += fresh
+            self._slot.outbox.append(
+                Entry(ticket.operation, ticket.goal, ticket.received.isoformat(), ticket.base)
+                for ticket in fresh
+                if ticket.state == "waiting" and ticket.operation not in self._slot.outbox.pending
+            )
 
     def _settle(self, batch: list[Ticket]) -> None:
         """Take up what waits and bring it to an end, however often the remote moves."""
@@ -255,8 +259,7 @@ class Generator:
                     verdict_is_current = True
                     if self._repository.refresh() != line.start.commit:
                         continue
-                if line.publish():
-                    self._snapshot, self._tip = line.head, line.head.commit
+                if self._publish(line, results):
                     self._answer(batch, results)
                     return
                 log.info("the state repo has moved; judging %d demands again", len(batch))
@@ -271,6 +274,17 @@ class Generator:
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
             pause = min(pause * 2, _LONGEST_PAUSE_S)
+
+    def _publish(self, line: writer.Line, results: list[_Result]) -> bool:
+        """Publish a line; what the remote denies becomes the answer of all that is in it."""
+        try:
+            published = line.publish()
+        except PushDenied as error:
+            results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
+            return True
+        if published:
+            self._snapshot = line.head
+        return published
 
     def _line(self) -> writer.Line:
         """Start a line on the newest tip that is known, people's changes taken in."""
@@ -347,10 +361,9 @@ class Generator:
         outcome: Outcome = "released" if goal.get("shutdown") else "booked"
         return Receipt(ticket.operation, str(goal.get("id", "")), outcome, commit)
 
-    def _answer(
-        self, batch: list[Ticket], results: list[tuple[Ticket, Receipt | DemandOpsError]]
-    ) -> None:
-        self._slot.outbox.done(ticket.operation for ticket in batch)
+    def _answer(self, batch: list[Ticket], results: list[_Result]) -> None:
+        with self._changed:
+            self._slot.outbox.done(ticket.operation for ticket in batch)
         for ticket, result in results:
             self._forget(ticket)
             if isinstance(result, Receipt):
@@ -363,7 +376,7 @@ class Generator:
     def _fail(self, batch: list[Ticket], error: DemandOpsError, keep: bool = False) -> None:
         """Answer every demand of a batch with an error; ``keep`` leaves them in the outbox."""
         if not keep:
-            with suppress(OSError):  # a disk that is full must not keep them from an answer
+            with self._changed, suppress(OSError):  # a full disk must not withhold the answer
                 self._slot.outbox.done(ticket.operation for ticket in batch)
         for ticket in batch:
             self._forget(ticket)

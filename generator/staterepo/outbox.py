@@ -30,7 +30,7 @@ class Entry:
 
 
 class Outbox:
-    """The journal of one process. Not thread-safe: the writer alone uses it."""
+    """The journal of one process. Not thread-safe: its user locks."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -47,16 +47,18 @@ class Outbox:
             self._file.write("".join(lines))
             self._sync()
 
-    def done(self, operations: Iterable[str]) -> None:
+    def done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Forget demands that are published, refused or withdrawn.
 
-        Not fsynced by itself: the next :meth:`append` does it, and only after it could a demand
-        exist that a replay of these would harm.
+        Not fsynced unless told so: the next :meth:`append` does it, and only after it could a
+        demand exist that a replay of these would harm.
         """
         for operation in operations:
             if self.pending.pop(operation, None) is not None:
                 self._file.write(json.dumps({"done": operation}) + "\n")
         self._file.flush()
+        if durably:
+            self._sync()
         if not self.pending and self._file.tell() > _COMPACT_ABOVE:
             self._compact()
 

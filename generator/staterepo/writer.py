@@ -124,8 +124,8 @@ class Line:
         return self._repository.publish(self.start.commit, self.head.commit)
 
 
-def first_snapshot(repository: StateRepository, progress: Progress) -> tuple[Snapshot, Oid]:
-    """Load the books at the generator's last commit, and return them with the tip.
+def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
+    """Load the books at the generator's last commit.
 
     What people changed since then is taken in by :func:`generator.staterepo.snapshot.advance`,
     as it would have been had the generator been running.
@@ -136,4 +136,4 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> tuple[Sna
     """
     tip = repository.tip()
     base = history.last_generated(repository.objects, tip)
-    return snapshots.load(repository.objects, base or tip, progress), tip
+    return snapshots.load(repository.objects, base or tip, progress)
