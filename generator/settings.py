@@ -28,6 +28,9 @@ DEFAULT_ACTION_NAME = "/event_detector_operator_plugin/operator_plugin/deploymen
 QUEUE_LIMIT = 10_000
 """Demands that may wait at once; beyond it a new one is rejected rather than kept in memory."""
 
+GENERATED_ROOTS = ("bootstrap", "clusters")
+"""The top-level folders whose every file follows from ledger and configuration."""
+
 _PACKAGE = Path(__file__).parent
 
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import partial
 from types import MappingProxyType
-from typing import Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, StringConstraints
 
 from generator import yamlio
 from generator.catalog.appdef import ApplicationDefinition, Service
@@ -27,7 +27,7 @@ from generator.catalog.inventory import (
     Node,
     NodesFile,
 )
-from generator.catalog.model import DnsLabel, FileModel, parse_file
+from generator.catalog.model import DnsLabel, FileModel, Frozen, parse_file
 from generator.catalog.registry import Chart, ChartsFile, Image, ImagesFile
 from generator.errors import Fault, InvalidInput, fault, near
 from generator.settings import RENDER_VERSION
@@ -49,6 +49,18 @@ CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs")
 """The top-level entries of a state repo that people own and the catalog is made from."""
 
 
+class Flux(Frozen):
+    """How the clusters' Flux reaches this repo: the GitRepository of each access domain."""
+
+    url: Annotated[
+        str, StringConstraints(pattern=r"^(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+$")
+    ]
+    interval: Annotated[
+        str, StringConstraints(pattern=r"^(\d+h)?(\d+m)?(\d+s)?$", min_length=2)
+    ] = "1m"
+    secret: DnsLabel | None = None
+
+
 class Repository(FileModel):
     """``demandops.yaml``: what the whole state repo has in common."""
 
@@ -56,6 +68,7 @@ class Repository(FileModel):
     gitops: Literal["flux"]
     render_version: int = Field(alias="renderVersion", ge=1)
     source: DnsLabel = "demandops"
+    flux: Flux
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,15 +35,31 @@ from generator.staterepo import layout, reader
     help="Make a bare repository, which `serve` and `request` use in place. Without it DIR has the "
     "files checked out, ready to be pushed to a Git server.",
 )
+@click.option(
+    "--url",
+    default="",
+    metavar="URL",
+    help="Where the clusters will fetch the state repo from (https or ssh); it stands in "
+    "demandops.yaml and can be changed there.",
+)
 @output_option
-def init(directory: Path, gitops: str, bare: bool, output: str) -> None:
-    """Lay down a new state repo: the skeleton, the application definitions and a first commit."""
-    commit = layout.init(directory, datetime.now(timezone.utc), bare=bare, gitops=gitops)
+def init(directory: Path, gitops: str, bare: bool, url: str, output: str) -> None:
+    """Lay down a new state repo: the skeleton, the application definitions and a first commit.
+
+    To make a cluster follow it, with Flux installed there:
+
+        git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
+    """
+    commit = layout.init(directory, datetime.now(timezone.utc), bare=bare, gitops=gitops, url=url)
     if output == "json":
         print_json({"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare})
         return
     out = console()
     out.print(f"state repo in {directory}, first commit {commit[:10]} on main")
+    out.print(
+        f"a cluster follows it after: git -C {directory} show main:bootstrap/c-its.yaml | "
+        "kubectl apply -f -"
+    )
     if bare:
         out.print(f"next: demandops serve --state-repo {directory}")
         out.print(f"to see or edit its files: git clone {directory}")

@@ -25,7 +25,7 @@ from generator.errors import Fault, InvalidInput, fault
 KUBERNETES_VERSION = "1.36.0"
 """The release whose schemas built-in kinds are held against."""
 
-OWN_ROOTS = ("clusters/", "ledger/")
+OWN_ROOTS = ("bootstrap/", "clusters/", "ledger/")
 
 _BUILT_IN = frozenset({"v1", "apps/v1", "rbac.authorization.k8s.io/v1"})
 
@@ -65,7 +65,7 @@ def check_files(files: Mapping[str, str | None]) -> None:
     for path, text in sorted(files.items()):
         if not path.startswith(OWN_ROOTS) or ".." in path.split("/"):
             faults.append(fault("", "is not the generator's to write").within(path))
-        if text is None or not path.startswith("clusters/"):
+        if text is None or path.startswith("ledger/"):
             continue
         for document in _documents(path, text, faults):
             faults += _check_object(path, document, seen)
@@ -91,7 +91,7 @@ def _check_object(
     metadata = document.get("metadata") or {}
     api, kind = str(document.get("apiVersion")), str(document.get("kind"))
     identity = (api, kind, str(metadata.get("namespace")), str(metadata.get("name")))
-    cluster = path.split("/")[1]
+    cluster = path.split("/")[1].removesuffix(".yaml")
     other = seen.setdefault((cluster, *identity[1:]), path)
     if other != path:
         yield fault("metadata.name", f"{kind} {identity[3]} stands in {other} too").within(path)

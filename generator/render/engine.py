@@ -7,6 +7,7 @@ come from its ``templates`` folder, those of appdefs from the catalog's files.
 
 from __future__ import annotations
 
+import re
 import traceback
 from collections.abc import Mapping
 from typing import Any
@@ -72,10 +73,18 @@ def _literal(value: str, indent: int) -> _Verbatim:
     return _Verbatim("\n".join(pad + line for line in value.rstrip("\n").split("\n")))
 
 
+def _bare(value: str) -> _Verbatim:
+    """Return ``value`` without quotes, for comments: it must be a plain path."""
+    if not re.fullmatch(r"[A-Za-z0-9._/-]+", value):
+        raise ValueError(f"'{value}' cannot stand in a comment")
+    return _Verbatim(value)
+
+
 def _configure(environment: Environment) -> Environment:
     environment.filters.pop("tojson", None)  # everything is JSON already; twice would be text
     environment.filters["block"] = _block
     environment.filters["literal"] = _literal
+    environment.filters["bare"] = _bare
     environment.filters["ros_name"] = naming.ros_name
     return environment
 

@@ -14,8 +14,10 @@ from generator.plan.release import Release, ServiceRelease
 from generator.render import connections
 from generator.render.check import check_values
 from generator.render.engine import Engine
+from generator.settings import MAIN_BRANCH
 
 CLUSTERS_ROOT = "clusters"
+BOOTSTRAP_ROOT = "bootstrap"
 
 
 def domain_folder(cluster: str, domain: AccessDomain) -> str:
@@ -59,10 +61,14 @@ def chart_object(name: str, chart: Chart) -> str:
 def standing_files(catalog: Catalog, engine: Engine) -> dict[str, str]:
     """Return the files that stay when nothing is demanded.
 
-    For each access domain on each cluster its chart sources and a placeholder: Git drops empty
-    folders, and a missing folder makes Flux and Argo CD fail instead of pruning.
+    For each cluster what makes its Flux follow the repo; for each access domain on it the chart
+    sources and a placeholder: Git drops empty folders, and a missing folder makes Flux and Argo CD
+    fail instead of pruning.
     """
-    files = {}
+    files = {
+        f"{BOOTSTRAP_ROOT}/{cluster}.yaml": _bootstrap(cluster, catalog, engine)
+        for cluster in sorted({cluster for cluster, _ in domains_in_use(catalog)})
+    }
     for cluster, domain in domains_in_use(catalog):
         folder = domain_folder(cluster, domain)
         files[f"{folder}/_domain.yaml"] = engine.text(
@@ -78,6 +84,19 @@ def standing_files(catalog: Catalog, engine: Engine) -> dict[str, str]:
                 source=catalog.repository.source,
             )
     return files
+
+
+def _bootstrap(cluster: str, catalog: Catalog, engine: Engine) -> str:
+    domains = [domain for name, domain in domains_in_use(catalog) if name == cluster]
+    return engine.text(
+        "flux/bootstrap.yaml.j2",
+        cluster=cluster,
+        domains=domains,
+        folders={domain.name: domain_folder(cluster, domain) for domain in domains},
+        charts=sorted({chart.folder for chart in catalog.charts.values() if chart.folder}),
+        repository=catalog.repository,
+        branch=MAIN_BRANCH,
+    )
 
 
 def domains_in_use(catalog: Catalog) -> list[tuple[str, AccessDomain]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping
 from datetime import datetime
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pygit2
 
+from generator import yamlio
 from generator.catalog.catalog import CONFIG_ROOTS, load
 from generator.decision import State, rendered
 from generator.errors import StateRepoError
@@ -18,10 +20,18 @@ from generator.staterepo import message
 from generator.staterepo import tree as trees
 
 
-def files(skeleton: Path | None = None, appdefs: Path | None = None) -> dict[str, str]:
-    """Return every file of a new state repo by path: skeleton, appdefs and what they render to."""
-    found = _read(skeleton or data_folder("skeleton"), "")
-    found |= _read(appdefs or data_folder("appdefs"), "appdefs/")
+def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
+    """Return every file of a new state repo by path: skeleton, appdefs and what they render to.
+
+    Raises:
+        InvalidInput: where ``url`` is none that a cluster can fetch from.
+    """
+    found = _read(data_folder("skeleton"), "")
+    found |= _read(data_folder("appdefs"), "appdefs/")
+    root = found["demandops.yaml"].replace("gitops: flux\n", f"gitops: {gitops}\n")
+    if url:
+        root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {yamlio.scalar(url)}", root)
+    found["demandops.yaml"] = root
     catalog = load({p: text for p, text in found.items() if p.split("/")[0] in CONFIG_ROOTS})
     return found | rendered(State.of(catalog, Ledger()))
 
@@ -34,7 +44,7 @@ def _read(folder: Path, prefix: str) -> dict[str, str]:
     }
 
 
-def init(target: Path, now: datetime, *, bare: bool, gitops: str) -> str:
+def init(target: Path, now: datetime, *, bare: bool, gitops: str, url: str = "") -> str:
     """Make a state repo and return its first commit.
 
     Args:
@@ -42,6 +52,7 @@ def init(target: Path, now: datetime, *, bare: bool, gitops: str) -> str:
         now: the time of the commit.
         bare: whether to make a bare repository, which the generator can use in place.
         gitops: which controller reads it.
+        url: where the clusters will find it; the skeleton's example where left out.
 
     Raises:
         StateRepoError: where the folder is in use. Nothing is written then.
@@ -50,7 +61,7 @@ def init(target: Path, now: datetime, *, bare: bool, gitops: str) -> str:
         raise StateRepoError(
             f"{target} exists and is not empty; name a new folder (nothing was changed)"
         )
-    content = _chosen(files(), gitops)
+    content = files(gitops=gitops, url=url)
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -62,11 +73,6 @@ def init(target: Path, now: datetime, *, bare: bool, gitops: str) -> str:
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return commit
-
-
-def _chosen(content: Mapping[str, str], gitops: str) -> dict[str, str]:
-    root = content["demandops.yaml"].replace("gitops: flux", f"gitops: {gitops}")
-    return {**content, "demandops.yaml": root}
 
 
 def _write(folder: Path, content: Mapping[str, str], now: datetime, bare: bool) -> str:

@@ -17,7 +17,7 @@ from generator.errors import Fault, InvalidInput, StateRepoError, fault
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger
 from generator.render.changeset import Read
-from generator.settings import RENDER_VERSION
+from generator.settings import GENERATED_ROOTS, RENDER_VERSION
 from generator.staterepo import history, remote
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
@@ -118,7 +118,7 @@ class Reader:
 
 
 def _differing(wanted: dict[str, str], commit: Commit) -> tuple[str, ...]:
-    standing = trees.texts(commit.tree, ("clusters",))
+    standing = trees.texts(commit.tree, GENERATED_ROOTS)
     return tuple(
         path
         for path in sorted({*wanted, *standing})
@@ -161,7 +161,7 @@ def check_folder(folder: Path) -> State:
         raise InvalidInput(faults)
     state = State.of(catalog, ledger)
     wanted = rendered(state)
-    for path in sorted({*wanted, *(p for p in files if p.startswith("clusters/"))}):
+    for path in sorted({*wanted, *(p for p in files if p.split("/")[0] in GENERATED_ROOTS)}):
         if wanted.get(path) != files.get(path) and not _is_note(path):
             faults.append(
                 fault(
@@ -176,7 +176,7 @@ def check_folder(folder: Path) -> State:
 
 
 def _texts(folder: Path) -> Iterator[tuple[str, str]]:
-    for root in (*CONFIG_ROOTS, "ledger", "clusters"):
+    for root in (*CONFIG_ROOTS, "ledger", *GENERATED_ROOTS):
         top = folder / root
         paths = [top] if top.is_file() else sorted(top.rglob("*"))
         for path in paths:

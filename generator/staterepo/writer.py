@@ -17,6 +17,7 @@ from generator.decision import Decision, State, consequence, rendered
 from generator.demand.claim import Subject
 from generator.errors import Fault, InvalidInput
 from generator.render.changeset import Change, Changeset, ReleaseChange
+from generator.settings import GENERATED_ROOTS
 from generator.staterepo import history, message
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
@@ -90,7 +91,7 @@ class Line:
         files: dict[str, str | None] = dict(rendered(state))
         changes = []
         standing = {
-            path for path in trees.texts(self._tree, ("clusters",)) if path.endswith(".yaml")
+            path for path in trees.texts(self._tree, GENERATED_ROOTS) if path.endswith(".yaml")
         }
         for path in standing - set(files):
             files[path] = None

@@ -28,8 +28,17 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copytree(ROOT / name, sources / name, ignore=skipped)
         else:
             shutil.copy(ROOT / name, sources / name)
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder),
-               str(sources)]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "-q",
+        "--no-deps",
+        "-w",
+        str(folder),
+        str(sources),
+    ]
     subprocess.run(command, check=True)
     return next(folder.glob("demandops-*.whl"))
 
@@ -37,10 +46,15 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     for folder, packaged in (
-        ("templates", "templates"), ("appdefs", "appdefs"), ("state-repo-skeleton", "skeleton"),
+        ("templates", "templates"),
+        ("appdefs", "appdefs"),
+        ("state-repo-skeleton", "skeleton"),
     ):
-        files = {p.relative_to(ROOT / folder).as_posix() for p in (ROOT / folder).rglob("*")
-                 if p.is_file()}
+        files = {
+            p.relative_to(ROOT / folder).as_posix()
+            for p in (ROOT / folder).rglob("*")
+            if p.is_file()
+        }
         prefix = f"generator/_data/{packaged}/"
         assert {n.removeprefix(prefix) for n in names if n.startswith(prefix)} == files
     assert not [name for name in names if name.startswith(("tests/", "examples/", "docs/"))]
@@ -66,7 +80,10 @@ def test_a_demand_is_rendered_from_the_installed_wheel(wheel: Path, tmp_path: Pa
     where = tmp_path / "env" / "bin" / "python"
     found = subprocess.run(
         [str(where), "-c", "import generator; print(generator.__file__)"],
-        cwd=tmp_path, capture_output=True, text=True, check=True,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert found.stdout.startswith(str(tmp_path))
     demandops("init", "state.git", "--bare")

@@ -1,0 +1,305 @@
+"""The one class that a test needs: a cluster with Flux, fake nodes and a Git server.
+
+    with Rig("edge", nodes=["edge"]) as rig:
+        rig.kube.apply(...)
+
+The composition root of the rig: it alone knows in which order things start. With the environment
+of `settings` it starts nothing and stands for a cluster that is there already.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+
+from . import flux, githttp, kwok, pki, settings, tools
+from .controlplane import ControlPlane
+from .errors import RigError
+from .kube import Kube
+from .net import answers, free_port, url
+from .processes import Component, Processes
+from .workdir import Workdir
+
+KEEP_VARIABLE = "E2E_KEEP"
+
+
+class Rig:
+    """One cluster; several can run at once, each with ports and a folder of its own.
+
+    `nodes` are node ids. `git_of` shares another rig's Git server, so that two clusters read one
+    state repo. `credentials` (user, password) makes the Git server ask for them. `arguments` adds
+    to a Flux controller's command line, by its name. `folder` is where data and logs go (a
+    temporary folder by default, removed at the end unless a test failed or E2E_KEEP is set).
+    """
+
+    kube: Kube
+    kubeconfig: Path
+
+    def __init__(
+        self,
+        name: str = "rig",
+        *,
+        nodes: Iterable[str] = (),
+        git_of: Rig | None = None,
+        credentials: tuple[str, str] | None = None,
+        arguments: Mapping[str, Iterable[str]] | None = None,
+        folder: Path | None = None,
+        report: tools.Report | None = None,
+    ) -> None:
+        self.name = name
+        self.timings: dict[str, float] = {}
+        self.existing = settings.existing(name)
+        self._initial, self._git_of, self._credentials = list(nodes), git_of, credentials
+        self._arguments = {key: list(value) for key, value in (arguments or {}).items()}
+        self._report, self._folder = report, folder
+        self._nodes: list[str] = []
+        self._binaries: dict[str, Path] = {}
+        self._work: Workdir | None = None
+        self._processes: Processes | None = None
+        self._git_url = self._push_url = ""
+
+    def __enter__(self) -> Rig:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop(failed=kind is not None)
+
+    # --- the whole --------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start everything and wait until it is ready; what had started is stopped on failure."""
+        if self._work is not None:
+            raise RigError(f"rig {self.name}: already started")
+        try:
+            if self.existing:
+                self._adopt(self.existing)
+            else:
+                self._start_own()
+            self.add_nodes(self._initial)
+        except BaseException as error:  # an interrupt must not leave a cluster behind either
+            self.stop(failed=isinstance(error, Exception))
+            raise
+
+    def stop(self, *, failed: bool = False) -> None:
+        """Stop all that was started; the logs stay where `failed`. May be called twice."""
+        work, processes, kube = self._work, self._processes, getattr(self, "kube", None)
+        try:
+            if kube is not None and self.existing:
+                for name in self._nodes:  # on our own cluster they go with it
+                    kube.delete("Node", name)
+            if kube is not None:
+                kube.close()
+        finally:
+            self._work = self._processes = None
+            self._nodes = []
+            if processes is not None:
+                processes.stop_all()
+            if work is not None:
+                self._clear(work, failed)
+
+    def check(self) -> None:
+        """Raise RigError where a part has died unasked."""
+        if self._processes is not None:
+            self._processes.check()
+
+    # --- what tests use ---------------------------------------------------------------------
+
+    def git_url(self, repository: str) -> str:
+        """The URL by which the cluster reads a repository (`state.git`)."""
+        return f"{self._git_url}/{repository.strip('/')}"
+
+    def push_url(self, repository: str) -> str:
+        """The URL by which a test pushes to it, credentials included."""
+        return f"{self._push_url}/{repository.strip('/')}"
+
+    def repository(self, repository: str) -> Path:
+        """The bare repository on disk (for hooks and damage), created where it is not there."""
+        path = self._owned("has no repositories on this disk").repositories / repository.strip("/")
+        if self._git_of is not None:
+            return self._git_of.repository(repository)
+        if not path.exists():
+            githttp.init_bare(path)
+        return path
+
+    def add_nodes(self, node_ids: Iterable[str], timeout: float = 30.0) -> list[str]:
+        """Make fake nodes with these `node_id` labels, wait until Ready; returns their names."""
+        manifests = [kwok.manifest(node_id) for node_id in node_ids]
+        names = [manifest["metadata"]["name"] for manifest in manifests]
+        self._nodes += names
+        self.kube.apply(*manifests)
+        for name in names:
+            self.kube.wait_ready("Node", name, timeout=timeout)
+        return names
+
+    def helm(self, *arguments: str) -> str:
+        """Run the helm command on this cluster and return what it prints."""
+        helm = self._binaries.get("helm") or shutil.which("helm")
+        if helm is None:
+            helm = self._binaries["helm"] = tools.ensure(["helm"], self._report)["helm"]
+        # Somebody else's kubeconfig may call a login command that wants the person's environment.
+        clean = self._work.environment() if self._work and not self.existing else dict(os.environ)
+        environment = clean | {"KUBECONFIG": str(self.kubeconfig)}
+        done = subprocess.run(
+            [str(helm), *arguments], env=environment, capture_output=True, text=True, check=False
+        )
+        if done.returncode != 0:
+            raise RigError(f"helm {' '.join(arguments)}: {done.stderr.strip()}")
+        return done.stdout
+
+    # --- single parts -----------------------------------------------------------------------
+
+    def components(self) -> list[str]:
+        """Names of the parts that can be killed and started again."""
+        return self._own().names()
+
+    def pids(self) -> dict[str, int]:
+        """Process ids of the parts that run."""
+        return self._own().pids()
+
+    def log(self, component: str) -> Path:
+        """A part's log file."""
+        return self._own().log(component)
+
+    def kill(self, component: str) -> None:
+        """End a part as a crash would; `start_component` brings it back."""
+        self._own().kill(component)
+
+    def stop_component(self, component: str) -> None:
+        """End a part in order."""
+        self._own().stop(component)
+
+    def start_component(self, component: str) -> None:
+        """Start a part again, on the same ports and data, and wait until it is ready."""
+        self._own().start(component)
+
+    def restart(self, component: str) -> None:
+        """Stop a part in order and start it again."""
+        self.stop_component(component)
+        self.start_component(component)
+
+    def pause(self, component: str) -> None:
+        """Make a part hang: connections to it are accepted and never answered."""
+        self._own().signal(component, signal.SIGSTOP)
+
+    def resume(self, component: str) -> None:
+        """Let a paused part go on."""
+        self._own().signal(component, signal.SIGCONT)
+
+    # --- starting ---------------------------------------------------------------------------
+
+    def _adopt(self, existing: settings.Existing) -> None:
+        self.kubeconfig = existing.kubeconfig
+        self._git_url, self._push_url = existing.git_url, existing.push_url
+        work = self._work = Workdir(self.name, self._folder)
+        self.kube = Kube(existing.kubeconfig, work.path / "discovery.json")
+        for kind in ("GitRepository", "Kustomization", "HelmRelease"):
+            try:
+                self.kube.find(kind)
+            except Exception as error:
+                remedy = "install Flux (source-, kustomize- and helm-controller) there first"
+                raise RigError(f"{existing.kubeconfig}: no {kind}s: {error}; {remedy}") from error
+
+    def _start_own(self) -> None:
+        clock = _Clock(self.timings)
+        self._binaries = tools.ensure(report=self._report)
+        clock.lap("tools")
+        work = self._work = Workdir(self.name, self._folder)
+        running = self._processes = Processes(work.logs, work.environment())
+        certificates = pki.make(work.path / "pki")
+        plane = ControlPlane.plan(self._binaries, work.path, certificates)
+        running.start_together([plane.etcd(), *self._git(work)])
+        clock.lap("etcd and git")
+        running.start_together([plane.apiserver()])
+        clock.lap("kube-apiserver")
+        path = work.path / "kubeconfig"
+        self.kubeconfig = pki.write_kubeconfig(path, self.name, plane.server, certificates)
+        self.kube = Kube(self.kubeconfig, work.path / "discovery.json", self.check)
+        self.kube.install_crds(tools.crd_files(self._binaries))
+        namespace = {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": flux.NAMESPACE}}
+        self.kube.apply(namespace)
+        clock.lap("Flux's CRDs")
+        running.start_together(
+            [
+                plane.controller_manager(path),
+                plane.scheduler(path),
+                kwok.component(self._binaries["kwok"], path),
+                *flux.components(self._binaries, work.path, path, self._arguments),
+            ]
+        )
+        # Until the controller manager has made it, a namespace admits no pods.
+        account = ("ServiceAccount", "default", "default")
+        self.kube.wait("the default service account", lambda: self.kube.get(*account))
+        clock.lap("controllers")
+
+    def _git(self, work: Workdir) -> list[Component]:
+        if self._git_of is not None:
+            self._git_url, self._push_url = self._git_of._git_url, self._git_of._push_url
+            return []
+        port = free_port()
+        self._git_url = self._push_url = url(port)
+        environment: dict[str, str] = {}
+        if self._credentials is not None:
+            user, password = self._credentials
+            environment = {githttp.USER_VARIABLE: user, githttp.PASSWORD_VARIABLE: password}
+            self._push_url = self._git_url.replace("://", f"://{user}:{password}@", 1)
+        argv = [sys.executable, "-I", "-S", githttp.__file__]
+        argv += ["--root", str(work.repositories), "--port", str(port)]
+        return [Component("git", tuple(argv), answers(port, githttp.HEALTH), environment)]
+
+    # --- inside -----------------------------------------------------------------------------
+
+    def _own(self) -> Processes:
+        if self._processes is None:
+            raise RigError(f"rig {self.name}: runs no processes of its own")
+        return self._processes
+
+    def _owned(self, what: str) -> Workdir:
+        if self._work is None or self.existing:
+            raise RigError(f"rig {self.name}: {what}")
+        return self._work
+
+    def _clear(self, work: Workdir, failed: bool) -> None:
+        if os.environ.get(KEEP_VARIABLE):
+            print(f"rig {self.name}: kept {work.path}", file=sys.stderr)
+            return
+        work.clear(keep_logs=failed)
+        if failed and not self.existing:
+            print(f"rig {self.name}: logs are in {work.logs}", file=sys.stderr)
+
+
+class _Clock:
+    """Notes how long each stage of a start took, in seconds."""
+
+    def __init__(self, timings: dict[str, float]) -> None:
+        self._timings, self._last = timings, time.monotonic()
+
+    def lap(self, stage: str) -> None:
+        now = time.monotonic()
+        self._timings[stage] = round(now - self._last, 2)
+        self._last = now
+
+
+def start_all(*rigs: Rig) -> None:
+    """Start several rigs at the same time; where one fails, all are stopped."""
+    try:
+        with ThreadPoolExecutor(max_workers=len(rigs)) as pool:
+            for job in [pool.submit(rig.start) for rig in rigs]:
+                job.result()
+    except BaseException:
+        for rig in rigs:
+            rig.stop(failed=True)
+        raise

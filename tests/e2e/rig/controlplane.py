@@ -1,0 +1,117 @@
+"""How a control plane without containers is started: etcd, API server, controllers, scheduler.
+
+It turns ports, certificates and paths of programs into `Component`s and starts nothing itself.
+Everything listens on loopback. What the tests throw away needs no safety on disk, so etcd does not
+flush, and nobody else wants to lead, so nobody elects a leader.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from .net import LOOPBACK, answers, free_port, url
+from .pki import Pki
+from .processes import Component
+
+_SERVICES = "10.96.0.0/16"
+
+
+@dataclass(frozen=True)
+class ControlPlane:
+    """One control plane's ports and files."""
+
+    binaries: dict[str, Path]
+    folder: Path
+    pki: Pki
+    etcd_port: int
+    api_port: int
+
+    @staticmethod
+    def plan(binaries: dict[str, Path], folder: Path, pki: Pki) -> ControlPlane:
+        """Choose free ports."""
+        return ControlPlane(binaries, folder, pki, free_port(), free_port())
+
+    @property
+    def server(self) -> str:
+        """The API server's URL."""
+        return url(self.api_port, "https")
+
+    def etcd(self) -> Component:
+        """The store; it keeps its data through a restart."""
+        client, peer = url(self.etcd_port), url(free_port())
+        argv = [
+            str(self.binaries["etcd"]),
+            "--name=rig",
+            f"--data-dir={self.folder / 'etcd'}",
+            f"--listen-client-urls={client}",
+            f"--advertise-client-urls={client}",
+            f"--listen-peer-urls={peer}",
+            f"--initial-advertise-peer-urls={peer}",
+            f"--initial-cluster=rig={peer}",
+            "--unsafe-no-fsync",
+            "--log-level=warn",
+        ]
+        return Component("etcd", tuple(argv), answers(self.etcd_port, "/readyz"))
+
+    def apiserver(self) -> Component:
+        """The API server; ready once its own post-start hooks are done."""
+        pki = self.pki
+        argv = [
+            str(self.binaries["kube-apiserver"]),
+            f"--etcd-servers={url(self.etcd_port)}",
+            f"--bind-address={LOOPBACK}",
+            f"--advertise-address={LOOPBACK}",
+            f"--secure-port={self.api_port}",
+            f"--cert-dir={self.folder / 'apiserver'}",
+            f"--tls-cert-file={pki.server_certificate}",
+            f"--tls-private-key-file={pki.server_key}",
+            f"--client-ca-file={pki.authority}",
+            "--service-account-issuer=https://kubernetes.default.svc",
+            f"--service-account-key-file={pki.account_public}",
+            f"--service-account-signing-key-file={pki.account_private}",
+            f"--service-cluster-ip-range={_SERVICES}",
+            "--authorization-mode=RBAC",
+            "--allow-privileged=true",
+            # Loopback is no address for a Service's endpoints: the API server would refuse its own.
+            "--endpoint-reconciler-type=none",
+        ]
+        probe = answers(self.api_port, "/readyz", pki.authority)
+        return Component("kube-apiserver", tuple(argv), probe)
+
+    def controller_manager(self, kubeconfig: Path) -> Component:
+        """The controllers that turn a Deployment into pods, and collect what lost its owner."""
+        port = free_port()
+        argv = [
+            str(self.binaries["kube-controller-manager"]),
+            f"--kubeconfig={kubeconfig}",
+            f"--service-account-private-key-file={self.pki.account_private}",
+            f"--root-ca-file={self.pki.authority}",
+            # With the defaults of 20 and 30 a burst of releases waits for this client, not for us.
+            "--kube-api-qps=200",
+            "--kube-api-burst=400",
+            *self._serving(port),
+        ]
+        probe = answers(port, "/healthz", self.pki.authority)
+        return Component("kube-controller-manager", tuple(argv), probe)
+
+    def scheduler(self, kubeconfig: Path) -> Component:
+        """The scheduler: node selectors mean something only with it."""
+        port = free_port()
+        argv = [
+            str(self.binaries["kube-scheduler"]),
+            f"--kubeconfig={kubeconfig}",
+            *self._serving(port),
+        ]
+        return Component(
+            "kube-scheduler", tuple(argv), answers(port, "/healthz", self.pki.authority)
+        )
+
+    def _serving(self, port: int) -> list[str]:
+        return [
+            "--leader-elect=false",
+            f"--bind-address={LOOPBACK}",
+            f"--secure-port={port}",
+            f"--tls-cert-file={self.pki.server_certificate}",
+            f"--tls-private-key-file={self.pki.server_key}",
+        ]

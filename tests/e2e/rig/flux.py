@@ -1,0 +1,62 @@
+"""Flux's source-, kustomize- and helm-controller as plain processes.
+
+They take the cluster from `KUBECONFIG` (they have no flag for it) and run as its administrator;
+what a release may do is limited by the service account it names, which they impersonate.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .net import LOOPBACK, answers, free_port
+from .processes import Component
+
+NAMESPACE = "flux-system"
+CONTROLLERS = ("source-controller", "kustomize-controller", "helm-controller")
+
+
+def components(
+    binaries: dict[str, Path], folder: Path, kubeconfig: Path, own: dict[str, list[str]]
+) -> list[Component]:
+    """The three controllers; `own` holds further arguments by controller name."""
+    storage = folder / "artifacts"
+    storage.mkdir(parents=True, exist_ok=True)
+    artifacts = f"{LOOPBACK}:{free_port()}"
+    extra = {
+        "source-controller": [
+            f"--storage-path={storage}",
+            f"--storage-addr={artifacts}",
+            f"--storage-adv-addr={artifacts}",
+        ],
+        "kustomize-controller": ["--no-remote-bases=true"],
+        # By default it waits up to ten minutes for running releases before it ends.
+        "helm-controller": ["--graceful-shutdown-timeout=5s"],
+    }
+    return [
+        _component(name, binaries[name], kubeconfig, [*extra[name], *own.get(name, [])])
+        for name in CONTROLLERS
+    ]
+
+
+def _component(name: str, binary: Path, kubeconfig: Path, extra: list[str]) -> Component:
+    port = free_port()
+    argv = [
+        str(binary),
+        "--metrics-addr=0",
+        f"--health-addr={LOOPBACK}:{port}",
+        "--enable-leader-election=false",
+        "--watch-all-namespaces=true",
+        "--log-level=info",
+        # Tests wait for what these shorten: half a minute between looks at an unready dependency,
+        # three quarters of a second after an object's first look (which only sets the finalizer),
+        # up to a quarter of an hour after repeated faults, and chance in every interval.
+        "--requeue-dependency=1s",
+        "--min-retry-delay=50ms",
+        "--max-retry-delay=5s",
+        "--interval-jitter-percentage=0",
+        "--kube-api-qps=200",
+        "--kube-api-burst=400",
+        *extra,
+    ]
+    environment = {"KUBECONFIG": str(kubeconfig), "RUNTIME_NAMESPACE": NAMESPACE}
+    return Component(name, tuple(argv), answers(port, "/readyz"), environment)

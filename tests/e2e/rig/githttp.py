@@ -1,0 +1,242 @@
+"""A smart-HTTP Git server over `git http-backend`, for the state repo.
+
+Runs as a process of its own (`python githttp.py --root DIR --port N`), so that tests can kill it or
+make it hang like any other part of the rig, and needs nothing but Python and Git. Pushing is
+allowed and a push to a repository that is not there creates it. With GIT_HTTP_USER and
+GIT_HTTP_PASSWORD in its environment it wants those by basic authentication.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import contextlib
+import hmac
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path, PurePosixPath
+from typing import IO
+from urllib.parse import parse_qs, unquote
+
+USER_VARIABLE = "GIT_HTTP_USER"
+PASSWORD_VARIABLE = "GIT_HTTP_PASSWORD"  # noqa: S105 - a variable's name
+HEALTH = "/-/healthz"
+_CHUNK = 64 * 1024
+
+# Set for every backend, whatever the host's configuration says. A garbage collection in the
+# background would outlive its push and race with the next.
+_CONFIGURATION = {
+    "core.fsync": "none",
+    "gc.auto": "0",
+    "http.receivepack": "true",
+    "receive.autogc": "false",
+    "safe.directory": "*",
+    "uploadpack.allowAnySHA1InWant": "true",
+    "uploadpack.allowFilter": "true",
+}
+
+
+class GitServer(ThreadingHTTPServer):
+    """Serves every repository below one folder."""
+
+    daemon_threads = True
+    request_queue_size = 128
+
+    def __init__(self, root: Path, address: str, port: int) -> None:
+        super().__init__((address, port), _Handler)
+        self.root = root.resolve()
+        user, password = os.environ.get(USER_VARIABLE), os.environ.get(PASSWORD_VARIABLE)
+        self.expected = ""
+        if user and password:
+            self.expected = "Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()
+        program = shutil.which("git")
+        if program is None:
+            raise SystemExit("`git` is not on PATH: install Git")
+        self.git = program
+
+    def environment(self) -> dict[str, str]:
+        """The environment of Git's processes."""
+        return _environment(self.root)
+
+
+def _environment(root: Path) -> dict[str, str]:
+    settings = {"GIT_CONFIG_COUNT": str(len(_CONFIGURATION))}
+    for number, (key, value) in enumerate(_CONFIGURATION.items()):
+        settings |= {f"GIT_CONFIG_KEY_{number}": key, f"GIT_CONFIG_VALUE_{number}": value}
+    return {
+        "PATH": os.environ.get("PATH", os.defpath),
+        "HOME": str(root),
+        "GIT_CONFIG_NOSYSTEM": "1",
+        "GIT_CONFIG_GLOBAL": os.devnull,
+        "GIT_HTTP_EXPORT_ALL": "1",
+        "GIT_PROJECT_ROOT": str(root),
+        **settings,
+    }
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"  # or a client that asks "may I go on?" would wait for an answer
+    server: GitServer
+
+    def do_GET(self) -> None:
+        self._serve()
+
+    def do_POST(self) -> None:
+        self._serve()
+
+    def _serve(self) -> None:
+        self.close_connection = True  # answers have no length, so their end is the connection's
+        path, _, query = self.path.partition("?")
+        path = unquote(path)
+        if path == HEALTH:
+            self._answer(HTTPStatus.OK, "serving")
+        elif not self._allowed():
+            self._answer(HTTPStatus.UNAUTHORIZED, "credentials, please")
+        elif ".." in PurePosixPath(path).parts:
+            self._answer(HTTPStatus.BAD_REQUEST, "no '..' in a path")
+        else:
+            self._create_for_push(path, query)
+            self._run_backend(path, query)
+
+    def _allowed(self) -> bool:
+        given = self.headers.get("Authorization", "")
+        return hmac.compare_digest(given.encode(), self.server.expected.encode()) or (
+            not self.server.expected
+        )
+
+    def _answer(self, status: HTTPStatus, text: str) -> None:
+        body = f"{text}\n".encode()
+        self.send_response(status)
+        if status is HTTPStatus.UNAUTHORIZED:
+            self.send_header("WWW-Authenticate", 'Basic realm="rig"')
+        self.send_header("Content-Type", "text/plain; charset=utf-8")
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(body)
+
+    def _create_for_push(self, path: str, query: str) -> None:
+        asked = path.removesuffix("/info/refs")
+        pushing = parse_qs(query).get("service") == ["git-receive-pack"]
+        repository = self.server.root / asked.strip("/")
+        if asked != path and pushing and asked.endswith(".git") and not repository.exists():
+            init_bare(repository, self.server.git)
+
+    def _run_backend(self, path: str, query: str) -> None:
+        backend = subprocess.Popen(
+            [self.server.git, "http-backend"],
+            env=self.server.environment() | self._request_variables(path, query),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        assert backend.stdin is not None
+        assert backend.stdout is not None
+        feeder = threading.Thread(target=self._feed, args=(backend.stdin,), daemon=True)
+        feeder.start()  # beside the reading: a backend may answer before it has read all
+        try:
+            self._relay(backend.stdout)
+        except OSError:
+            backend.kill()  # the client has gone
+        finally:
+            backend.stdout.close()
+            backend.wait()
+            feeder.join(timeout=10)
+
+    def _request_variables(self, path: str, query: str) -> dict[str, str]:
+        headers = self.headers
+        variables = {
+            "REQUEST_METHOD": self.command,
+            "PATH_INFO": path,
+            "QUERY_STRING": query,
+            "REMOTE_ADDR": str(self.client_address[0]),
+            "SERVER_PROTOCOL": self.request_version,
+            "CONTENT_TYPE": headers.get("Content-Type", ""),
+            "HTTP_CONTENT_ENCODING": headers.get("Content-Encoding", ""),
+            "GIT_PROTOCOL": headers.get("Git-Protocol", ""),
+            "CONTENT_LENGTH": headers.get("Content-Length", ""),
+        }
+        return {name: value for name, value in variables.items() if value}
+
+    def _feed(self, stdin: IO[bytes]) -> None:
+        """Hand the request's body on; read it to its end even where the backend has given up."""
+        listening = True
+        try:
+            for chunk in self._body():
+                if listening:
+                    try:
+                        stdin.write(chunk)
+                    except BrokenPipeError:
+                        listening = False
+        except (OSError, ValueError) as error:
+            self.log_error("request body: %s", error)
+        finally:
+            with contextlib.suppress(BrokenPipeError):
+                stdin.close()
+
+    def _body(self) -> Iterator[bytes]:
+        if "chunked" in self.headers.get("Transfer-Encoding", "").lower():  # packs above 1 MB
+            while size := int(self.rfile.readline().split(b";")[0], 16):
+                yield from self._read(size)
+                self.rfile.readline()
+            while self.rfile.readline().strip():
+                pass  # trailers
+        else:
+            yield from self._read(int(self.headers.get("Content-Length") or 0))
+
+    def _read(self, left: int) -> Iterator[bytes]:
+        while left > 0:
+            chunk = self.rfile.read(min(left, _CHUNK))
+            if not chunk:
+                raise ValueError(f"the connection ended {left} bytes early")
+            left -= len(chunk)
+            yield chunk
+
+    def _relay(self, stdout: IO[bytes]) -> None:
+        status, headers = HTTPStatus.OK.value, []
+        while line := stdout.readline().strip():
+            name, _, value = line.decode("latin-1").partition(":")
+            if name.lower() == "status":
+                status = int(value.split()[0])
+            else:
+                headers.append((name, value.strip()))
+        if not headers:
+            self._answer(HTTPStatus.BAD_GATEWAY, "git http-backend gave no answer, see the log")
+            return
+        self.send_response(status)
+        for name, value in [*headers, ("Connection", "close")]:
+            self.send_header(name, value)
+        self.end_headers()
+        shutil.copyfileobj(stdout, self.wfile, _CHUNK)
+
+
+def init_bare(repository: Path, git: str = "git") -> None:
+    """Create an empty bare repository whose default branch is main."""
+    repository.parent.mkdir(parents=True, exist_ok=True)
+    subprocess.run(
+        [git, "init", "--quiet", "--bare", "--initial-branch=main", str(repository)],
+        check=True,
+        env=_environment(repository.parent),
+    )
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(description="serve the Git repositories below a folder")
+    parser.add_argument("--root", type=Path, required=True)
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--address", default="127.0.0.1", help="for a cluster in containers")
+    options = parser.parse_args()
+    options.root.mkdir(parents=True, exist_ok=True)
+    server = GitServer(options.root, options.address, options.port)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    server.serve_forever(poll_interval=0.2)
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,202 @@
+"""Run the Go toolchain on one wrapper module, with progress: the only place that knows `go`.
+
+Used by `tools` alone. Builds go by the committed `go.mod` and `go.sum`, whatever the caller's Go
+settings are, with the Go that is installed (no toolchain is fetched), and at the lowest priority:
+a cold build takes about twenty minutes of both cores.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import re
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from . import launch
+from .errors import RigError
+
+JOBS_VARIABLE = "DEMANDOPS_E2E_BUILD_JOBS"
+REMEDY = (
+    "install Go {needed} or newer and put it on PATH (the distribution's package `golang`, or the "
+    "archive that the Go project publishes)"
+)
+_EVERY_SECONDS = 10.0
+_SHOWN_LINES = 40
+
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Go:
+    """An installed Go toolchain."""
+
+    program: str
+    version: str  # as in go1.26.8
+    target: str  # as in linux/amd64
+
+    @staticmethod
+    def find() -> Go:
+        """The Go on PATH; raises RigError with what to install where there is none."""
+        program = shutil.which("go")
+        if program is None:
+            raise RigError("tests/e2e/tools: `go` is not on PATH: " + REMEDY.format(needed="1.26"))
+        asked = ["GOVERSION", "GOOS", "GOARCH"]
+        version, system, machine = _output([program, "env", *asked], Path("/")).splitlines()
+        return Go(program, version, f"{system}/{machine}")
+
+    def check(self, wrapper: Path) -> None:
+        """Raise RigError where this Go is older than what the wrapper's `go.mod` needs."""
+        found = re.search(r"^go (\S+)$", (wrapper / "go.mod").read_text(), re.MULTILINE)
+        needed = found.group(1) if found else "1.26"
+        if _numbers(self.version) < _numbers(needed):
+            have = f"{self.program} is {self.version}, too old for {wrapper / 'go.mod'}"
+            raise RigError(f"{have}: {REMEDY.format(needed=needed)}")
+
+
+def build(
+    go: Go, wrapper: Path, package: str, flags: list[str], target: Path, report: Report
+) -> None:
+    """Build `package` as pinned by `wrapper` into the file `target`."""
+    go.check(wrapper)
+    report("resolving modules")
+    packages: set[str] = set()
+    fetched = _Counter(report, "fetched {count} modules")
+    listing = _watched([go.program, "list", "-deps", package], wrapper, fetched.line)
+    packages.update(listing.split())
+    compiled = _Counter(report, f"compiled {{count}} of at most {len(packages)} packages", packages)
+    argv = [go.program, "build", "-v", *flags, "-o", str(target), package]
+    _watched(argv, wrapper, compiled.line, tick=compiled.tick)
+
+
+def module_folder(go: Go, wrapper: Path, module: str) -> str:
+    """The folder of a module's unpacked sources."""
+    return _output([go.program, "list", "-m", "-f", "{{.Dir}}", module], wrapper).strip()
+
+
+class _Counter:
+    """Counts lines of progress and reports them at most every few seconds."""
+
+    def __init__(self, report: Report, text: str, expected: set[str] | None = None) -> None:
+        self._report, self._text, self._expected = report, text, expected
+        self._count, self._start = 0, time.monotonic()
+        self._last = self._start
+
+    def line(self, line: str) -> bool:
+        """Whether the line was mere progress rather than something a person must read."""
+        progress = line.startswith("go: downloading")
+        if self._expected is not None:
+            progress = progress or line in self._expected
+        self._count += progress
+        self.tick()
+        return progress
+
+    def tick(self) -> None:
+        now = time.monotonic()
+        if now - self._last >= _EVERY_SECONDS:
+            self._last = now
+            text = self._text.format(count=self._count)
+            self._report(f"{text}, {now - self._start:.0f} s")
+
+
+def _watched(
+    argv: list[str],
+    folder: Path,
+    line: Callable[[str], bool],
+    tick: Callable[[], None] = lambda: None,
+) -> str:
+    """Run a command, hand each line of its standard error on, and return its standard output."""
+    process = subprocess.Popen(
+        launch.command(argv[0], *argv[1:], niceness=19),
+        cwd=folder,
+        env=_environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    errors: queue.Queue[str | None] = queue.Queue()
+    output: list[str] = []
+    stdout = process.stdout
+    threads = [
+        threading.Thread(target=_pump, args=(process.stderr, errors), daemon=True),
+        threading.Thread(target=lambda: output.append(stdout.read()), daemon=True),
+    ]
+    for thread in threads:
+        thread.start()
+    try:
+        shown = _follow(errors, line, tick)
+        code = process.wait()
+    except BaseException:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        raise
+    finally:
+        for thread in threads:
+            thread.join(timeout=5)
+        process.stdout.close()
+        process.stderr.close()
+    if code != 0:
+        tail = "\n".join(f"  {text}" for text in shown)
+        raise RigError(f"{folder}: `go {' '.join(argv[1:])}` failed with {code}:\n{tail}")
+    return "".join(output)
+
+
+def _pump(stream: IO[str], lines: queue.Queue[str | None]) -> None:
+    for text in stream:
+        lines.put(text.rstrip("\n"))
+    lines.put(None)
+
+
+def _follow(
+    lines: queue.Queue[str | None], line: Callable[[str], bool], tick: Callable[[], None]
+) -> deque[str]:
+    """The last lines that were more than progress; linking is silent, hence the ticks."""
+    shown: deque[str] = deque(maxlen=_SHOWN_LINES)
+    while True:
+        try:
+            text = lines.get(timeout=1)
+        except queue.Empty:
+            tick()
+            continue
+        if text is None:
+            return shown
+        if not line(text):
+            shown.append(text)
+
+
+def _environment() -> dict[str, str]:
+    jobs = os.environ.get(JOBS_VARIABLE, "")
+    if jobs and not jobs.isdigit():
+        raise RigError(f"{JOBS_VARIABLE}={jobs!r} is not a number: give the processes Go may use")
+    flags = "-mod=readonly" + (f" -p={jobs}" if jobs else "")
+    settings = {"GOTOOLCHAIN": "local", "GOWORK": "off", "CGO_ENABLED": "0", "GOFLAGS": flags}
+    # A cross-compiling caller would get programs that do not run here.
+    dropped = {"GOOS", "GOARCH", "GOEXPERIMENT", "GO111MODULE"}
+    return {k: v for k, v in os.environ.items() if k not in dropped} | settings
+
+
+def _output(argv: list[str], folder: Path) -> str:
+    done = subprocess.run(
+        argv, cwd=folder, env=_environment(), capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise RigError(f"{folder}: `{' '.join(argv)}` failed: {done.stderr.strip()}")
+    return done.stdout
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in re.findall(r"\d+", version)[:3])

@@ -1,0 +1,214 @@
+"""Talk to a cluster: apply, read, wait. The rig's only module that imports `kubernetes`.
+
+Objects go in and out as plain dictionaries, the shape of their manifests. Whatever waits takes a
+deadline, looks often, and says in its error what was last seen.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from kubernetes.client.api_client import ApiClient
+from kubernetes.client.configuration import Configuration
+from kubernetes.client.exceptions import ApiException
+from kubernetes.config.kube_config import load_kube_config
+from kubernetes.dynamic.client import DynamicClient
+from kubernetes.dynamic.exceptions import NotFoundError
+from urllib3.exceptions import HTTPError
+
+from .errors import RigError
+
+Manifest = dict[str, Any]
+Seen = TypeVar("Seen")
+
+_MANAGER = "demandops-e2e"
+_POLL_SECONDS = 0.1
+_VERSIONS = {
+    "GitRepository": "source.toolkit.fluxcd.io/v1",
+    "HelmChart": "source.toolkit.fluxcd.io/v1",
+    "HelmRelease": "helm.toolkit.fluxcd.io/v2",
+    "Kustomization": "kustomize.toolkit.fluxcd.io/v1",
+    "CustomResourceDefinition": "apiextensions.k8s.io/v1",
+    "Deployment": "apps/v1",
+    "Lease": "coordination.k8s.io/v1",
+    "ReplicaSet": "apps/v1",
+    "Job": "batch/v1",
+    "Role": "rbac.authorization.k8s.io/v1",
+    "RoleBinding": "rbac.authorization.k8s.io/v1",
+    "ClusterRole": "rbac.authorization.k8s.io/v1",
+    "ClusterRoleBinding": "rbac.authorization.k8s.io/v1",
+}
+
+
+class Kube:
+    """One cluster's API. Kinds not listed above are taken from `v1` unless `version` is given."""
+
+    def __init__(
+        self, kubeconfig: Path, cache: Path, check: Callable[[], None] = lambda: None
+    ) -> None:
+        settings = Configuration()
+        load: Any = load_kube_config  # annotated in some versions of the library, not in others
+        load(config_file=str(kubeconfig), client_configuration=settings)
+        self.api: Any = ApiClient(settings)
+        self._cache, self._check = cache, check
+        self._dynamic: Any = None
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self.api.close()
+
+    def apply(self, *manifests: Manifest | str) -> None:
+        """Apply manifests on the server's side; text may hold several YAML documents."""
+        for manifest in _documents(manifests):
+            meta = manifest["metadata"]
+            self._resource(manifest["kind"], manifest["apiVersion"]).server_side_apply(
+                body=manifest,
+                name=meta["name"],
+                namespace=meta.get("namespace"),
+                field_manager=_MANAGER,
+                force_conflicts=True,
+            )
+
+    def get(self, kind: str, name: str, namespace: str = "", version: str = "") -> Manifest | None:
+        """One object, or None where it is not there."""
+        try:
+            found = self._resource(kind, version).get(name=name, namespace=namespace or None)
+        except NotFoundError:
+            return None
+        return dict(found.to_dict())
+
+    def find(
+        self, kind: str, namespace: str = "", selector: str = "", version: str = ""
+    ) -> list[Manifest]:
+        """The objects of a kind, in one namespace or in all, by label selector."""
+        found = self._resource(kind, version).get(
+            namespace=namespace or None, label_selector=selector or None
+        )
+        return [dict(item) for item in found.to_dict()["items"]]
+
+    def delete(self, kind: str, name: str, namespace: str = "", version: str = "") -> None:
+        """Delete one object; one that is not there is as good as deleted."""
+        try:
+            self._resource(kind, version).delete(name=name, namespace=namespace or None)
+        except NotFoundError:
+            return
+
+    def patch(
+        self, kind: str, name: str, body: Manifest, namespace: str = "", version: str = ""
+    ) -> None:
+        """Merge-patch one object."""
+        self._resource(kind, version).patch(
+            name=name,
+            namespace=namespace or None,
+            body=body,
+            content_type="application/merge-patch+json",
+        )
+
+    def reconcile(self, kind: str, name: str, namespace: str) -> str:
+        """Ask a Flux controller to look now; returns the token that `handled` looks for."""
+        token = f"{time.time():.6f}"
+        annotations = {"reconcile.fluxcd.io/requestedAt": token}
+        self.patch(kind, name, {"metadata": {"annotations": annotations}}, namespace)
+        return token
+
+    def wait(self, what: str, look: Callable[[], Seen | None], timeout: float = 60.0) -> Seen:
+        """The first result of `look` that is neither None nor False.
+
+        Raises RigError after `timeout` seconds, or at once where a part of the rig has died.
+        """
+        deadline = time.monotonic() + timeout
+        while True:
+            trouble = ""
+            try:
+                if (seen := look()) is not None and seen is not False:
+                    return seen
+            except (ApiException, HTTPError, OSError) as error:  # a test may restart the server
+                trouble = f"; last error: {error}"
+            self._check()
+            if time.monotonic() > deadline:
+                raise RigError(f"waited {timeout:.0f} s for {what}{trouble}")
+            time.sleep(_POLL_SECONDS)
+
+    def wait_ready(
+        self, kind: str, name: str, namespace: str = "", timeout: float = 60.0, version: str = ""
+    ) -> Manifest:
+        """Wait until an object's Ready condition holds for its newest generation."""
+        last: list[str] = ["not there"]
+
+        def ready() -> Manifest | None:
+            found = self.get(kind, name, namespace, version)
+            last[:] = [_condition(found)]
+            return found if last == [""] else None
+
+        what = f"{kind} {namespace}/{name} to be Ready"
+        try:
+            return self.wait(what, ready, timeout)
+        except RigError as error:
+            raise RigError(f"{error}; last seen: {last[0]}") from error
+
+    def wait_gone(
+        self, kind: str, name: str, namespace: str = "", timeout: float = 60.0, version: str = ""
+    ) -> None:
+        """Wait until an object is not there."""
+        what = f"{kind} {namespace}/{name} to go"
+        self.wait(what, lambda: self.get(kind, name, namespace, version) is None, timeout)
+
+    def install_crds(self, files: Iterable[Path], timeout: float = 30.0) -> None:
+        """Apply CRDs and wait until the server serves them."""
+        crds = _documents([path.read_text() for path in files])
+        self.apply(*crds)
+        for crd in crds:
+            name = crd["metadata"]["name"]
+
+            def established(name: str = name) -> bool:
+                found = self.get("CustomResourceDefinition", name) or {}
+                return _holds(found, "Established")
+
+            self.wait(f"CRD {name} to be served", established, timeout)
+
+    def _resource(self, kind: str, version: str = "") -> Any:
+        if self._dynamic is None:  # late, for it asks the server what there is
+            connect: Any = DynamicClient
+            self._dynamic = connect(self.api, cache_file=str(self._cache))
+        version = version or _VERSIONS.get(kind, "v1")
+        return self._dynamic.resources.get(api_version=version, kind=kind)
+
+
+def handled(manifest: Manifest, token: str) -> bool:
+    """Whether a Flux controller has finished the reconcile asked for with `token`."""
+    return bool(manifest.get("status", {}).get("lastHandledReconcileAt") == token)
+
+
+def _condition(found: Manifest | None) -> str:
+    """Why an object is not ready; empty where it is."""
+    if found is None:
+        return "not there"
+    status = found.get("status", {})
+    generation = found["metadata"].get("generation")
+    fresh = status.get("observedGeneration", generation) == generation
+    if fresh and _holds(found, "Ready"):
+        return ""
+    shown = [f"{c['type']}={c['status']} {c.get('message', '')}" for c in _conditions(found)]
+    if not fresh:
+        shown.append("of an older generation")
+    return "; ".join(shown) or "no conditions"
+
+
+def _holds(found: Manifest, kind: str) -> bool:
+    return any(c["type"] == kind and c["status"] == "True" for c in _conditions(found))
+
+
+def _conditions(found: Manifest) -> list[dict[str, str]]:
+    return list(found.get("status", {}).get("conditions") or [])
+
+
+def _documents(manifests: Iterable[Manifest | str]) -> list[Manifest]:
+    documents: list[Manifest] = []
+    for manifest in manifests:
+        parsed = yaml.safe_load_all(manifest) if isinstance(manifest, str) else [manifest]
+        documents += [document for document in parsed if document]
+    return documents

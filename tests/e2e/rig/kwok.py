@@ -1,0 +1,67 @@
+"""Fake nodes and the kwok process that keeps them and their pods alive.
+
+A fake node stands for one inventory node: it carries the `node_id` label that releases select.
+It bears the annotation by which a kwok in somebody else's cluster takes it over as well.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .errors import RigError
+from .net import LOOPBACK, answers, free_port
+from .processes import Component
+
+NODE_ID_LABEL = "node_id"
+HOLD_ANNOTATION = "rig.demandops.invalid/hold"  # see stages.yaml
+_STAGES = Path(__file__).resolve().parent / "stages.yaml"
+_FAKE = "kwok.x-k8s.io/node"
+_LABEL_VALUE = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")
+_CAPACITY = {"cpu": "64", "memory": "256Gi", "ephemeral-storage": "1Ti", "pods": "1000"}
+
+
+def component(binary: Path, kubeconfig: Path) -> Component:
+    """The kwok process for all nodes that `manifest` makes."""
+    port = free_port()
+    argv = [
+        str(binary),
+        f"--kubeconfig={kubeconfig}",
+        "--manage-all-nodes=false",
+        f"--manage-nodes-with-annotation-selector={_FAKE}=fake",
+        "--node-lease-duration-seconds=40",
+        f"--node-ip={LOOPBACK}",
+        "--cidr=10.244.0.0/16",
+        f"--server-address={LOOPBACK}:{port}",
+        f"--config={_STAGES}",
+    ]
+    return Component("kwok", tuple(argv), answers(port, "/healthz"))
+
+
+def node_name(node_id: str) -> str:
+    """A Kubernetes name for a node id; ids that differ only in lost characters stay apart."""
+    slug = re.sub(r"[^a-z0-9]+", "-", node_id.lower()).strip("-")
+    if slug == node_id:
+        return slug
+    return f"{slug or 'node'}-{hashlib.sha256(node_id.encode()).hexdigest()[:6]}"
+
+
+def manifest(node_id: str, labels: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """The Node object of one inventory node; raises RigError where its id is no label value."""
+    if not _LABEL_VALUE.fullmatch(node_id):
+        raise RigError(f"node {node_id!r}: not a label value; use letters, digits, '-', '_', '.'")
+    name = node_name(node_id)
+    common = {"kubernetes.io/hostname": name, "kubernetes.io/os": "linux", "type": "kwok"}
+    return {
+        "apiVersion": "v1",
+        "kind": "Node",
+        "metadata": {
+            "name": name,
+            "labels": {**common, **(labels or {}), NODE_ID_LABEL: node_id},
+            "annotations": {_FAKE: "fake", "node.alpha.kubernetes.io/ttl": "0"},
+        },
+        "status": {"capacity": _CAPACITY, "allocatable": _CAPACITY},
+    }

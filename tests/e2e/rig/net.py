@@ -1,0 +1,71 @@
+"""Free loopback ports and readiness probes: all that the rig knows of sockets.
+
+A probe returns None once its component is ready and else says why not, so that a start that never
+comes to an end can name its reason.
+"""
+
+from __future__ import annotations
+
+import http.client
+import random
+import socket
+import ssl
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+LOOPBACK = "127.0.0.1"
+Probe = Callable[[], "str | None"]
+
+# Below the kernel's usual range for outgoing connections (32768 and up), or a port found free
+# could be some client's own before its server binds it.
+_PORTS = range(20000, 32000)
+_given: set[int] = set()
+_lock = threading.Lock()
+
+
+def free_port() -> int:
+    """A loopback port that nothing listens on and that this process gives out once only."""
+    with _lock:
+        for port in random.sample(_PORTS, len(_PORTS)):
+            if port not in _given and _bindable(port):
+                _given.add(port)
+                return port
+    raise OSError(f"no free port on {LOOPBACK} between {_PORTS.start} and {_PORTS.stop}")
+
+
+def url(port: int, scheme: str = "http") -> str:
+    """The base URL of a server on this port."""
+    return f"{scheme}://{LOOPBACK}:{port}"
+
+
+def answers(port: int, path: str, authority: Path | None = None) -> Probe:
+    """Ready once `path` is answered with 200, by HTTPS where a certificate authority is given."""
+    context = ssl.create_default_context(cafile=str(authority)) if authority else None
+
+    def probe() -> str | None:
+        connection = (
+            http.client.HTTPSConnection(LOOPBACK, port, timeout=5, context=context)
+            if context
+            else http.client.HTTPConnection(LOOPBACK, port, timeout=5)
+        )
+        try:
+            connection.request("GET", path)
+            answer = connection.getresponse()
+            text = answer.read(2000).decode(errors="replace").strip()
+        except (OSError, http.client.HTTPException) as error:
+            return f"{LOOPBACK}:{port}{path}: {error}"
+        finally:
+            connection.close()
+        return None if answer.status == 200 else f"{path} says {answer.status}: {text}"
+
+    return probe
+
+
+def _bindable(port: int) -> bool:
+    with socket.socket() as attempt:
+        try:
+            attempt.bind((LOOPBACK, port))
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,245 @@
+"""Start, watch and stop the rig's processes; it knows nothing of what they are.
+
+Each process leads a group of its own (so that Ctrl-C reaches the tests only, which then stop
+things in order, and so that its children can be ended with it), a log file, and the kernel's order
+to die with this process. Stopping asks first and kills after a deadline, last started first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from . import launch
+from .errors import RigError
+from .net import Probe
+
+_POLL_SECONDS = 0.05
+_TAIL_LINES = 30
+_GROUP_SECONDS = 3.0  # an init that does not reap its orphans must not hold a stop up
+
+
+@dataclass(frozen=True)
+class Component:
+    """How one process is started and when it counts as ready."""
+
+    name: str
+    argv: tuple[str, ...]
+    probe: Probe
+    environment: Mapping[str, str] = field(default_factory=dict)
+    ready_seconds: float = 90.0
+    stop_seconds: float = 10.0
+
+
+class Processes:
+    """The processes of one rig, by component name."""
+
+    def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
+        self._logs = logs
+        self._environment = dict(environment)
+        self._batches: list[list[str]] = []
+        self._components: dict[str, Component] = {}
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._started: dict[str, float] = {}
+        logs.mkdir(parents=True, exist_ok=True)
+
+    def start_together(self, components: Iterable[Component]) -> None:
+        """Start components that do not need each other, then wait until all are ready."""
+        batch = list(components)
+        self._batches.append([component.name for component in batch])
+        for component in batch:
+            self._components[component.name] = component
+            self._launch(component)
+        for component in batch:
+            self.wait_ready(component.name)
+
+    def start(self, name: str) -> None:
+        """Start a component again, with the same arguments and ports; wait until it is ready."""
+        component = self._known(name)
+        process = self._running.get(name)
+        if process is not None:
+            if _exit_code(process) is None:
+                raise RigError(f"{name}: already runs as {process.pid}; stop it first")
+            _end(process)
+        self._launch(component)
+        self.wait_ready(name)
+
+    def wait_ready(self, name: str) -> None:
+        """Wait for the component's probe; raises RigError with its reason and the log's tail."""
+        component = self._known(name)
+        deadline = time.monotonic() + component.ready_seconds
+        while (reason := component.probe()) is not None:
+            self.check(name)
+            if time.monotonic() > deadline:
+                waited = f"not ready after {component.ready_seconds:.0f} s: {reason}"
+                raise RigError(self._with_log(name, waited))
+            time.sleep(_POLL_SECONDS)
+        self.check(name)  # the port may have answered for somebody else's server
+
+    def check(self, *names: str) -> None:
+        """Raise RigError where one of the named (default: all) processes ended unasked."""
+        for name in names or list(self._running):
+            process = self._running.get(name)
+            if process is not None and (code := _exit_code(process)) is not None:
+                age = time.monotonic() - self._started[name]
+                ended = f"ended with {code} after {age:.1f} s"
+                raise RigError(self._with_log(name, ended))
+
+    def stop(self, name: str) -> None:
+        """Ask a component to end and kill it where it does not; one that is not there is fine."""
+        self._known(name)
+        self._stop_batch([name])
+
+    def kill(self, name: str) -> None:
+        """End a component at once, as a crash would."""
+        self._known(name)
+        process = self._running.pop(name, None)
+        if process is not None:
+            _end(process)
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to a component and its children (SIGSTOP makes a server hang)."""
+        process = self._running.get(self._known(name).name)
+        if process is None:
+            raise RigError(f"{name}: does not run, so it cannot get {number.name}")
+        os.killpg(process.pid, number)
+
+    def stop_all(self) -> None:
+        """Stop everything, last started first; a second interrupt kills what is left at once."""
+        try:
+            for batch in reversed(self._batches):
+                self._stop_batch(batch)
+        finally:
+            for process in list(self._running.values()):
+                _end(process)
+            self._running.clear()
+
+    def pids(self) -> dict[str, int]:
+        """Process ids of what runs."""
+        return {name: process.pid for name, process in self._running.items()}
+
+    def names(self) -> list[str]:
+        """All components, in the order of their start."""
+        return list(self._components)
+
+    def log(self, name: str) -> Path:
+        """The log file of a component; it goes on through restarts."""
+        return self._logs / f"{name}.log"
+
+    def _known(self, name: str) -> Component:
+        if name not in self._components:
+            raise RigError(f"no component {name!r}; there are {', '.join(self._components)}")
+        return self._components[name]
+
+    def _launch(self, component: Component) -> None:
+        argv = launch.command(component.argv[0], *component.argv[1:])
+        environment = {**self._environment, **component.environment}
+        with self.log(component.name).open("ab") as log:
+            log.write(f"--- {time.strftime('%H:%M:%S')} {' '.join(component.argv)}\n".encode())
+            log.flush()
+            process = _spawner.call(
+                lambda: subprocess.Popen(
+                    argv,
+                    env=environment,
+                    cwd=self._logs,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,
+                )
+            )
+        self._running[component.name] = process
+        self._started[component.name] = time.monotonic()
+
+    def _stop_batch(self, names: list[str]) -> None:
+        going = {name: self._running[name] for name in names if name in self._running}
+        for process in going.values():
+            # CONT as well: a process that a test has stopped would never see the TERM.
+            for number in (signal.SIGTERM, signal.SIGCONT):
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, number)
+        start = time.monotonic()
+        for name, process in going.items():
+            deadline = start + self._components[name].stop_seconds
+            while _exit_code(process) is None and time.monotonic() < deadline:
+                time.sleep(_POLL_SECONDS)
+            _end(process)
+            del self._running[name]
+
+    def _with_log(self, name: str, what: str) -> str:
+        path = self.log(name)
+        with path.open(errors="replace") as log:
+            tail = "".join(f"  {line}" for line in deque(log, maxlen=_TAIL_LINES))
+        return f"{name}: {what}\n{path} ends with:\n{tail}"
+
+
+def _exit_code(process: subprocess.Popen[bytes]) -> int | None:
+    """How the process ended, None while it runs; without reaping it.
+
+    Reaped, its pid could soon be somebody else's, and so could the group that `_end` kills.
+    """
+    if process.returncode is not None:
+        return process.returncode
+    ended = os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    if ended is None:
+        return None
+    return ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and what it started, reap it, and wait for the others to be gone."""
+    if process.returncode is not None:
+        return
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    deadline = time.monotonic() + _GROUP_SECONDS
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        while time.monotonic() < deadline:
+            os.killpg(process.pid, 0)  # fails once the group is empty
+            time.sleep(_POLL_SECONDS / 5)
+
+
+class _Spawner:
+    """Starts every process from one thread that lives as long as this process does.
+
+    The kernel kills a child when the *thread* that started it ends. A rig started in a worker
+    thread (two clusters at once) would otherwise lose its cluster when that thread is done.
+    """
+
+    def __init__(self) -> None:
+        self._jobs: queue.Queue[
+            tuple[Callable[[], subprocess.Popen[bytes]], Future[subprocess.Popen[bytes]]]
+        ] = queue.Queue()
+        self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+
+    def call(self, job: Callable[[], subprocess.Popen[bytes]]) -> subprocess.Popen[bytes]:
+        with self._lock:
+            if self._thread is None or not self._thread.is_alive():  # not alive after a fork
+                self._thread = threading.Thread(target=self._work, name="rig-spawner", daemon=True)
+                self._thread.start()
+        future: Future[subprocess.Popen[bytes]] = Future()
+        self._jobs.put((job, future))
+        return future.result()
+
+    def _work(self) -> None:
+        while True:
+            job, future = self._jobs.get()
+            try:
+                future.set_result(job())
+            except BaseException as error:
+                future.set_exception(error)
+
+
+_spawner = _Spawner()

@@ -1,0 +1,215 @@
+"""Build the rig's programs from their pinned Go modules, once, into a cache outside the checkout.
+
+First stage of the rig: everything above takes the paths that `ensure` returns. A wrapper module
+under `tests/e2e/tools/` pins each program, so that `go.sum` covers all of it. A cache entry is
+named after the digest of all that decides its bytes; it appears by one rename, so an entry that
+exists is whole. `python -m tests.e2e.rig.tools` builds all and prints how long each took.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import re
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import gobuild
+from .errors import RigError
+
+WRAPPERS = Path(__file__).resolve().parent.parent / "tools"
+CACHE_VARIABLE = "DEMANDOPS_E2E_CACHE"
+
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Tool:
+    """One program: which wrapper module pins it and which package is its main one."""
+
+    name: str
+    wrapper: str
+    package: str
+    crds_of: str = ""  # the Go module whose CRDs are copied next to the program
+
+
+def _flux(name: str) -> Tool:
+    module = f"github.com/fluxcd/{name}"
+    return Tool(name, name, module, crds_of=module)
+
+
+def _kubernetes(name: str) -> Tool:
+    return Tool(name, "kubernetes", f"k8s.io/kubernetes/cmd/{name}")
+
+
+# Cheapest first, so that a fault of the setting shows within a minute.
+TOOLS = {
+    tool.name: tool
+    for tool in (
+        Tool("etcd", "etcd", "go.etcd.io/etcd/server/v3"),
+        _kubernetes("kube-apiserver"),
+        _kubernetes("kube-controller-manager"),
+        _kubernetes("kube-scheduler"),
+        Tool("kwok", "kwok", "sigs.k8s.io/kwok/cmd/kwok"),
+        _flux("source-controller"),
+        _flux("kustomize-controller"),
+        _flux("helm-controller"),
+        Tool("helm", "helm", "helm.sh/helm/v4/cmd/helm"),
+    )
+}
+
+
+def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> dict[str, Path]:
+    """Paths of the named programs (all by default), built first where the cache lacks them.
+
+    `report` takes progress lines, by default to standard error. Raises RigError where a name is
+    unknown, Go is missing or too old, or a build fails.
+    """
+    wanted = list(TOOLS) if names is None else list(names)
+    unknown = sorted(set(wanted) - set(TOOLS))
+    if unknown:
+        raise RigError(f"no such tool: {', '.join(unknown)}; there are {', '.join(TOOLS)}")
+    say = report or _to_stderr
+    go = gobuild.Go.find()
+    entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], go)}" for name in wanted}
+    missing = [name for name in wanted if not entries[name].is_dir()]
+    for place, name in enumerate(missing, start=1):
+        with _turn(cache_root(), say):
+            if not entries[name].is_dir():  # another run may have built it while we waited
+                _build(TOOLS[name], go, entries[name], _prefixed(say, place, len(missing), name))
+    return {name: entries[name] / name for name in wanted}
+
+
+def crd_files(binaries: dict[str, Path]) -> list[Path]:
+    """The CRD manifests that came with the given programs."""
+    return sorted(
+        path for binary in binaries.values() for path in binary.parent.glob("crds/*.yaml")
+    )
+
+
+def cache_root() -> Path:
+    """Where built programs are kept."""
+    named = os.environ.get(CACHE_VARIABLE)
+    if named:
+        return Path(named).expanduser().resolve()
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser().resolve() / "demandops" / "e2e"
+
+
+def _digest(tool: Tool, go: gobuild.Go) -> str:
+    """What decides a program's bytes: its pins, the flags, the toolchain and the target."""
+    folder = WRAPPERS / tool.wrapper
+    parts = [
+        (folder / "go.mod").read_bytes(),
+        (folder / "go.sum").read_bytes(),
+        json.dumps([tool.package, tool.crds_of, _flags(tool), go.version, go.target]).encode(),
+    ]
+    joined = b"\0".join(hashlib.sha256(part).digest() for part in parts)
+    return hashlib.sha256(joined).hexdigest()[:16]
+
+
+def _flags(tool: Tool) -> list[str]:
+    """Build flags: small binaries whose bytes do not depend on where the checkout lies."""
+    linker = ["-s", "-w"]
+    if tool.wrapper == "kubernetes":
+        # Unstamped, the server calls itself v0.0.0-master and clients refuse to work with it.
+        version = _pinned(WRAPPERS / tool.wrapper / "go.mod", "k8s.io/kubernetes")
+        major, minor = version.removeprefix("v").split(".")[:2]
+        stamps = {"gitVersion": version, "gitMajor": major, "gitMinor": minor}
+        linker += [
+            f"-X k8s.io/component-base/version.{key}={value}" for key, value in stamps.items()
+        ]
+    return ["-trimpath", "-buildvcs=false", f"-ldflags={' '.join(linker)}"]
+
+
+def _pinned(go_mod: Path, module: str) -> str:
+    found = re.search(
+        rf"^\s*(?:require )?{re.escape(module)} (v\S+)", go_mod.read_text(), re.MULTILINE
+    )
+    if found is None:
+        raise RigError(f"{go_mod}: requires no {module}; run `go get -tool` as its README says")
+    return found.group(1)
+
+
+@contextlib.contextmanager
+def _turn(root: Path, say: Report) -> Iterator[None]:
+    """One build at a time on a machine: two of Kubernetes at once would not fit into memory."""
+    root.mkdir(parents=True, exist_ok=True)
+    with (root / "build.lock").open("w") as lock:
+        waited = False
+        while True:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the kernel frees it if we die
+                break
+            except BlockingIOError:
+                if not waited:
+                    say(f"another run is building into {root}, waiting for it")
+                waited = True
+                time.sleep(0.5)
+        for leftover in root.glob(".building-*"):  # of a killed build: we hold the lock
+            shutil.rmtree(leftover, ignore_errors=True)
+        yield
+
+
+def _build(tool: Tool, go: gobuild.Go, entry: Path, say: Report) -> None:
+    staging = Path(tempfile.mkdtemp(prefix=f".building-{tool.name}-", dir=entry.parent))
+    try:
+        start = time.monotonic()
+        wrapper = WRAPPERS / tool.wrapper
+        binary = staging / tool.name
+        gobuild.build(go, wrapper, tool.package, _flags(tool), binary, say)
+        if tool.crds_of:
+            _copy_crds(Path(gobuild.module_folder(go, wrapper, tool.crds_of)), staging / "crds")
+        seconds = round(time.monotonic() - start, 1)
+        (staging / "build.json").write_text(json.dumps({"tool": tool.name, "seconds": seconds}))
+        with binary.open("rb") as written:
+            os.fsync(written.fileno())  # or a power cut could leave an empty file behind the name
+        staging.chmod(0o755)
+        staging.rename(entry)
+        say(f"built in {seconds:.0f} s")
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def _copy_crds(module: Path, target: Path) -> None:
+    target.mkdir()
+    sources = sorted((module / "config" / "crd" / "bases").glob("*.yaml"))
+    if not sources:
+        raise RigError(f"{module}: no CRDs in config/crd/bases; has the module moved them?")
+    for source in sources:
+        (target / source.name).write_bytes(source.read_bytes())  # without the read-only mode
+
+
+def _prefixed(say: Report, place: int, total: int, name: str) -> Report:
+    return lambda text: say(f"[{place}/{total}] {name}: {text}")
+
+
+def _to_stderr(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _main() -> int:
+    start = time.monotonic()
+    try:
+        paths = ensure(sys.argv[1:] or None)
+    except RigError as error:
+        print(error, file=sys.stderr)
+        return 1
+    for name, path in paths.items():
+        seconds = json.loads((path.parent / "build.json").read_text())["seconds"]
+        size = path.stat().st_size / 1e6
+        print(f"{name:24} built in {seconds:7.1f} s  {size:6.1f} MB  {path}")
+    print(f"ready after {time.monotonic() - start:.1f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(_main())
