@@ -15,9 +15,7 @@ from generator.cli.output import (
     progress,
     state_repo_option,
 )
-from generator.decision import rehearse
-from generator.errors import InvalidInput
-from generator.staterepo import layout, reader
+from generator.staterepo import checkout, layout, reader
 
 
 @click.command()
@@ -75,27 +73,39 @@ def init(directory: Path, gitops: str, bare: bool, url: str, output: str) -> Non
     metavar="DIR",
     default=Path(),
 )
+@click.option(
+    "--base",
+    metavar="REV",
+    help="The commit that the edit started from; by default where it left origin/main, or HEAD.",
+)
 @output_option
-def check(directory: Path, output: str) -> None:
-    """Check the files of a checked-out state repo, and that everything renders."""
-    faults = []
-    try:
-        rehearse(reader.check_folder(directory))
-    except InvalidInput as error:
-        faults = list(error.faults)
+def check(directory: Path, base: str | None, output: str) -> None:
+    """Check a checked-out state repo before its edits are merged.
+
+    All files are valid, every application renders, no generated file is edited by hand, and a
+    chart that changed has a new version.
+    """
+    found = checkout.check(directory, base)
     if output == "json":
         print_json(
-            [
-                {"file": found.file, "field": found.field, "message": found.message}
-                for found in faults
-            ]
+            {
+                "faults": [
+                    {"file": one.file, "field": one.field, "message": one.message}
+                    for one in found.faults
+                ],
+                "outdated": list(found.outdated),
+            }
         )
     else:
-        for found in faults:
-            errors.print(f"error: {found}")
-        if not faults:
+        for one in found.faults:
+            errors.print(f"error: {one}")
+        if not found.faults:
             console().print(f"{directory}: all files are valid and everything renders")
-    if faults:
+        if found.outdated:
+            console().print(f"the generator will write {len(found.outdated)} files anew:")
+            for path in found.outdated:
+                console().print(f"  {path}")
+    if found.faults:
         click.get_current_context().exit(1)
 
 

@@ -10,12 +10,8 @@ from pathlib import Path
 from pygit2 import Commit
 
 from generator import settings
-from generator.catalog.catalog import CONFIG_ROOTS
-from generator.catalog.catalog import load as load_catalog
-from generator.decision import State, rendered
-from generator.errors import Fault, InvalidInput, StateRepoError, fault
-from generator.ledger import format as ledger_format
-from generator.ledger.ledger import Ledger
+from generator.decision import rendered
+from generator.errors import InvalidInput
 from generator.render.changeset import Read
 from generator.settings import GENERATED_ROOTS, RENDER_VERSION
 from generator.staterepo import history, remote
@@ -122,66 +118,8 @@ def _differing(wanted: dict[str, str], commit: Commit) -> tuple[str, ...]:
     return tuple(
         path
         for path in sorted({*wanted, *standing})
-        if wanted.get(path) != standing.get(path) and not _is_note(path)
+        if wanted.get(path) != standing.get(path) and not trees.is_note(path)
     )
-
-
-def _is_note(path: str) -> bool:
-    """Tell what people may put below ``clusters/`` for themselves: a README is no manifest."""
-    return path.rsplit("/", 1)[-1] == "README.md"
-
-
-def check_folder(folder: Path) -> State:
-    """Check a checked-out state repo: configuration, ledger, and that everything renders.
-
-    Raises:
-        StateRepoError: where it is no state repo.
-        InvalidInput: with every fault that was found, among them generated files that differ
-            from what the books give.
-    """
-    if not (folder / "demandops.yaml").is_file():
-        raise StateRepoError(
-            f"{folder} is no state repo, for it has no demandops.yaml; `demandops init` makes one"
-        )
-    files = dict(_texts(folder))
-    catalog = load_catalog(
-        {p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS}
-    )
-    ledger, faults = Ledger(), list[Fault]()
-    for path, text in sorted(files.items()):
-        if ledger_format.kind_of(path) is None:
-            continue
-        try:
-            claim = ledger_format.read(text, path)
-        except InvalidInput as error:
-            faults += error.faults
-        else:
-            ledger = ledger.replace(claim.key, claim)
-    if faults:
-        raise InvalidInput(faults)
-    state = State.of(catalog, ledger)
-    wanted = rendered(state)
-    for path in sorted({*wanted, *(p for p in files if p.split("/")[0] in GENERATED_ROOTS)}):
-        if wanted.get(path) != files.get(path) and not _is_note(path):
-            faults.append(
-                fault(
-                    "",
-                    "differs from what ledger and configuration give; leave it to the "
-                    "generator, which writes it after the next demand",
-                ).within(path)
-            )
-    if faults:
-        raise InvalidInput(faults)
-    return state
-
-
-def _texts(folder: Path) -> Iterator[tuple[str, str]]:
-    for root in (*CONFIG_ROOTS, "ledger", *GENERATED_ROOTS):
-        top = folder / root
-        paths = [top] if top.is_file() else sorted(top.rglob("*"))
-        for path in paths:
-            if path.is_file():
-                yield path.relative_to(folder).as_posix(), path.read_text(errors="replace")
 
 
 @contextmanager

@@ -81,6 +81,11 @@ def differences(
             yield path, None
 
 
+def is_note(path: str) -> bool:
+    """Tell what people may put beside generated files: a README is no manifest."""
+    return path.rsplit("/", 1)[-1] == "README.md"
+
+
 def write(repo: Repository, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
     """Write ``base`` with ``files`` changed (``None`` removes) and return the new tree's id.
 
