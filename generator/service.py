@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from generator import settings
+from generator.catalog.catalog import Catalog
 from generator.decision import Decision, Outcome, decide
 from generator.errors import (
     DemandOpsError,
@@ -93,8 +94,17 @@ class Generator:
         data: Path | None = None,
         queue_limit: int = settings.QUEUE_LIMIT,
         progress: Progress = lambda done, total: None,
+        on_published: Callable[[Catalog], None] = lambda catalog: None,
     ) -> None:
         """Open the state repo and start the worker; what an earlier run left over comes first.
+
+        Args:
+            state_repo: a folder with a bare repository, or a URL that git clones.
+            data: where outbox and clone are kept; by default :func:`settings.data_home`.
+            queue_limit: how many demands may wait.
+            progress: told (files read, files in all) while the ledger is loaded.
+            on_published: called in the worker thread after every push, with the catalog in force;
+                must return at once.
 
         Raises:
             StateRepoError, InvalidInput: where the state repo cannot be used.
@@ -108,6 +118,7 @@ class Generator:
             raise
         self.given_address = state_repo
         self.queue_limit = queue_limit
+        self._on_published = on_published
         embedded = self._repository.always_current
         self._batch_limit = _BATCH_LIMIT_EMBEDDED if embedded else _BATCH_LIMIT_REMOTE
         self._queue: deque[Ticket] = deque()
@@ -282,6 +293,8 @@ class Generator:
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
             return True
+        if published and line.head.commit != line.start.commit:
+            self._on_published(line.head.state.catalog)
         if published:
             self._snapshot = line.head
         return published

@@ -20,6 +20,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from generator.cli.output import errors, progress
+from generator.cluster import wake
 from generator.service import Generator
 from generator.settings import DEFAULT_ACTION_NAME
 from ros_bridge.node import DemandNode
@@ -57,8 +58,16 @@ class _ToRos(logging.Handler):
     help="The state repo: a folder with a bare repository, or a URL that git clones; also the ROS "
     "parameter state_repo [env: DEMANDOPS_STATE_REPO].",
 )
+@click.option(
+    "--wake",
+    "wake_file",
+    envvar="DEMANDOPS_WAKE",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Which clusters to wake after a push, and how; see docs/flux.md [env: DEMANDOPS_WAKE].",
+)
 @click.pass_context
-def serve(ctx: click.Context, state_repo: str | None) -> None:
+def serve(ctx: click.Context, state_repo: str | None, wake_file: Path | None) -> None:
     """Run the ROS 2 node that takes demands over the action DeploymentRequest.
 
     Everything after --ros-args goes to ROS. Parameters: action_name, state_repo, log_level (debug,
@@ -73,9 +82,11 @@ def serve(ctx: click.Context, state_repo: str | None) -> None:
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
         settings = _parameters(state_repo)
+        waker = wake.Wake(wake.read(wake_file).clusters if wake_file else {})
         with progress("reading the ledger") as tell:
-            generator = Generator(settings["state_repo"], progress=tell)
+            generator = Generator(settings["state_repo"], progress=tell, on_published=waker)
         _run(generator, settings)
+        waker.close()
     finally:
         rclpy.try_shutdown()
 

@@ -1,0 +1,3 @@
+"""Stage 8, what came of it: the clusters that follow the state repo. The only folder that knows
+the Kubernetes API.
+"""

@@ -1,0 +1,107 @@
+"""The file that says which clusters are woken, and waking by webhook; the API's way is in e2e."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+
+from generator.cluster import wake
+from generator.errors import InvalidInput
+from tests.golden.cases import start
+
+HEAD = "apiVersion: demandops/v1\nkind: Wake\n"
+
+
+def write(folder: Path, text: str) -> Path:
+    file = folder / "wake.yaml"
+    file.write_text(HEAD + text)
+    return file
+
+
+def test_a_file_names_each_cluster_and_one_way_to_reach_it(tmp_path: Path) -> None:
+    file = write(
+        tmp_path, "clusters:\n  a: {kubeconfig: /x}\n  b: {receiver: 'https://h/hook/1'}\n"
+    )
+    clusters = wake.read(file).clusters
+    assert (clusters["a"].kubeconfig, clusters["b"].receiver) == (Path("/x"), "https://h/hook/1")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("clusters: {a: {}}\n", "clusters.a: needs either kubeconfig or receiver"),
+        (
+            "clusters: {a: {kubeconfig: /x, receiver: 'https://h'}}\n",
+            "clusters.a: needs either kubeconfig or receiver",
+        ),
+        ("", "clusters: is missing; add it"),
+    ],
+)
+def test_a_wrong_file_is_told_with_field_and_remedy(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    file = write(tmp_path, text)
+    with pytest.raises(InvalidInput) as caught:
+        wake.read(file)
+    assert str(caught.value) == f"{file}: {message}"
+
+
+def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        wake.read(tmp_path / "none.yaml")
+    assert str(caught.value) == f"{tmp_path}/none.yaml: cannot be read: No such file or directory"
+
+
+@pytest.fixture
+def receiver() -> Iterator[tuple[str, list[str]]]:
+    heard: list[str] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            heard.append(self.path)
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Say nothing."""
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}/hook/abc", heard
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_a_receiver_is_called_after_a_push(receiver: tuple[str, list[str]]) -> None:
+    url, heard = receiver
+    state, _ = start("experiment")
+    waker = wake.Wake({"c-its": wake.Reached(receiver=url)})
+    waker(state.catalog)
+    waker.close()
+    assert set(heard) == {"/hook/abc"}
+
+
+def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:
+    url, heard = receiver
+    wake.Wake({"c-its": wake.Reached(receiver=url)}).close()
+    assert heard == []
+
+
+def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody(
+    receiver: tuple[str, list[str]], caplog: pytest.LogCaptureFixture
+) -> None:
+    url, heard = receiver
+    state, _ = start("experiment")
+    away = wake.Reached(receiver="http://127.0.0.1:1/hook/secret")
+    waker = wake.Wake({"away": away, "here": wake.Reached(receiver=url)})
+    waker(state.catalog)
+    waker.close()
+    assert heard
+    assert "cluster 'away' was not woken (URLError)" in caplog.text
+    assert "secret" not in caplog.text
