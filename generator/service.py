@@ -48,6 +48,7 @@ _STOP_TIMEOUT_S = 20.0
 _BATCH_LIMIT_EMBEDDED = 20
 _BATCH_LIMIT_REMOTE = 200
 """Demands that are published together: a push costs some 50 ms, moving a branch less than one."""
+_TIDY_EVERY = 300
 _TAKEN_BACK = "the demand was taken back before it was committed"
 
 
@@ -119,6 +120,7 @@ class Generator:
         self.given_address = state_repo
         self.queue_limit = queue_limit
         self._on_published = on_published
+        self._since_tidy = 0
         embedded = self._repository.always_current
         self._batch_limit = _BATCH_LIMIT_EMBEDDED if embedded else _BATCH_LIMIT_REMOTE
         self._queue: deque[Ticket] = deque()
@@ -233,6 +235,7 @@ class Generator:
             batch: list[Ticket] = []
             try:
                 self._settle(batch)
+                self._tidy()
             except ShuttingDown as error:
                 self._fail(batch, error, keep=True)
             except DemandOpsError as error:
@@ -293,11 +296,19 @@ class Generator:
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
             return True
-        if published and line.head.commit != line.start.commit:
+        if not published:
+            return False
+        self._snapshot = line.head
+        if line.head.commit != line.start.commit:
             self._on_published(line.head.state.catalog)
-        if published:
-            self._snapshot = line.head
-        return published
+            self._since_tidy += len(results)
+        return True
+
+    def _tidy(self) -> None:
+        """Every few hundred commits: a demand leaves some twenty loose objects behind."""
+        if self._since_tidy >= _TIDY_EVERY:
+            self._since_tidy = 0
+            self._repository.tidy()
 
     def _line(self) -> writer.Line:
         """Start a line on the newest tip that is known, people's changes taken in."""

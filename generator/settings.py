@@ -52,6 +52,8 @@ def data_home(state_repo: str) -> Path:
     ``DEMANDOPS_DATA_HOME`` wins, else ``$XDG_STATE_HOME/demandops``; below it one folder for each
     state repo, named by a digest of its address (which may hold a password, so it is not shown).
     """
+    if Path(state_repo).exists():  # however the folder is written, it is one
+        state_repo = str(Path(state_repo).resolve())
     root = os.environ.get("DEMANDOPS_DATA_HOME")
     if root:
         base = Path(root)

@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
@@ -117,7 +118,9 @@ def _parameters(state_repo: str | None) -> dict[str, Any]:
 def _run(generator: Generator, settings: dict[str, Any]) -> None:
     node = DemandNode(generator, settings["action_name"])
     for name, value in settings.items():
-        node.declare_parameter(name, generator.address if name == "state_repo" else value)
+        shown = generator.address if name == "state_repo" else value
+        # read when the node starts; a change of them now would do nothing, so none is taken
+        node.declare_parameter(name, shown, ParameterDescriptor(read_only=True))
     set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
     library_log = logging.getLogger("demandops")
     library_log.handlers, library_log.propagate = [_ToRos(node)], False

@@ -143,6 +143,9 @@ def verify(revisions: str | None, state_repo: str, output: str) -> None:
             out.print(f"{verdict.commit[:10]} {word}{note}  {verdict.summary}")
             for path in verdict.differing:
                 out.print(f"    {path}")
-        out.print(f"{len(verdicts) - len(broken)} of {len(verdicts)} commits hold")
+        skipped = sum(bool(verdict.skipped) for verdict in verdicts)
+        hold = len(verdicts) - len(broken) - skipped
+        note = f", {skipped} skipped" if skipped else ""
+        out.print(f"{hold} of {len(verdicts)} commits hold{note}")
     if broken:
         click.get_current_context().exit(1)

@@ -111,6 +111,8 @@ def id_problem(value: str) -> str:
         return f"has {len(value)} characters; at most {MAX_ID} are taken"
     if ".." in value:
         return f"{_shown(value)} holds '..'; choose an id without it"
+    if value != value.strip():
+        return f"{_shown(value)} starts or ends with white space; take it away"
     for char in value:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return (

@@ -10,6 +10,7 @@ import re
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import git
@@ -78,6 +79,11 @@ class StateRepository(ABC):
         Raises:
             RemoteAway, PushDenied: where it could not be published for another reason.
         """
+
+    def tidy(self) -> None:
+        """Let git pack loose objects, if there are many; it does so in a process of its own."""
+        with suppress(git.GitCommandError), git.Repo(self.objects.path) as repo:
+            _git(repo, "gc", "--auto", "--quiet")
 
     @property
     @abstractmethod
