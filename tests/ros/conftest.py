@@ -73,6 +73,13 @@ class Served:
 Serve = Callable[..., Served]
 
 
+def new_state_repo(path: Path) -> Path:
+    """Lay down a bare state repo."""
+    command = [sys.executable, "-m", "generator.cli.main", "init", str(path), "--bare"]
+    subprocess.run(command, check=True, capture_output=True)
+    return path
+
+
 @pytest.fixture
 def serve(tmp_path: Path, ros_domain: int) -> Iterator[Serve]:
     """Start nodes, and end those that a test leaves running."""
@@ -87,9 +94,7 @@ def serve(tmp_path: Path, ros_domain: int) -> Iterator[Serve]:
 
     def start(state_repo: str | None = None, *args: str) -> Served:
         if state_repo is None:
-            state_repo = str(tmp_path / "state.git")
-            command = [sys.executable, "-m", "generator.cli.main", "init", state_repo, "--bare"]
-            subprocess.run(command, check=True, capture_output=True)
+            state_repo = str(new_state_repo(tmp_path / "state.git"))
         log = tmp_path / f"node-{len(started)}.log"
         command = [sys.executable, "-m", "generator.cli.main", "serve", "--state-repo", state_repo]
         with log.open("w") as sink:

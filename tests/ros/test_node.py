@@ -14,7 +14,7 @@ import pytest
 import yaml
 from demandops_interfaces.srv import GetBookkeeping
 
-from tests.ros.conftest import Client, Serve, Served
+from tests.ros.conftest import Client, Serve, Served, new_state_repo
 
 ROOT = Path(__file__).parent.parent.parent
 EXPERIMENT = sorted((ROOT / "examples" / "experiment").glob("[1-8]-*.yaml"))
@@ -48,13 +48,13 @@ def git(state_repo: str, *args: str) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def slow_remote(served_repo: str, seconds: float) -> str:
+def slow_remote(bare: Path, seconds: float) -> str:
     """Make pushes to a repository take a while, and return its URL."""
-    hook = Path(served_repo) / "hooks" / "pre-receive"
+    hook = bare / "hooks" / "pre-receive"
     hook.parent.mkdir(exist_ok=True)
     hook.write_text(f"#!/bin/sh\nsleep {seconds}\n")
     hook.chmod(0o755)
-    return f"file://{served_repo}"
+    return f"file://{bare}"
 
 
 def test_the_eight_steps_of_the_paper_give_its_bookkeeping(serve: Serve, client: Client) -> None:
@@ -117,13 +117,8 @@ def test_four_hundred_goals_at_once_are_all_answered_and_none_is_lost(
 def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(
     serve: Serve, client: Client, tmp_path: Path
 ) -> None:
-    bare = tmp_path / "slow.git"
-    subprocess.run(
-        [sys.executable, "-m", "generator.cli.main", "init", str(bare), "--bare"],
-        check=True,
-        capture_output=True,
-    )
-    served = serve(slow_remote(str(bare), 2))
+    bare = new_state_repo(tmp_path / "slow.git")
+    served = serve(slow_remote(bare, 2))
     client.ready()
     committed = client.send(connection(1))
     client.wait(lambda: any(text.startswith("committed") for text in committed.feedback))
@@ -141,13 +136,8 @@ def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(
 def test_told_to_stop_it_finishes_what_is_in_hand(
     serve: Serve, client: Client, tmp_path: Path, number: signal.Signals
 ) -> None:
-    bare = tmp_path / "slow.git"
-    subprocess.run(
-        [sys.executable, "-m", "generator.cli.main", "init", str(bare), "--bare"],
-        check=True,
-        capture_output=True,
-    )
-    served = serve(slow_remote(str(bare), 1))
+    bare = new_state_repo(tmp_path / "slow.git")
+    served = serve(slow_remote(bare, 1))
     client.ready()
     goals = [client.send(connection(i)) for i in range(5)]
     client.wait(lambda: all(goal.accepted is not None for goal in goals))
@@ -162,13 +152,8 @@ def test_told_to_stop_it_finishes_what_is_in_hand(
 def test_a_restart_takes_up_what_was_acknowledged_nowhere(
     serve: Serve, client: Client, tmp_path: Path
 ) -> None:
-    bare = tmp_path / "slow.git"
-    subprocess.run(
-        [sys.executable, "-m", "generator.cli.main", "init", str(bare), "--bare"],
-        check=True,
-        capture_output=True,
-    )
-    served = serve(slow_remote(str(bare), 30))
+    bare = new_state_repo(tmp_path / "slow.git")
+    served = serve(slow_remote(bare, 30))
     client.ready()
     goal = client.send(connection(1))
     client.wait(lambda: any("committed" in text for text in goal.feedback))
@@ -208,12 +193,7 @@ def test_bookkeeping_is_answered_over_ros(serve: Serve, client: Client) -> None:
 def test_action_name_state_repo_and_log_level_are_ros_parameters(
     serve: Serve, ros_domain: int, tmp_path: Path
 ) -> None:
-    other = tmp_path / "other.git"
-    subprocess.run(
-        [sys.executable, "-m", "generator.cli.main", "init", str(other), "--bare"],
-        check=True,
-        capture_output=True,
-    )
+    other = new_state_repo(tmp_path / "other.git")
     args = ["-p", "action_name:=/demands", "-p", f"state_repo:={other}", "-p", "log_level:=error"]
     served = serve(None, "--ros-args", *args)
     client = Client(ros_domain, "/demands")
