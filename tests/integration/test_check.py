@@ -1,0 +1,142 @@
+"""`demandops check`: what a person is about to merge, held against where they started from."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from generator.cli.main import run
+
+CHART = "appdefs/object-detection-fusion/charts/object-fusion"
+
+
+@pytest.fixture(scope="module")
+def laid_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("check") / "state-repo"
+    assert run(["init", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def checkout(laid_down: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path / "data"))
+    shutil.copytree(laid_down, tmp_path / "state-repo")
+    return tmp_path / "state-repo"
+
+
+Check = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def check(checkout: Path, capsys: pytest.CaptureFixture[str]) -> Check:
+    def checked(*args: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = run(["check", str(checkout), *args])
+        printed = capsys.readouterr()
+        return code, printed.out.replace(f"{checkout}", "REPO"), printed.err
+
+    return checked
+
+
+def git(folder: Path, *args: str) -> None:
+    who = ["-c", "user.name=someone", "-c", "user.email=someone@example.invalid"]
+    subprocess.run(["git", "-C", str(folder), *who, *args], check=True, capture_output=True)
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def test_what_init_laid_down_is_sound(check: Check) -> None:
+    assert check() == (0, "REPO: all files are valid and everything renders\n", "")
+
+
+def test_a_chart_that_changed_without_a_new_version_is_caught(checkout: Path, check: Check) -> None:
+    edit(checkout / CHART / "values.yaml", "period: 0.5", "period: 0.7")
+    code, _, errors = check()
+    assert code == 1
+    assert errors == (
+        f"error: {CHART}/Chart.yaml: version: is still 0.1.0, but values.yaml changed; raise it "
+        "here and at charts.object-fusion in registry/charts.yaml, or no cluster takes it\n"
+    )
+
+
+def test_a_chart_that_changed_with_a_new_version_is_fine_and_shows_what_follows(
+    checkout: Path, check: Check
+) -> None:
+    edit(checkout / CHART / "values.yaml", "period: 0.5", "period: 0.7")
+    edit(checkout / CHART / "Chart.yaml", "version: 0.1.0", "version: 0.2.0")
+    charts = checkout / "registry" / "charts.yaml"
+    charts.write_text("0.2.0".join(charts.read_text().rsplit("0.1.0", 1)))
+    code, out, errors = check()
+    assert (code, errors) == (0, "")
+    assert out == (
+        "REPO: all files are valid and everything renders\n"
+        "the generator will write 2 files anew:\n"
+        "  clusters/c-its/perception/_charts/object-fusion-0.1.0.yaml\n"
+        "  clusters/c-its/perception/_charts/object-fusion-0.2.0.yaml\n"
+    )
+
+
+def test_a_chart_and_the_registry_that_disagree_are_told(checkout: Path, check: Check) -> None:
+    edit(checkout / CHART / "Chart.yaml", "version: 0.1.0", "version: 0.2.0")
+    code, _, errors = check()
+    assert code == 1
+    assert errors == (
+        "error: registry/charts.yaml: charts.object-fusion.version: is 0.1.0, but "
+        f"{CHART}/Chart.yaml says 0.2.0; make them one\n"
+    )
+
+
+def test_a_generated_file_edited_by_hand_is_told(checkout: Path, check: Check) -> None:
+    edit(checkout / "bootstrap" / "c-its.yaml", "prune: true", "prune: false")
+    code, _, errors = check()
+    assert code == 1
+    assert errors == (
+        "error: bootstrap/c-its.yaml: is generated, and an edit by hand is lost; take it back, and "
+        "change the configuration that it follows from\n"
+    )
+
+
+def test_edits_are_held_against_where_the_branch_left_main_even_when_committed(
+    checkout: Path, check: Check
+) -> None:
+    git(checkout, "update-ref", "refs/remotes/origin/main", "HEAD")
+    edit(checkout / CHART / "values.yaml", "period: 0.5", "period: 0.7")
+    git(checkout, "commit", "-qam", "a quicker watcher")
+    assert check()[0] == 1
+    assert check("--base", "HEAD")[0] == 0
+
+
+def test_a_folder_that_is_no_git_checkout_is_checked_all_the_same(
+    checkout: Path, check: Check
+) -> None:
+    shutil.rmtree(checkout / ".git")
+    assert check()[0] == 0
+    edit(checkout / "inventory" / "nodes.yaml", "cluster: c-its", "cluster: c-itz")
+    assert check()[0] == 1
+    code, _, errors = check("--base", "HEAD")
+    assert (code, errors) == (1, f"error: {checkout} is no Git checkout; leave out --base\n")
+
+
+def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None:
+    edit(checkout / "inventory" / "brokers.yaml", "node: edge", "node: egde")
+    code, out, _ = check("--output", "json")
+    assert code == 1
+    assert json.loads(out) == {
+        "faults": [
+            {
+                "file": "inventory/brokers.yaml",
+                "field": "brokers[1].node",
+                "message": "'egde' is not in nodes.yaml; did you mean 'edge'?",
+            }
+        ],
+        "outdated": [],
+    }
