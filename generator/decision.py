@@ -111,9 +111,14 @@ def admit(state: State, goal: object) -> DemandRequest:
         raise Refused(faults)
     told = {found.field for found in faults}
     content = _in_wire_words(list(admission.faults(request, state.catalog)), request, state.catalog)
-    faults += [found for found in content if not _told(found.field, told)]
+    unread = bool(told & {"apps", "connections"})  # and so not said to be missing
+    faults += [
+        found
+        for found in content
+        if not _told(found.field, told) and not (unread and found.code == "empty")
+    ]
     if faults:
-        raise Refused(dict.fromkeys(faults))
+        raise Refused(sorted(dict.fromkeys(faults), key=lambda found: _subject(found.field)))
     return request
 
 
@@ -139,6 +144,12 @@ def _told(field: str, told: Iterable[str]) -> bool:
         or known.startswith((f"{field}.", f"{field}["))
         for known in told
     )
+
+
+def _subject(field: str) -> tuple[str, int]:
+    """Return what a fault is about, so that faults of one subject are told together."""
+    name, bracket, rest = field.partition("[")
+    return (name, int(rest.split("]")[0])) if bracket else ("", 0)
 
 
 def _in_wire_words(

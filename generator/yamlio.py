@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import yaml
@@ -24,6 +24,12 @@ _WORDS = frozenset(
     ["y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "none"]
 )  # some parser somewhere reads one of these as something other than text
 
+_OPENING = (yaml.MappingStartEvent, yaml.SequenceStartEvent)
+_CLOSING = (yaml.MappingEndEvent, yaml.SequenceEndEvent)
+_MAX_DEPTH = 100
+_MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
+_MISFIT = "not valid YAML: a tag or number stands where it has no meaning"
+
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
@@ -31,13 +37,20 @@ class _StrictLoader(_Loader):  # type: ignore[misc]
     """A safe loader that refuses duplicate keys and leaves dates as text."""
 
 
-def _mapping(loader: Any, node: yaml.MappingNode) -> dict[Hashable, Any]:  # noqa: ANN401
-    seen: dict[Hashable, Any] = {}
+def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:  # noqa: ANN401
+    if not isinstance(node, yaml.MappingNode):
+        raise yaml.constructor.ConstructorError(
+            None, None, "a mapping is expected here", node.start_mark
+        )
+    seen: dict[str, Any] = {}
     for key_node, value_node in node.value:
         key = loader.construct_object(key_node, deep=True)
-        if not isinstance(key, Hashable):
+        if not isinstance(key, str):
             raise yaml.constructor.ConstructorError(
-                None, None, "a key must be a plain value", key_node.start_mark
+                None,
+                None,
+                f"the key {brief(key)} must be text; put it in quotes",
+                key_node.start_mark,
             )
         if key in seen:
             raise yaml.constructor.ConstructorError(
@@ -73,6 +86,7 @@ def _readable_block(text: str) -> bool:
     """Tell whether a literal block shows ``text`` unchanged (a parameter file in a ConfigMap)."""
     return (
         text.endswith("\n")
+        and not text.endswith("\n\n")
         and not text.startswith((" ", "\n"))
         and text.count("\n") > 1
         and not re.search(r"[ \t]\n|[^\x20-\x7e\n]", text)
@@ -80,6 +94,15 @@ def _readable_block(text: str) -> bool:
 
 
 _PlainDumper.add_representer(str, _text)
+
+
+def brief(value: object) -> str:
+    """Return a value for a message, whatever it is."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no number of over 4300 digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 60 else text[:57] + "…"
 
 
 def _mark(error: yaml.YAMLError) -> str:
@@ -90,7 +113,11 @@ def _mark(error: yaml.YAMLError) -> str:
 def load_all(text: str) -> Iterator[Any]:
     """Yield the documents of ``text``; raise :class:`InvalidInput` for what is not strict YAML."""
     try:
+        depth = 0
         for event in yaml.parse(text, Loader=_Loader):
+            depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
+            if depth > _MAX_DEPTH:  # before the C parser builds it and overruns its stack
+                raise InvalidInput([fault("", f"is nested deeper than {_MAX_DEPTH} levels")])
             if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
                 where = f"line {event.start_mark.line + 1}" if event.start_mark else ""
                 raise InvalidInput(
@@ -100,10 +127,8 @@ def load_all(text: str) -> Iterator[Any]:
     except yaml.YAMLError as error:
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise InvalidInput([fault(_mark(error), f"not valid YAML: {problem}")]) from error
-    except ValueError as error:  # an impossible number, say
-        raise InvalidInput([fault("", f"not valid YAML: {error}")]) from error
-    except RecursionError:
-        raise InvalidInput([fault("", "not valid YAML: nested too deeply")]) from None
+    except _MISFITS as error:
+        raise InvalidInput([fault("", _MISFIT)]) from error
 
 
 def load(text: str) -> Any:  # noqa: ANN401 - raw YAML is parsed into models right behind this
@@ -127,6 +152,8 @@ def load_rendered(text: str) -> Any:  # noqa: ANN401
     except yaml.YAMLError as error:
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise InvalidInput([fault(_mark(error), f"not valid YAML: {problem}")]) from error
+    except _MISFITS as error:
+        raise InvalidInput([fault("", _MISFIT)]) from error
 
 
 def dump(data: Mapping[str, Any]) -> str:

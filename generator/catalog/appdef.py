@@ -15,7 +15,10 @@ from generator.catalog.model import DnsLabel, FileModel, Frozen, Word
 from generator.errors import near
 
 TopicPattern = Annotated[
-    str, StringConstraints(pattern=r"^(/([A-Za-z_]\w*|([A-Za-z_]\w*)?\{instance\}\w*))+$")
+    str,
+    StringConstraints(
+        pattern=r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
+    ),
 ]
 """A topic name; ``{instance}`` stands for the source or the application that the service is for."""
 

@@ -45,7 +45,7 @@ def field_path(location: tuple[int | str, ...]) -> str:
             path += f"[{part}]"
         elif part != "[key]":
             path += f".{part}" if path else part
-    return path
+    return path if path.isprintable() else path.encode("unicode_escape").decode()
 
 
 def faults_of(error: ValidationError, model: type[BaseModel], file: str = "") -> list[Fault]:
@@ -54,6 +54,17 @@ def faults_of(error: ValidationError, model: type[BaseModel], file: str = "") ->
         fault(field_path(item["loc"]), _message(dict(item), model)).within(file)
         for item in error.errors(include_url=False)
     ]
+
+
+_EXPECTED = {
+    "model_type": "must be a mapping",
+    "dict_type": "must be a mapping",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "bool_type": "must be true or false",
+    "int_type": "must be a whole number",
+    "string_type": "must be text",
+}
 
 
 def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
@@ -67,18 +78,19 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
             near(name, known) if known else ""
         )
     if kind == "string_type" and isinstance(value, int | float):
-        return f"must be text, not {value!r}; put it in quotes"
+        return f"must be text, not {yamlio.brief(value)}; put it in quotes"
     if kind == "literal_error":
-        return f"is {value!r}, but must be {item['ctx']['expected']}"
+        return f"is {yamlio.brief(value)}, but must be {item['ctx']['expected']}"
     if kind == "string_pattern_mismatch":
         return (
             f"{value!r} is not a name that can be used here; it must match {item['ctx']['pattern']}"
         )
     if kind == "value_error":
         return str(item["ctx"]["error"])
-    shown = repr(value)
-    shown = shown if len(shown) <= 60 else shown[:57] + "…"
-    return f"{item['msg'][:1].lower()}{item['msg'][1:]}, not {shown}"
+    if kind == "string_too_short":
+        return "is empty; fill it in"
+    expected = _EXPECTED.get(kind) or f"{item['msg'][:1].lower()}{item['msg'][1:]}"
+    return f"{expected}, not {yamlio.brief(value)}"
 
 
 def _fields(model: type[BaseModel]) -> list[str]:

@@ -32,7 +32,12 @@ class _Errors:
     """Plain lines on stderr, whole whatever the width of the terminal."""
 
     def print(self, text: str) -> None:
-        click.echo(text, err=True)
+        click.echo("".join(char if char in "\n\t" else _visible(char) for char in text), err=True)
+
+
+def _visible(char: str) -> str:
+    """Return a character as it is, or escaped where it would act on the terminal."""
+    return char if char.isprintable() else char.encode("unicode_escape").decode()
 
 
 errors = _Errors()

@@ -76,7 +76,8 @@ def request(
 def _documents(file: str) -> Iterable[_Document]:
     name = "standard input" if file == "-" else file
     try:
-        text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
+        data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
+        text = data.decode("utf-8")
     except OSError as error:
         reason = error.strerror or str(error)
         raise InvalidInput([fault("", f"cannot be read: {reason}").within(name)]) from None

@@ -18,7 +18,7 @@ from generator.demand.request import (
     DemandRequest,
     Operation,
 )
-from generator.errors import Fault, fault, near
+from generator.errors import Fault, fault, near, shown
 
 SUPPORTED_CONNECTIONS = frozenset({ConnectionType.MQTT})
 """The connection types that :mod:`generator.render.connections` can write."""
@@ -127,13 +127,14 @@ def _connection(
 
 
 def _no_broker(where: str, connection: ConnectionDemand, catalog: Catalog) -> Fault:
-    known = ", ".join(sorted(catalog.brokers)) or "none"
+    known = ", ".join(sorted(catalog.brokers))
+    remedy = f"name one of: {known}" if known else "inventory/brokers.yaml has none; add one there"
     if connection.broker:
-        message = f"no broker runs on '{connection.broker}'; brokers run on: {known}"
+        message = f"no broker runs on {shown(connection.broker)}; {remedy}"
     else:
         message = (
             f"is open, and no broker runs on '{connection.target}' or '{connection.source}'; "
-            f"name one of: {known}"
+            f"{remedy}"
         )
     return fault(f"{where}.broker", message, code="no-broker")
 
@@ -144,17 +145,13 @@ def _node(where: str, node: str, catalog: Catalog) -> Iterator[Fault]:
     if node not in catalog.nodes:
         yield fault(
             where,
-            f"'{_short(node)}' is not in inventory/nodes.yaml" + near(node, catalog.nodes),
+            f"{shown(node)} is not in inventory/nodes.yaml" + near(node, catalog.nodes),
             code="unknown-node",
         )
     elif node not in catalog.domain_of:
         yield fault(
             where,
-            f"'{node}' is in no access domain; a platform engineer adds it to "
+            f"{shown(node)} is in no access domain; a platform engineer adds it to "
             "policy/access-domains.yaml",
             code="no-access-domain",
         )
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= 80 else text[:77] + "…"

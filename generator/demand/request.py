@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from types import MappingProxyType
 
-from generator.errors import Fault, fault
+from generator.errors import Fault, fault, shown
 
 MAX_ID = 1024
 """Characters that an id may have; file and object names are shortened and hashed anyway."""
@@ -110,13 +110,13 @@ def id_problem(value: str) -> str:
     if len(value) > MAX_ID:
         return f"has {len(value)} characters; at most {MAX_ID} are taken"
     if ".." in value:
-        return f"{_shown(value)} holds '..'; choose an id without it"
+        return f"{shown(value)} holds '..'; choose an id without it"
     if value != value.strip():
-        return f"{_shown(value)} starts or ends with white space; take it away"
+        return f"{shown(value)} starts or ends with white space; take it away"
     for char in value:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return (
-                f"{_shown(value)} holds the control character U+{ord(char):04X}; "
+                f"{shown(value)} holds the control character U+{ord(char):04X}; "
                 "choose an id without it"
             )
     return ""
@@ -127,20 +127,15 @@ def topic_problem(name: str) -> str:
     if not name:
         return "is empty; give a topic name"
     if name.startswith("~"):
-        return f"{_shown(name)} is private to a node; give the full name, starting with '/'"
+        return f"{shown(name)} is private to a node; give the full name, starting with '/'"
     if not _TOPIC.fullmatch(name):
         return (
-            f"{_shown(name)} is not a topic name that ROS 2 allows; use letters, digits and '_' "
+            f"{shown(name)} is not a topic name that ROS 2 allows; use letters, digits and '_' "
             "between single '/', no part starting with a digit"
         )
     if len(name) > MAX_TOPIC:
         return f"has {len(name)} characters; ROS 2 takes at most {MAX_TOPIC}"
     return ""
-
-
-def _shown(value: str) -> str:
-    text = value.encode("unicode_escape").decode() if not value.isprintable() else value
-    return f"'{text if len(text) <= 80 else text[:77] + '…'}'"
 
 
 def faults(request: DemandRequest) -> Iterator[Fault]:
@@ -149,7 +144,11 @@ def faults(request: DemandRequest) -> Iterator[Fault]:
     if request.id:
         yield from _id("id", request.id)
     if not (request.applications or request.connections):
-        yield fault("id", "the request lists no application and no connection; list what it is for")
+        yield fault(
+            "id",
+            "the request lists no application and no connection; list what it is for",
+            code="empty",
+        )
     for index, app in enumerate(request.applications):
         where = f"applications[{index}]"
         yield from _id(f"{where}.id", app.id)
@@ -196,7 +195,8 @@ def _connection(where: str, connection: ConnectionDemand, joining: bool) -> Iter
                 f"'{source}' goes to '{targets[source]}' and to '{target}'; one source topic has "
                 "one target, use a second connection",
             )
-        if connection.source == connection.target and source == target:
+        same_place = connection.source and connection.source == connection.target
+        if joining and same_place and source == target:
             yield fault(
                 f"{where}.topics[{index}].target",
                 f"'{target}' would feed itself, for source and target are both "

@@ -14,8 +14,9 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
+from generator import yamlio
 from generator.catalog.appdef import ApplicationDefinition
-from generator.catalog.model import Frozen, faults_of
+from generator.catalog.model import Frozen, faults_of, field_path
 from generator.demand.request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -86,11 +87,13 @@ class WireGoal(Frozen):
 
 _BODY = "object_detection_fusion_app"
 _INPUT = re.compile(r"^applications\[(\d+)\]\.inputs\.(\w+)(\[\d+\])?(.*)$")
+_LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 _WIRE_NAMES = (
     (re.compile(r"^applications(\[\d+\])\.id$"), r"apps\1.header.id"),
     (re.compile(r"^applications(\[\d+\])\.node$"), r"apps\1.header.node_id"),
     (re.compile(r"^applications(\[\d+\])\.requesters"), rf"apps\1.{_BODY}.requester_ids"),
     (re.compile(r"^applications(\[\d+\])\.appdef$"), r"apps\1.type"),
+    (re.compile(r"^applications(\[\d+\])\.inputs$"), rf"apps\1.{_BODY}"),
     (re.compile(r"^(connections\[\d+\])\.requesters"), r"\1.requester_ids"),
     (re.compile(r"^(connections\[\d+\])\.(source|target)$"), r"\1.\2_node_id"),
     (re.compile(r"^(connections\[\d+\])\.broker$"), r"\1.broker_node_id"),
@@ -114,9 +117,11 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
     if not isinstance(data, dict):
         return None, [_no_mapping()]
     goal, faults = _sound_part(data)
+    # where it does not say which, it is held to what a shutdown is held to: the rules of both
+    unsaid = any(found.field == "shutdown" for found in faults)
     request = DemandRequest(
         id=goal.id,
-        operation=Operation.SHUTDOWN if goal.shutdown else Operation.JOIN,
+        operation=Operation.SHUTDOWN if goal.shutdown or unsaid else Operation.JOIN,
         applications=tuple(_application(app, appdef_by_type(app.type)) for app in goal.apps),
         connections=tuple(_connection(connection) for connection in goal.connections),
     )
@@ -146,30 +151,49 @@ def _no_mapping() -> Fault:
 
 def _sound_part(data: dict[str, Any]) -> tuple[WireGoal, list[Fault]]:
     """Return what of ``data`` has the right form, and the faults of the rest."""
+    faults: list[Fault] = []
+    pruned = _with_keys_of_text(data, (), faults)
     try:
-        return WireGoal.model_validate(data), []
+        return WireGoal.model_validate(pruned), faults
     except ValidationError as error:
-        faults = faults_of(error, WireGoal)
-        pruned = data
-        # from the back, so that removing a list's item leaves the places before it as they are
-        locations = sorted((item["loc"] for item in error.errors()), key=_place, reverse=True)
-        for location in locations:
-            pruned = _without(pruned, location)
+        faults += faults_of(error, WireGoal)
+        for item in error.errors():
+            pruned = _blanked(pruned, item["loc"])
         return WireGoal.model_validate(pruned), faults
 
 
-def _place(location: tuple[int | str, ...]) -> tuple[tuple[int, str], ...]:
-    return tuple((part, "") if isinstance(part, int) else (-1, part) for part in location)
+def _with_keys_of_text(
+    data: object, location: tuple[int | str, ...], faults: list[Fault]
+) -> object:
+    """Return ``data`` without the entries whose key is no text, which are told."""
+    if isinstance(data, list):
+        return [_with_keys_of_text(item, (*location, i), faults) for i, item in enumerate(data)]
+    if not isinstance(data, dict):
+        return data
+    kept = {}
+    for key, value in data.items():
+        if isinstance(key, str):
+            kept[key] = _with_keys_of_text(value, (*location, key), faults)
+        else:
+            message = f"the key {yamlio.brief(key)} must be text; put it in quotes"
+            faults.append(fault(field_path(location), message))
+    return kept
 
 
-def _without(data: Any, location: tuple[int | str, ...]) -> Any:  # noqa: ANN401
+def _blanked(data: object, location: tuple[int | str, ...], within: str = "") -> object:
+    """Return ``data`` without what stands at ``location``.
+
+    A field goes, so that its default holds; a list's item becomes an empty one, so that those
+    behind it keep their places.
+    """
     head, *rest = location
     if isinstance(data, list) and isinstance(head, int):
-        inner = [_without(data[head], tuple(rest))] if rest else []
-        return [*data[:head], *inner, *data[head + 1 :]]
-    if isinstance(data, dict) and head in data:
-        if rest:
-            return {**data, head: _without(data[head], tuple(rest))}
+        empty: object = "" if within in _LISTS_OF_TEXT else {}
+        item = _blanked(data[head], tuple(rest), within) if rest else empty
+        return [*data[:head], item, *data[head + 1 :]]
+    if isinstance(data, dict):
+        if rest and head in data:
+            return {**data, head: _blanked(data[head], tuple(rest), str(head))}
         return {key: value for key, value in data.items() if key != head}
     return data
 
@@ -208,7 +232,11 @@ def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
 
 
 def _connection(connection: WireConnection) -> ConnectionDemand:
-    pairs = zip(connection.source_topics, connection.target_topics, strict=False)
+    sources, targets = connection.source_topics, connection.target_topics
+    # where one list is shorter (told by the caller), the other's names stand in for its
+    pairs = zip(
+        [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
+    )
     return ConnectionDemand(
         id=connection.id,
         type=connection.type,

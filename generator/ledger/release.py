@@ -32,13 +32,15 @@ def release(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
     keys: list[ClaimKey] = []
     not_held: list[str] = []
     for subject, asked in _listed(request):
-        claim = _meant(ledger.of(subject), request.id, asked)
+        # looked up in what was held at first: a second listing of a subject means the same claim
+        claim = _meant(start.of(subject), request.id, asked)
         if claim is None:
             not_held.append(f"{subject} for {', '.join(asked.requesters)}")
             continue
-        rest, missing = _subtracted(claim, asked, now)
-        not_held += [f"{subject}: {name}" for name in missing]
-        ledger = ledger.replace(claim.key, rest)
+        not_held += [f"{subject}: {name}" for name in _subtracted(claim, asked, now)[1]]
+        left = ledger.get(claim.key)
+        if left is not None:
+            ledger = ledger.replace(claim.key, _subtracted(left, asked, now)[0])
         keys.append(claim.key)
     changes = differences(start, ledger, keys)
     if not changes:
@@ -50,16 +52,10 @@ Asked: TypeAlias = ApplicationDemand | ConnectionDemand
 
 
 def _listed(request: DemandRequest) -> Iterator[tuple[Subject, Asked]]:
-    """Yield what a shutdown lists, each once, so that a repetition does not count as not held."""
-    seen: list[Asked] = []
-    for kind, asked_of_kind in (
-        (SubjectKind.APPLICATION, request.applications),
-        (SubjectKind.CONNECTION, request.connections),
-    ):
-        for asked in asked_of_kind:
-            if asked not in seen:
-                seen.append(asked)
-                yield Subject(kind, asked.id), asked
+    for app in request.applications:
+        yield Subject(SubjectKind.APPLICATION, app.id), app
+    for connection in request.connections:
+        yield Subject(SubjectKind.CONNECTION, connection.id), connection
 
 
 def _meant(claims: Iterable[Claim], request: str, asked: Asked) -> Claim | None:

@@ -90,11 +90,14 @@ def _check_object(
 ) -> Iterable[Fault]:
     metadata = document.get("metadata") or {}
     api, kind = str(document.get("apiVersion")), str(document.get("kind"))
-    identity = (api, kind, str(metadata.get("namespace")), str(metadata.get("name")))
+    name = str(metadata.get("name"))
     cluster = path.split("/")[1].removesuffix(".yaml")
-    other = seen.setdefault((cluster, *identity[1:]), path)
-    if other != path:
-        yield fault("metadata.name", f"{kind} {identity[3]} stands in {other} too").within(path)
+    identity = (cluster, kind, str(metadata.get("namespace")), name)
+    other = seen.get(identity)
+    if other is not None:
+        where = "here twice" if other == path else f"in {other} too"
+        yield fault("metadata.name", f"{kind} {name} stands {where}").within(path)
+    seen[identity] = path
     if api in _BUILT_IN:
         for where, message in _problems(_kind_validator(api, kind), document):
             yield fault(where, message).within(path)

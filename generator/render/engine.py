@@ -23,6 +23,14 @@ from generator.errors import InvalidInput, fault
 from generator.plan import naming
 from generator.settings import data_folder
 
+_TEMPLATE_FAULTS = (
+    TemplateError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+    LookupError,
+    RecursionError,
+)  # what a template can make happen: its author's to mend, whatever it is
 _MAX_LENGTH = 100_000
 _MAX_POWER = 64
 
@@ -145,7 +153,20 @@ class Engine:
             compiled: Template = self._catalog.get_template(template)
             values = yamlio.load_rendered(compiled.render(**context))
         except InvalidInput as error:
-            raise InvalidInput(yamlio.faults_in(error, template)) from None
+            raise InvalidInput(
+                fault(
+                    f"what it renders, {found.field}", f"{found.message}; mend the template"
+                ).within(template)
+                for found in error.faults
+            ) from None
+        except TemplateNotFound as error:
+            raise InvalidInput(
+                [
+                    fault(
+                        _line(error, template), f"'{error.name}' does not exist; mend the template"
+                    ).within(template)
+                ]
+            ) from None
         except TemplateSyntaxError as error:
             raise InvalidInput(
                 [

@@ -34,7 +34,8 @@ def generator_signature(moment: datetime) -> pygit2.Signature:
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
     """Return the requesters as the author, at the time when the demand was received."""
     names = ", ".join(decision.request.requesters())
-    name = _clipped(names.replace("<", "(").replace(">", ")"), _MAX_AUTHOR).strip(" .,:;\"'")
+    # git takes no angle brackets in a name and strips these characters from its ends
+    name = _clipped(names.replace("<", "(").replace(">", ")"), _MAX_AUTHOR).strip(" .,:;\"'\\")
     demand = decision.changes.claims[0].key.demand
     email = f"{demand}@demandops.invalid"
     return pygit2.Signature(name or "unnamed", email, int(received.timestamp()), 0)
