@@ -197,6 +197,7 @@ def rehearse(state: State) -> None:
     place = next(iter(sorted(state.catalog.domain_of)), None)
     if place is None:
         return
+    faults: list[Fault] = []
     for appdef in state.catalog.appdefs.values():
         request = DemandRequest(
             id="rehearsal",
@@ -215,5 +216,10 @@ def rehearse(state: State) -> None:
             ),
         )
         ledger, changes = booking.apply(Ledger(), request, datetime.fromtimestamp(0, timezone.utc))
-        keys = affected(Ledger(), ledger, state.catalog, changes.subjects())
-        changeset.render_all(ledger, state.catalog, state.engine, keys)
+        for key in affected(Ledger(), ledger, state.catalog, changes.subjects()):
+            try:
+                changeset.render_all(ledger, state.catalog, state.engine, [key])
+            except InvalidInput as error:
+                faults += error.faults
+    if faults:
+        raise InvalidInput(dict.fromkeys(faults))

@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import os
 from pathlib import Path
+from typing import Final
 
-API_VERSION = "demandops/v1"
+API_VERSION: Final = "demandops/v1"
 """``apiVersion`` of every file that people write."""
 
 LEDGER_API_VERSION = "demandops.ledger/v1"

@@ -6,10 +6,9 @@ or refused whole, with every fault of every file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Literal, TypeVar
 
@@ -27,10 +26,11 @@ from generator.catalog.inventory import (
     Node,
     NodesFile,
 )
-from generator.catalog.model import DnsLabel, FileModel, Frozen, parse_file
+from generator.catalog.model import DnsLabel, FileModel, Frozen
+from generator.catalog.reading import Reading
 from generator.catalog.registry import Chart, ChartsFile, Image, ImagesFile
-from generator.errors import Fault, InvalidInput, fault, near
-from generator.settings import RENDER_VERSION
+from generator.errors import InvalidInput, near
+from generator.settings import API_VERSION, RENDER_VERSION
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -44,6 +44,8 @@ IMAGES_FILE = "registry/images.yaml"
 
 MQTT_CLIENT_IMAGE = "mqtt-client"
 """The image of the registry that both ends of an MQTT connection run."""
+
+_CONNECTION_PREFIXES = ("mqtt", "zenoh", "ros")
 
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs")
 """The top-level entries of a state repo that people own and the catalog is made from."""
@@ -69,6 +71,15 @@ class Repository(FileModel):
     render_version: int = Field(alias="renderVersion", ge=1)
     source: DnsLabel = "demandops"
     flux: Flux
+
+
+_ANY = Repository(
+    apiVersion=API_VERSION,
+    kind="StateRepository",
+    gitops="flux",
+    renderVersion=RENDER_VERSION,
+    flux=Flux(url="https://unread.invalid/repo.git"),
+)  # stands in for one that could not be read, so that the rest is checked all the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,228 +121,212 @@ def load(files: Mapping[str, str]) -> Catalog:
     Raises:
         InvalidInput: with every fault of every file.
     """
-    faults: list[Fault] = []
-    read = partial(_read, files, faults)
-    repository = read(ROOT_FILE, Repository)
-    clusters = read(CLUSTERS_FILE, ClustersFile)
-    nodes = read(NODES_FILE, NodesFile)
-    brokers = read(BROKERS_FILE, BrokersFile)
-    domains = read(DOMAINS_FILE, AccessDomainsFile)
-    charts = read(CHARTS_FILE, ChartsFile)
-    images = read(IMAGES_FILE, ImagesFile)
-    appdefs = _read_appdefs(files, faults)
+    reading = Reading(files)
+    repository = reading.one(ROOT_FILE, Repository)
     if repository and repository.render_version > RENDER_VERSION:
-        faults.append(
-            fault(
-                "renderVersion",
-                f"is {repository.render_version}, but this generator renders version "
-                f"{RENDER_VERSION}; update the generator",
-            ).within(ROOT_FILE)
+        reading.tell(
+            ROOT_FILE,
+            "renderVersion",
+            f"is {repository.render_version}, but this generator renders version "
+            f"{RENDER_VERSION}; update the generator",
         )
-    if not (repository and clusters and nodes and brokers and domains and charts and images):
-        raise InvalidInput(faults)
-
+    nodes = reading.listed(NODES_FILE, NodesFile, "nodes", Node, "id")
+    domains = reading.listed(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
     catalog = Catalog(
-        repository=repository,
-        clusters=_keyed(clusters.clusters, "name", "clusters", CLUSTERS_FILE, faults),
-        nodes=_keyed(nodes.nodes, "id", "nodes", NODES_FILE, faults),
-        brokers=_keyed(brokers.brokers, "node", "brokers", BROKERS_FILE, faults),
-        domains=_keyed(domains.domains, "name", "domains", DOMAINS_FILE, faults),
-        charts=charts.charts,
-        images=images.images,
-        appdefs=appdefs,
-        domain_of=_domains_of_nodes(nodes.nodes, domains.domains, faults),
-        files=MappingProxyType({p: t for p, t in files.items() if p.startswith("appdefs/")}),
+        repository=repository or _ANY,
+        clusters=reading.listed(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
+        nodes=nodes,
+        brokers=reading.listed(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
+        domains=domains,
+        charts=reading.named(CHARTS_FILE, ChartsFile, "charts", Chart),
+        images=reading.named(IMAGES_FILE, ImagesFile, "images", Image),
+        appdefs=_read_appdefs(reading),
+        domain_of=_domains_of_nodes(reading, nodes, domains),
+        files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
     )
-    faults += _cross_check(catalog)
-    if faults:
-        raise InvalidInput(faults)
+    cross_check(catalog, reading)
+    if reading.faults:
+        raise InvalidInput(dict.fromkeys(reading.faults))
     return catalog
 
 
-def _read(
-    files: Mapping[str, str], faults: list[Fault], path: str, model: type[Model]
-) -> Model | None:
-    text = files.get(path)
-    if text is None:
-        faults.append(fault("", "is missing; `demandops init` shows what it holds").within(path))
-        return None
-    try:
-        return parse_file(model, text, path)
-    except InvalidInput as error:
-        faults += error.faults
-        return None
-
-
-def _read_appdefs(
-    files: Mapping[str, str], faults: list[Fault]
-) -> Mapping[str, ApplicationDefinition]:
+def _read_appdefs(reading: Reading) -> Mapping[str, ApplicationDefinition]:
     appdefs = {}
-    for path in sorted(files):
+    for path in sorted(reading.files):
         parts = path.split("/")
         if len(parts) != 3 or parts[0] != "appdefs" or parts[2] != "appdef.yaml":
             continue
-        appdef = _read(files, faults, path, ApplicationDefinition)
+        appdef = reading.one(path, ApplicationDefinition)
         if appdef is None:
             continue
         if appdef.name != parts[1]:
-            faults.append(
-                fault(
-                    "name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them one"
-                ).within(path)
+            reading.tell(
+                path, "name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them one"
             )
+            appdef = appdef.model_copy(update={"name": parts[1]})
         appdefs[appdef.name] = appdef
     return MappingProxyType(appdefs)
 
 
-def _keyed(
-    items: Iterable[Model], key: str, field: str, file: str, faults: list[Fault]
-) -> Mapping[str, Model]:
-    found: dict[str, Model] = {}
-    for index, item in enumerate(items):
-        name = str(getattr(item, key))
-        if name in found:
-            faults.append(
-                fault(f"{field}[{index}].{key}", f"'{name}' stands twice; remove one").within(file)
-            )
-        found[name] = item
-    return MappingProxyType(found)
-
-
 def _domains_of_nodes(
-    nodes: Iterable[Node], domains: Iterable[AccessDomain], faults: list[Fault]
+    reading: Reading, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
 ) -> Mapping[str, AccessDomain]:
     owner: dict[str, AccessDomain] = {}
-    domains = list(domains)
-    for index, node in enumerate(nodes):
-        matching = [d for d in domains if any(fnmatchcase(node.id, p) for p in d.nodes)]
+    for node in nodes:
+        matching = [d for d in domains.values() if any(fnmatchcase(node, p) for p in d.nodes)]
         if len(matching) > 1:
             names = " and ".join(f"'{domain.name}'" for domain in matching)
-            faults.append(
-                fault(
-                    f"nodes[{index}].id",
-                    f"'{node.id}' is in the access domains {names}; "
-                    "narrow their patterns so that it is in one",
-                ).within(NODES_FILE)
+            reading.tell(
+                NODES_FILE,
+                f"nodes[{reading.place(NODES_FILE, node)}].id",
+                f"'{node}' is in the access domains {names}; narrow their patterns so that it is "
+                "in one",
             )
         elif matching:
-            owner[node.id] = matching[0]
+            owner[node] = matching[0]
     return MappingProxyType(owner)
 
 
-def _cross_check(catalog: Catalog) -> list[Fault]:
-    checks: tuple[Callable[[Catalog], Iterable[Fault]], ...] = (
+def cross_check(catalog: Catalog, reading: Reading) -> None:
+    """Note every fault that shows only between files or entries."""
+    for check in (
         _check_inventory,
+        _check_topics,
         _check_namespaces,
         _check_charts,
         _check_services,
         _check_wire_types,
         _check_clients,
-    )
-    return [found for check in checks for found in check(catalog)]
+    ):
+        check(catalog, reading)
 
 
-def _check_inventory(catalog: Catalog) -> Iterable[Fault]:
-    for index, node in enumerate(catalog.nodes.values()):
-        if node.cluster not in catalog.clusters:
-            yield fault(
-                f"nodes[{index}].cluster",
-                f"'{node.cluster}' is not in clusters.yaml" + near(node.cluster, catalog.clusters),
-            ).within(NODES_FILE)
-    for index, broker in enumerate(catalog.brokers.values()):
-        if broker.node not in catalog.nodes:
-            yield fault(
-                f"brokers[{index}].node",
-                f"'{broker.node}' is not in nodes.yaml" + near(broker.node, catalog.nodes),
-            ).within(BROKERS_FILE)
+def _check_inventory(catalog: Catalog, reading: Reading) -> None:
+    for node in catalog.nodes.values():
+        if reading.lacks(CLUSTERS_FILE, node.cluster):
+            reading.tell(
+                NODES_FILE,
+                f"nodes[{reading.place(NODES_FILE, node.id)}].cluster",
+                f"'{node.cluster}' is not in clusters.yaml"
+                + near(node.cluster, reading.names(CLUSTERS_FILE)),
+            )
+    for broker in catalog.brokers.values():
+        if reading.lacks(NODES_FILE, broker.node):
+            reading.tell(
+                BROKERS_FILE,
+                f"brokers[{reading.place(BROKERS_FILE, broker.node)}].node",
+                f"'{broker.node}' is not in nodes.yaml"
+                + near(broker.node, reading.names(NODES_FILE)),
+            )
 
 
-def _check_namespaces(catalog: Catalog) -> Iterable[Fault]:
+def _check_topics(catalog: Catalog, reading: Reading) -> None:
+    roles = {role for appdef in catalog.appdefs.values() for role in appdef.inputs}
+    for node in catalog.nodes.values() if roles else ():
+        for role in node.topics:
+            if role not in roles:
+                reading.tell(
+                    NODES_FILE,
+                    f"nodes[{reading.place(NODES_FILE, node.id)}].topics.{role}",
+                    f"'{role}' is an input of no application" + near(role, roles),
+                )
+
+
+def _check_namespaces(catalog: Catalog, reading: Reading) -> None:
     seen: dict[str, str] = {}
-    for index, domain in enumerate(catalog.domains.values()):
+    for domain in catalog.domains.values():
         other = seen.setdefault(domain.namespace, domain.name)
         if other != domain.name:
-            yield fault(
-                f"domains[{index}].namespace",
+            reading.tell(
+                DOMAINS_FILE,
+                f"domains[{reading.place(DOMAINS_FILE, domain.name)}].namespace",
                 f"'{domain.namespace}' is the namespace of '{other}' already; give each its own",
-            ).within(DOMAINS_FILE)
+            )
 
 
-def _check_charts(catalog: Catalog) -> Iterable[Fault]:
+def _check_charts(catalog: Catalog, reading: Reading) -> None:
     for name, chart in catalog.charts.items():
         if not chart.folder:
             continue
         path = f"{chart.folder}/Chart.yaml"
-        where = f"charts.{name}.folder"
         text = catalog.files.get(path)
         if text is None:
-            yield fault(where, f"'{path}' does not exist; mend the folder").within(CHARTS_FILE)
+            message = f"'{path}' does not exist; mend the folder"
+            reading.tell(CHARTS_FILE, f"charts.{name}.folder", message)
             continue
         try:
             metadata = yamlio.load(text)
-            version = metadata.get("version") if isinstance(metadata, dict) else None
         except InvalidInput as error:
-            yield from yamlio.faults_in(error, path)
+            reading.faults += yamlio.faults_in(error, path)
             continue
+        version = metadata.get("version") if isinstance(metadata, dict) else None
         if version != chart.version:
-            yield fault(
+            reading.tell(
+                CHARTS_FILE,
                 f"charts.{name}.version",
                 f"is {chart.version}, but {path} says {version}; make them one",
-            ).within(CHARTS_FILE)
+            )
 
 
-def _check_services(catalog: Catalog) -> Iterable[Fault]:
-    prefixes: dict[str, tuple[str, Service]] = {}
+def _check_services(catalog: Catalog, reading: Reading) -> None:
+    prefixes: dict[str, tuple[str, str, Service]] = {}
     for appdef in catalog.appdefs.values():
         file = f"appdefs/{appdef.name}/appdef.yaml"
         for name, service in appdef.services.items():
             where = f"services.{name}"
-            if service.chart not in catalog.charts:
-                yield fault(
-                    f"{where}.chart",
-                    f"'{service.chart}' is not in {CHARTS_FILE}"
-                    + near(service.chart, catalog.charts),
-                ).within(file)
+            if reading.lacks(CHARTS_FILE, service.chart):
+                known = near(service.chart, reading.names(CHARTS_FILE))
+                reading.tell(
+                    file, f"{where}.chart", f"'{service.chart}' is not in {CHARTS_FILE}{known}"
+                )
             for image in service.images:
-                if image not in catalog.images:
-                    yield fault(
-                        f"{where}.images",
-                        f"'{image}' is not in {IMAGES_FILE}" + near(image, catalog.images),
-                    ).within(file)
+                if reading.lacks(IMAGES_FILE, image):
+                    known = near(image, reading.names(IMAGES_FILE))
+                    reading.tell(
+                        file, f"{where}.images", f"'{image}' is not in {IMAGES_FILE}{known}"
+                    )
             if catalog.values_template(appdef.name, service) not in catalog.files:
-                yield fault(f"{where}.values", f"'{service.values}' does not exist").within(file)
-            other, known = prefixes.setdefault(service.prefix, (name, service))
-            if service.prefix in ("mqtt", "zenoh", "ros"):
-                yield fault(
-                    f"{where}.prefix", f"'{service.prefix}' names connections; choose another"
-                ).within(file)
-            elif other != name or (known is not service and not _same_service(known, service)):
-                yield fault(
+                message = f"'{service.values}' does not exist; add it beside appdef.yaml"
+                reading.tell(file, f"{where}.values", message)
+            if service.prefix in _CONNECTION_PREFIXES:
+                message = f"'{service.prefix}' names connections; choose another"
+                reading.tell(file, f"{where}.prefix", message)
+                continue
+            other = prefixes.setdefault(service.prefix, (appdef.name, name, service))
+            if other[2] is not service and not _same(catalog, other, (appdef.name, name, service)):
+                reading.tell(
+                    file,
                     f"{where}.prefix",
-                    f"'{service.prefix}' is used by '{other}' already; only a service for each "
+                    f"'{service.prefix}' is used by '{other[1]}' already; only a service for each "
                     "topic may stand in several appdefs, and then must be the same in all",
-                ).within(file)
+                )
 
 
-def _same_service(one: Service, other: Service) -> bool:
-    return bool(one.each) and one == other
+def _same(catalog: Catalog, one: tuple[str, str, Service], other: tuple[str, str, Service]) -> bool:
+    """Tell whether two appdefs mean the same shared service."""
+    texts = [
+        catalog.files.get(catalog.values_template(appdef, service))
+        for appdef, _, service in (one, other)
+    ]
+    return bool(one[2].each) and one[1:] == other[1:] and texts[0] == texts[1]
 
 
-def _check_clients(catalog: Catalog) -> Iterable[Fault]:
-    if catalog.brokers and MQTT_CLIENT_IMAGE not in catalog.images:
-        yield fault("images", f"'{MQTT_CLIENT_IMAGE}' is missing; MQTT connections run it").within(
-            IMAGES_FILE
-        )
+def _check_clients(catalog: Catalog, reading: Reading) -> None:
+    if catalog.brokers and reading.lacks(IMAGES_FILE, MQTT_CLIENT_IMAGE):
+        message = f"'{MQTT_CLIENT_IMAGE}' is missing; MQTT connections run it"
+        reading.tell(IMAGES_FILE, "images", message)
 
 
-def _check_wire_types(catalog: Catalog) -> Iterable[Fault]:
+def _check_wire_types(catalog: Catalog, reading: Reading) -> None:
     seen: dict[int, str] = {}
     for appdef in catalog.appdefs.values():
         if appdef.deployment_request is None:
             continue
-        other = seen.setdefault(appdef.deployment_request.type, appdef.name)
+        number = appdef.deployment_request.type
+        other = seen.setdefault(number, appdef.name)
         if other != appdef.name:
-            yield fault(
+            reading.tell(
+                f"appdefs/{appdef.name}/appdef.yaml",
                 "deploymentRequest.type",
-                f"{appdef.deployment_request.type} already names '{other}'; choose another number",
-            ).within(f"appdefs/{appdef.name}/appdef.yaml")
+                f"{number} already names '{other}'; choose another number",
+            )

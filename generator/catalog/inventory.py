@@ -6,21 +6,38 @@ one access domain, and a node selector finds it there.
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
+from generator.catalog.identifiers import id_problem, topic_problem
 from generator.catalog.model import DnsLabel, FileModel, Frozen, Word
 
-NodeId = Annotated[str, StringConstraints(min_length=1, max_length=1024)]
+
+def _id(value: str) -> str:
+    problem = id_problem(value)
+    if problem:
+        raise ValueError(problem)
+    return value
+
+
+def _topic(value: str) -> str:
+    problem = topic_problem(value)
+    if problem:
+        raise ValueError(problem)
+    return value
+
+
+NodeId = Annotated[str, AfterValidator(_id)]
+Topic = Annotated[str, AfterValidator(_topic)]
 
 LabelKey = Annotated[
     str,
     StringConstraints(pattern=r"^([a-z0-9.-]+/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?$"),
 ]
-LabelValue = Annotated[
-    str, StringConstraints(pattern=r"^([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?$")
-]
+_LABEL_VALUE = re.compile(r"([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?")
+LabelValue = Annotated[str, StringConstraints(pattern=f"^{_LABEL_VALUE.pattern}$")]
 
 
 class Cluster(Frozen):
@@ -37,6 +54,14 @@ class Toleration(Frozen):
     operator: Literal["Exists", "Equal"] = "Equal"
     value: str = ""
     effect: Literal["", "NoSchedule", "PreferNoSchedule", "NoExecute"] = ""
+
+    @model_validator(mode="after")
+    def _sensible(self) -> Toleration:
+        if self.operator == "Exists" and self.value:
+            raise ValueError("operator Exists takes no value; remove it, or use Equal")
+        if self.operator == "Equal" and not self.key:
+            raise ValueError("operator Equal needs a key; add it, or use Exists for every taint")
+        return self
 
 
 class Ros(Frozen):
@@ -60,13 +85,25 @@ class Node(Frozen):
     type: Literal["vehicle", "station", "edge", "cloud"]
     cluster: DnsLabel
     selector: dict[LabelKey, LabelValue] | None = None
-    topics: dict[Word, str] = Field(default_factory=dict)
+    topics: dict[Word, Topic] = Field(default_factory=dict)
     tolerations: tuple[Toleration, ...] = Field(default=(), strict=False)
     image_pull_secrets: tuple[DnsLabel, ...] = Field(
         default=(), alias="imagePullSecrets", strict=False
     )
     host_network: bool = Field(default=True, alias="hostNetwork")
     ros: Ros = Ros()
+
+    @model_validator(mode="after")
+    def _findable(self) -> Node:
+        if self.selector is None and not _LABEL_VALUE.fullmatch(self.id):
+            raise ValueError(
+                "the id is no label value, so nodes cannot carry it as node_id; add a selector"
+            )
+        return self
+
+    def labels(self) -> dict[str, str]:
+        """Return the node selector."""
+        return dict(self.selector) if self.selector is not None else {"node_id": self.id}
 
 
 class Broker(Frozen):

@@ -28,7 +28,7 @@ Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_lengt
 class Frozen(BaseModel):
     """A value that cannot change, with no room for misspelt fields."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, populate_by_name=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 class FileModel(Frozen):
@@ -94,7 +94,7 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
 
 
 def _fields(model: type[BaseModel]) -> list[str]:
-    return list(model.model_fields)
+    return [field.alias or name for name, field in model.model_fields.items()]
 
 
 def parse(model: type[Model], data: object, file: str = "") -> Model:

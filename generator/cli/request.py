@@ -36,7 +36,8 @@ class _Document:
 
     @property
     def request_id(self) -> str:
-        return str(self.goal.get("id", "")) if isinstance(self.goal, dict) else ""
+        id = self.goal.get("id", "") if isinstance(self.goal, dict) else ""
+        return id if isinstance(id, str) else ""
 
 
 @click.command()

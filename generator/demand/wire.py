@@ -16,6 +16,7 @@ from pydantic import Field, ValidationError
 
 from generator import yamlio
 from generator.catalog.appdef import ApplicationDefinition
+from generator.catalog.identifiers import absolute
 from generator.catalog.model import Frozen, faults_of, field_path
 from generator.demand.request import (
     ApplicationDemand,
@@ -23,7 +24,6 @@ from generator.demand.request import (
     DemandRequest,
     InputTopic,
     Operation,
-    absolute,
 )
 from generator.errors import Fault, fault
 

@@ -49,7 +49,7 @@ def render(end: ConnectionEnd, catalog: Catalog, engine: Engine) -> str:
         f"connections/{end.type.name.lower()}/end.yaml.j2",
         end=end,
         node=end.node,
-        selector=end.node.selector or {"node_id": end.node.id},
+        selector=end.node.labels(),
         tolerations=[
             toleration.model_dump(exclude_defaults=True) for toleration in end.node.tolerations
         ],

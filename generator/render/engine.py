@@ -155,7 +155,7 @@ class Engine:
         except InvalidInput as error:
             raise InvalidInput(
                 fault(
-                    f"what it renders, {found.field}", f"{found.message}; mend the template"
+                    f"{found.field} of what is rendered", f"{found.message}; mend the template"
                 ).within(template)
                 for found in error.faults
             ) from None

@@ -134,7 +134,7 @@ def _context(release: ServiceRelease, catalog: Catalog) -> dict[str, object]:
 def _node(node: Node) -> dict[str, object]:
     return {
         "id": node.id,
-        "selector": dict(node.selector or {"node_id": node.id}),
+        "selector": node.labels(),
         "tolerations": [item.model_dump(exclude_defaults=True) for item in node.tolerations],
         "image_pull_secrets": list(node.image_pull_secrets),
         "host_network": node.host_network,
