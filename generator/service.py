@@ -7,8 +7,10 @@ nothing, and when the remote has moved the demands themselves are judged again o
 
 from __future__ import annotations
 
+import json
 import logging
 import random
+import re
 import threading
 import uuid
 from collections import deque
@@ -27,9 +29,11 @@ from generator.errors import (
     DemandOpsError,
     InvalidInput,
     QueueFull,
+    Refused,
     ShuttingDown,
     StateRepoError,
     Withdrawn,
+    fault,
 )
 from generator.staterepo import history, remote, writer
 from generator.staterepo import snapshot as snapshots
@@ -49,6 +53,7 @@ _BATCH_LIMIT_EMBEDDED = 20
 _BATCH_LIMIT_REMOTE = 200
 """Demands that are published together: a push costs some 50 ms, moving a branch less than one."""
 _TIDY_EVERY = 300
+_OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 _TAKEN_BACK = "the demand was taken back before it was committed"
 
 
@@ -127,6 +132,7 @@ class Generator:
         self._changed = threading.Condition()
         self._tickets: dict[str, Ticket] = {}
         self._stopping = False
+        self._finished: Future[bool] | None = None
         self._giving_up = threading.Event()
         for entry in self._slot.outbox.pending.values():
             log.info("taking up demand %s from the outbox", entry.operation)
@@ -164,7 +170,16 @@ class Generator:
         Raises:
             ShuttingDown, QueueFull: where the demand is not taken at all.
         """
-        ticket = Ticket(operation or str(uuid.uuid4()), goal, _now(), listener)
+        operation = operation or str(uuid.uuid4())
+        if not _OPERATION.fullmatch(operation):
+            raise ValueError(f"{operation!r} is no operation id; use letters, digits and dashes")
+        ticket = Ticket(operation, goal, _now(), listener)
+        ticket.future.set_running_or_notify_cancel()  # `withdraw` takes a demand back, not cancel
+        try:
+            ticket.goal = json.loads(json.dumps(goal))
+        except (TypeError, ValueError, RecursionError):
+            ticket.future.set_exception(Refused([fault("", "the goal is no plain data")]))
+            return ticket
         with self._changed:
             if self._stopping:
                 raise ShuttingDown("the generator is shutting down; send the demand again later")
@@ -203,9 +218,12 @@ class Generator:
             A future that tells, when all has ended, whether everything was published.
         """
         with self._changed:
+            if self._finished is not None:
+                return self._finished
             self._stopping = True
+            finished: Future[bool] = Future()
+            self._finished = finished
             self._changed.notify()
-        finished: Future[bool] = Future()
         threading.Thread(
             target=self._end, args=(timeout, finished), name="demandops-stop", daemon=True
         ).start()
@@ -242,8 +260,8 @@ class Generator:
                 self._fail(batch, error)
             except Exception as error:
                 log.exception("a fault of the generator")
-                fault = StateRepoError(f"a fault of the generator: {error!r}; its log says more")
-                self._fail(batch, fault)
+                told = StateRepoError(f"a fault of the generator: {error!r}; its log says more")
+                self._fail(batch, told)
 
     def _take_up(self, batch: list[Ticket]) -> None:
         """Move what waits into the batch, journaled before anything is done with it."""
@@ -263,6 +281,7 @@ class Generator:
         verdict_is_current = self._repository.always_current
         while True:
             self._take_up(batch)
+            self._dismiss_withdrawn(batch)
             try:
                 line = self._line()
                 arrived = self._arrived(line.start, batch)
@@ -270,8 +289,9 @@ class Generator:
                 nothing_to_push = line.head.commit == line.start.commit
                 if nothing_to_push and not verdict_is_current:
                     # only a push would have shown that the remote has moved
+                    tip = self._repository.refresh()
                     verdict_is_current = True
-                    if self._repository.refresh() != line.start.commit:
+                    if tip != line.start.commit:
                         continue
                 if self._publish(line, results):
                     self._answer(batch, results)
@@ -288,6 +308,13 @@ class Generator:
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
             pause = min(pause * 2, _LONGEST_PAUSE_S)
+
+    def _dismiss_withdrawn(self, batch: list[Ticket]) -> None:
+        """Answer those that were taken back at once: the remote may be away for long."""
+        for ticket in [ticket for ticket in batch if ticket.state == "withdrawn"]:
+            batch.remove(ticket)
+            self._forget(ticket)
+            ticket.future.set_exception(Withdrawn(_TAKEN_BACK))
 
     def _publish(self, line: writer.Line, results: list[_Result]) -> bool:
         """Publish a line; what the remote denies becomes the answer of all that is in it."""
@@ -314,7 +341,7 @@ class Generator:
         """Start a line on the newest tip that is known, people's changes taken in."""
         tip = self._repository.tip()
         before = self._snapshot
-        if tip == before.commit:
+        if tip == before.commit and not before.problems:
             return writer.Line(self._repository, before)
         advance = snapshots.advance(self._repository.objects, before, tip)
         line = writer.Line(self._repository, advance.snapshot)
@@ -324,7 +351,7 @@ class Generator:
         return line
 
     def _judge(
-        self, line: writer.Line, ticket: Ticket, arrived: dict[str, str]
+        self, line: writer.Line, ticket: Ticket, arrived: dict[str, history.Arrival]
     ) -> Receipt | DemandOpsError:
         if ticket.state == "withdrawn":
             return Withdrawn(_TAKEN_BACK)
@@ -360,6 +387,7 @@ class Generator:
             self._tell(ticket, "committed", f"committed {commit}")
         else:
             commit = str(line.head.commit)
+            line.note_unchanged(ticket.operation)
         return Receipt(
             operation=ticket.operation,
             request_id=decision.request.id,
@@ -369,21 +397,23 @@ class Generator:
             not_held=decision.changes.not_held,
         )
 
-    def _arrived(self, start: Snapshot, batch: list[Ticket]) -> dict[str, str]:
-        """Return operation id → commit of demands that were published although nobody was told.
+    def _arrived(self, start: Snapshot, batch: list[Ticket]) -> dict[str, history.Arrival]:
+        """Return operation id → arrival of demands that were published although nobody was told.
 
         The connection may have been cut, or the process killed, after the remote took the push.
         """
         bases = {ticket.base for ticket in batch if ticket.maybe_published}
-        found: dict[str, str] = {}
+        found: dict[str, history.Arrival] = {}
         for base in bases:
             found |= history.operations_since(self._repository.objects, start.commit, base)
         return found
 
-    def _published_before(self, ticket: Ticket, commit: str) -> Receipt:
+    def _published_before(self, ticket: Ticket, arrival: history.Arrival) -> Receipt:
         goal = ticket.goal if isinstance(ticket.goal, dict) else {}
         outcome: Outcome = "released" if goal.get("shutdown") else "booked"
-        return Receipt(ticket.operation, str(goal.get("id", "")), outcome, commit)
+        if not arrival.changed:
+            outcome = "unchanged"
+        return Receipt(ticket.operation, str(goal.get("id", "")), outcome, arrival.commit)
 
     def _answer(self, batch: list[Ticket], results: list[_Result]) -> None:
         with self._changed:
@@ -426,6 +456,7 @@ def _ticket_of(entry: Entry) -> Ticket:
     received = datetime.fromisoformat(entry.received)
     ticket = Ticket(entry.operation, entry.goal, received, lambda stage, text: None)
     ticket.base, ticket.maybe_published = entry.base, True
+    ticket.future.set_running_or_notify_cancel()
     return ticket
 
 

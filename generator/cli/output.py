@@ -25,7 +25,7 @@ def _console(stderr: bool) -> Console:
     """Return a console; where no terminal reads, nothing is coloured and little is wrapped."""
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _WIDE
-    return Console(stderr=stderr, width=width, highlight=False, markup=False, soft_wrap=False)
+    return Console(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
 class _Errors:

@@ -71,8 +71,16 @@ def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> It
         yield entry_of(commit)
 
 
-def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, str]:
-    """Return operation id → commit of every demand that arrived after ``base``.
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """Where a demand is found in history, and whether it changed anything."""
+
+    commit: str
+    changed: bool
+
+
+def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Arrival]:
+    """Return operation id → arrival of every demand that was settled after ``base``.
 
     Where ``base`` is not known here (a remote that was laid anew), all of history is read.
     """
@@ -85,9 +93,9 @@ def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, str]:
         return {}
     found = {}
     for entry in walk(repo, tip, until):
-        operation = entry.one("Operation-Id")
-        if operation:
-            found[operation] = entry.commit
+        for key, changed in (("Operation-Id", True), ("Unchanged-Operation-Id", False)):
+            for operation in entry.trailers.get(key, ()):
+                found[operation] = Arrival(entry.commit, changed)
     return found
 
 

@@ -26,6 +26,11 @@ _MAX_AUTHOR = 200
 _MAX_SUBJECT = 90
 
 
+def is_generators(message: str) -> bool:
+    """Tell whether a commit is the generator's, so that its files fit its books."""
+    return "\nRender-Version: " in message
+
+
 def generator_signature(moment: datetime) -> pygit2.Signature:
     """Return the committer of all that the generator commits."""
     return pygit2.Signature(GENERATOR_NAME, GENERATOR_EMAIL, int(moment.timestamp()), 0)
@@ -41,8 +46,10 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
     return pygit2.Signature(name or "unnamed", email, int(received.timestamp()), 0)
 
 
-def of_decision(decision: Decision, operation: str, received: datetime) -> str:
-    """Return the message of a demand's commit."""
+def of_decision(
+    decision: Decision, operation: str, received: datetime, unchanged: Iterable[str] = ()
+) -> str:
+    """Return the message of a demand's commit; ``unchanged`` were judged just before it."""
     request = decision.request
     joining = request.operation is Operation.JOIN
     subjects = decision.changes.subjects()
@@ -63,6 +70,7 @@ def of_decision(decision: Decision, operation: str, received: datetime) -> str:
     trailers = [
         ("Operation", request.operation.value),
         ("Operation-Id", operation),
+        *(("Unchanged-Operation-Id", other) for other in unchanged),
         *(("Demand-Id", demand) for demand in dict.fromkeys(c.key.demand for c in claims)),
         *(("Requester", requester) for requester in request.requesters()),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),

@@ -12,6 +12,7 @@ import json
 import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import IO, Any
 
@@ -86,14 +87,16 @@ class Outbox:
 def _load(path: Path) -> dict[str, Entry]:
     """Return what is pending; a last line that a crash cut off was never acknowledged."""
     pending: dict[str, Entry] = {}
-    for line in path.read_text().splitlines() if path.exists() else []:
+    text = path.read_bytes().decode("utf-8", "replace") if path.exists() else ""
+    for line in text.splitlines():
         try:
             record = json.loads(line)
             if "done" in record:
                 pending.pop(record["done"], None)
             else:
+                datetime.fromisoformat(record["received"])
                 pending[record["operation"]] = Entry(**record)
-        except (ValueError, TypeError, KeyError):
+        except (ValueError, TypeError, KeyError, AttributeError):
             continue
     return pending
 

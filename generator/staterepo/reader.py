@@ -106,10 +106,10 @@ class Reader:
             )
         try:
             snapshot = snapshots.load(self._repository.objects, commit.id)
+            differing = _differing(rendered(snapshot.state), commit)
         except InvalidInput as error:
             why = f"a person's file was not valid then: {error.faults[0]}"
             return Verdict(entry.commit, entry.summary, True, why)
-        differing = _differing(rendered(snapshot.state), commit)
         return Verdict(entry.commit, entry.summary, not differing, differing=differing)
 
 

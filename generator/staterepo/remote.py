@@ -6,8 +6,10 @@ succeeds only on top of what was there: never a forced push, never a merge of te
 
 from __future__ import annotations
 
+import logging
 import re
 import shutil
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
@@ -22,23 +24,22 @@ from generator.settings import MAIN_BRANCH
 
 _MAIN = f"refs/heads/{MAIN_BRANCH}"
 _REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
-_URL = re.compile(r"^([a-z][a-z0-9+.-]*://|[^/\s]+@[^/\s:]+:|[A-Za-z0-9.-]+:[^/\\])")
-_ALLOWED = re.compile(r"^(https?|ssh|git|file|git\+ssh)://")
-_PASSWORD = re.compile(r"(://)[^/@\s]*@")
-_HAS_PASSWORD = re.compile(r"://[^/@\s]*:[^/@\s]*@")
-_MOVED = (
-    "non-fast-forward",
-    "fetch first",
-    "stale info",
-    "cannot lock ref",
-    "failed to update ref",
-    "remote rejected",
-    "incorrect old value",
-)
+_SCHEME = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]*)(://|::)")
+_SCP = re.compile(r"^([^/\s:]+:(?!:)|[^/\s:]+@\[[^\]/]+\]:)")
+_ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
+_HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
+_USER = re.compile(r"(://)[^/@\s]*@")
+_BEHIND = re.compile(r"\[rejected\]")
+_REFUSED = re.compile(r"\[remote rejected\] \((.*)\)")
+_PASSING = re.compile(r"lock|failed to update ref|incorrect old value")
+_NO_RIGHT = re.compile(r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE)
 _TIMEOUT_S = 120
+_STALE_LOCK_S = 5.0
 _ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
 
 Say = Callable[[str], None]
+
+log = logging.getLogger("demandops")
 
 
 class RemoteAway(StateRepoError):
@@ -51,7 +52,7 @@ class PushDenied(StateRepoError):
 
 def without_secrets(text: str) -> str:
     """Return ``text`` with the user part of every URL taken out: it may hold a password."""
-    return _PASSWORD.sub(r"\1", text)
+    return _USER.sub(r"\1", _HAS_PASSWORD.sub(r"\1", text))
 
 
 class StateRepository(ABC):
@@ -127,9 +128,18 @@ class EmbeddedRepository(StateRepository):
             return False
         try:
             reference.set_target(commit, "demandops")
-        except pygit2.GitError:
+        except (pygit2.GitError, OSError):
+            self._break_stale_lock()
             return False  # another writer holds the lock or was first: judge anew
         return True
+
+    def _break_stale_lock(self) -> None:
+        """Remove a branch's lock that a killed process left: Git holds one for milliseconds."""
+        lock = Path(self.objects.path) / f"{_MAIN}.lock"
+        with suppress(FileNotFoundError):
+            if time.time() - lock.stat().st_mtime > _STALE_LOCK_S:
+                log.warning("removing %s, which a killed process left behind", lock)
+                lock.unlink()
 
     @property
     def always_current(self) -> bool:
@@ -155,19 +165,11 @@ class ClonedRepository(StateRepository):
     """A bare clone of a remote; clone, fetch and push run git itself, with the user's set-up."""
 
     def __init__(self, url: str, folder: Path, say: Say) -> None:
-        if not _ALLOWED.match(url) and "://" in url:
-            scheme = url.split("://", maxsplit=1)[0]
-            raise StateRepoError(
-                f"'{scheme}://' is no way to reach a state repo; use https, ssh, git or file"
-            )
-        if _HAS_PASSWORD.search(url):
-            raise StateRepoError(
-                "the state repo's address holds a password, which process lists would show; leave "
-                "it out and give it to git by a credential helper, ~/.netrc or an SSH key"
-            )
         self.address = without_secrets(url)
         self._url = url
         self._folder = folder
+        for lock in folder.rglob("*.lock"):  # the folder is ours alone: a killed process left it
+            lock.unlink(missing_ok=True)
         if not self._is_sound():
             self._clone(say)
         self._git = git.Repo(folder)
@@ -227,15 +229,30 @@ class ClonedRepository(StateRepository):
             _git(self._git, "push", "--porcelain", "--quiet", "origin", f"{commit}:{_MAIN}")
         except git.GitCommandError as error:
             text = without_secrets(f"{error.stdout}\n{error.stderr}")
-            if self.refresh() != expected:
-                return self.objects.descendant_of(self.tip(), commit) or self.tip() == commit
-            if any(sign in text for sign in _MOVED) and "hook declined" not in text:
+            tip = self.refresh()
+            if tip == commit or self.objects.descendant_of(tip, commit):
+                return True  # it was taken, and the answer got lost
+            if tip != expected or _BEHIND.search(text):
                 return False
-            if "rejected" in text or "denied" in text or "403" in text:
-                raise PushDenied(f"{self.address} takes no push: {_last_line(text)}") from None
-            raise RemoteAway(f"{self.address} cannot be pushed to: {_last_line(text)}") from None
+            raise self._why_not(text) from None
         self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         return True
+
+    def _why_not(self, text: str) -> StateRepoError:
+        """Tell a push that can be tried again from one that is denied."""
+        refused = _REFUSED.search(text)
+        if refused and not _PASSING.search(refused[1]):
+            said = " ".join(
+                line.removeprefix("remote:").strip(" '")
+                for line in text.splitlines()
+                if line.startswith("remote:")
+            )
+            reason = f"{refused[1]}: {said}" if said else refused[1]
+            return PushDenied(f"{self.address} takes no push: {reason}")
+        if _NO_RIGHT.search(text):
+            return PushDenied(f"{self.address} takes no push: {_last_line(text)}")
+        reason = refused[1] if refused else _last_line(text)
+        return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
 
     @property
     def always_current(self) -> bool:
@@ -265,7 +282,20 @@ def _last_line(text: str) -> str:
 
 def is_url(address: str) -> bool:
     """Tell a Git URL (``https://…``, ``ssh://…``, ``user@host:path``) from a folder."""
-    return bool(_URL.match(address)) and not Path(address).exists()
+    return not Path(address).exists() and bool(_SCHEME.match(address) or _SCP.match(address))
+
+
+def _check_url(url: str) -> None:
+    scheme = _SCHEME.match(url)
+    if scheme and (scheme[2] == "::" or scheme[1] not in _ALLOWED):
+        raise StateRepoError(
+            f"'{scheme[0]}' is no way to reach a state repo; use https, ssh, git or file"
+        )
+    if _HAS_PASSWORD.search(url):
+        raise StateRepoError(
+            "the state repo's address holds a password, which process lists would show; leave "
+            "it out and give it to git by a credential helper, ~/.netrc or an SSH key"
+        )
 
 
 def connect(address: str, folder: Path, say: Say = lambda text: None) -> StateRepository:
@@ -280,6 +310,7 @@ def connect(address: str, folder: Path, say: Say = lambda text: None) -> StateRe
         StateRepoError: saying what is wrong with the address and how to mend it.
     """
     if is_url(address):
+        _check_url(address)
         return ClonedRepository(address, folder / "clone.git", say)
     path = Path(address).expanduser()
     if not path.is_dir():

@@ -11,15 +11,18 @@ from dataclasses import dataclass, replace
 
 import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
+from pygit2.enums import SortMode
 from rpds import HashTrieMap
 
 from generator.catalog.catalog import CONFIG_ROOTS, Catalog
 from generator.catalog.catalog import load as load_catalog
 from generator.decision import State
-from generator.demand.claim import ClaimKey, Subject
+from generator.demand.claim import Claim, ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger
+from generator.settings import GENERATED_ROOTS
+from generator.staterepo import message
 from generator.staterepo import tree as trees
 
 Progress = Callable[[int, int], None]
@@ -94,6 +97,73 @@ def load(
     return Snapshot(commit.id, State.of(catalog, ledger), keys)
 
 
+def load_last_valid(
+    repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
+) -> Snapshot:
+    """Load a commit; of what is not valid there, the last version before it that was.
+
+    Raises:
+        InvalidInput, StateRepoError: where there never was a valid configuration.
+    """
+    commit = commit_of(repo, revision)
+    problems: list[Fault] = []
+    try:
+        catalog = catalog_at(commit.tree)
+    except InvalidInput as error:
+        problems += error.faults
+        catalog = _last_valid_catalog(repo, commit, error)
+    ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
+    for path in dict.fromkeys(found.file for found in faults):
+        claim = _last_valid_claim(commit, path)
+        if claim is not None:
+            ledger, keys = ledger.replace(claim.key, claim), keys.insert(path, claim.key)
+    return Snapshot(commit.id, State.of(catalog, ledger), keys, (*problems, *faults))
+
+
+def _last_valid_catalog(repo: Repository, commit: Commit, fault: InvalidInput) -> Catalog:
+    seen = {_config_ids(commit.tree)}
+    while commit.parents:
+        commit = commit.parents[0]
+        if _config_ids(commit.tree) in seen:
+            continue
+        seen.add(_config_ids(commit.tree))
+        try:
+            return catalog_at(commit.tree)
+        except (InvalidInput, StateRepoError):
+            continue
+    raise fault
+
+
+def _config_ids(tree: Tree) -> tuple[str, ...]:
+    return tuple(str(_id(tree, root)) for root in CONFIG_ROOTS)
+
+
+def _last_valid_claim(commit: Commit, path: str) -> Claim | None:
+    while commit.parents:
+        commit = commit.parents[0]
+        text = trees.read_text(commit.tree, path)
+        if text is None:
+            return None
+        try:
+            return ledger_format.read(text, path)
+        except InvalidInput:
+            continue
+    return None
+
+
+def _edited_by_hand(repo: Repository, before: Oid, to: Oid) -> bool:
+    """Tell whether a commit that is not the generator's changed generated files on the way."""
+    walker = repo.walk(to, SortMode.TOPOLOGICAL)
+    walker.hide(before)
+    for commit in walker:
+        if message.is_generators(commit.message) or not commit.parents:
+            continue
+        old, new = commit.parents[0].tree, commit.tree
+        if any(_id(old, root) != _id(new, root) for root in GENERATED_ROOTS):
+            return True
+    return False
+
+
 def catalog_at(tree: Tree) -> Catalog:
     """Return the catalog of one tree.
 
@@ -145,11 +215,12 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     What is not valid there is left as it was before, and told in the new snapshot's problems.
     """
     before, after = commit_of(repo, snapshot.commit).tree, commit_of(repo, to).tree
-    state, problems, catalog_changed = snapshot.state, list[Fault](), False
+    state, problems = snapshot.state, list[Fault]()
+    catalog_changed = _edited_by_hand(repo, snapshot.commit, to)
     if any(_id(before, root) != _id(after, root) for root in CONFIG_ROOTS) or snapshot.problems:
         try:
             catalog = catalog_at(after)
-            catalog_changed = catalog != state.catalog
+            catalog_changed = catalog_changed or catalog != state.catalog
             state = State(catalog, State.of(catalog, state.ledger).engine, state.ledger)
         except (InvalidInput, StateRepoError) as error:
             problems += _as_faults(error)

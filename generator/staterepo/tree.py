@@ -100,19 +100,24 @@ def _builder(
 ) -> pygit2.TreeBuilder:
     builder = repo.TreeBuilder(base) if base is not None else repo.TreeBuilder()
     below: dict[str, dict[str, str | None]] = {}
+    here: dict[str, str | None] = {}
     for path, text in files.items():
         name, _, rest = path.partition("/")
         if rest:
             below.setdefault(name, {})[rest] = text
-        elif text is not None:
-            builder.insert(name, repo.create_blob(text.encode()), FileMode.BLOB)
-        elif builder.get(name) is not None:
-            builder.remove(name)
+        else:
+            here[name] = text
     for name, inner in below.items():
         entry = builder.get(name)
-        subtree = _builder(repo, entry if isinstance(entry, Tree) else None, inner)
+        folder = entry if isinstance(entry, Tree) else None
+        subtree = _builder(repo, folder, inner)
         if len(subtree):
             builder.insert(name, subtree.write(), FileMode.TREE)
-        elif entry is not None:
+        elif folder is not None:
+            builder.remove(name)
+    for name, text in here.items():  # last, so that a file may take the place of a folder
+        if text is not None:
+            builder.insert(name, repo.create_blob(text.encode()), FileMode.BLOB)
+        elif name not in below and builder.get(name) is not None:
             builder.remove(name)
     return builder

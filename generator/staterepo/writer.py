@@ -32,6 +32,7 @@ class Line:
         self._repository = repository
         self._objects = repository.objects
         self._tree = snapshots.commit_of(self._objects, start.commit).tree
+        self._unchanged: list[str] = []
         self.start = start
         self.head = start
 
@@ -41,11 +42,20 @@ class Line:
 
     def commit(self, decision: Decision, operation: str, received: datetime, now: datetime) -> str:
         """Commit one demand on top of the line and return the commit's id."""
-        text = message.of_decision(decision, operation, received)
+        text = message.of_decision(decision, operation, received, self._unchanged)
+        self._unchanged = []
         made = self._write(decision.files, text, message.author(decision, received), now)
         keys = [change.key for change in decision.changes.claims]
         self.head = self.head.after(made, decision.state, keys)
         return str(made)
+
+    def note_unchanged(self, operation: str) -> None:
+        """Have the next commit name a demand that changed nothing, if there is a next one.
+
+        Should the process die before it answers, that demand must not be judged again behind a
+        release that came after it.
+        """
+        self._unchanged.append(operation)
 
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
         """Commit what people's changes ask of the rendered files, if anything.
@@ -137,4 +147,4 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
     """
     tip = repository.tip()
     base = history.last_generated(repository.objects, tip)
-    return snapshots.load(repository.objects, base or tip, progress)
+    return snapshots.load_last_valid(repository.objects, base or tip, progress)
