@@ -7,6 +7,7 @@ replay on a moved remote and the real thing are the same call.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -23,6 +24,8 @@ from generator.plan.planner import affected, all_keys
 from generator.render import changeset
 from generator.render.changeset import Read, ReleaseChange
 from generator.render.engine import Engine
+
+_SUBJECT = re.compile(r"(apps|connections)\[(\d+)\]")
 
 Stage = Literal["admitted", "booked"]
 Outcome = Literal["booked", "released", "unchanged"]
@@ -148,8 +151,8 @@ def _told(field: str, told: Iterable[str]) -> bool:
 
 def _subject(field: str) -> tuple[str, int]:
     """Return what a fault is about, so that faults of one subject are told together."""
-    name, bracket, rest = field.partition("[")
-    return (name, int(rest.split("]")[0])) if bracket else ("", 0)
+    match = _SUBJECT.match(field)
+    return (match[1], int(match[2])) if match else ("", 0)
 
 
 def _in_wire_words(

@@ -253,6 +253,7 @@ class Generator:
             batch: list[Ticket] = []
             try:
                 self._settle(batch)
+                self._catch_up()
                 self._tidy()
             except ShuttingDown as error:
                 self._fail(batch, error, keep=True)
@@ -330,6 +331,13 @@ class Generator:
             self._on_published(line.head.state.catalog)
             self._since_tidy += len(results)
         return True
+
+    def _catch_up(self) -> None:
+        """Try again what people changed and could not be carried out: a release may allow it."""
+        if self._snapshot.problems:
+            line = self._line()
+            if line.publish():
+                self._snapshot = line.head
 
     def _tidy(self) -> None:
         """Every few hundred commits: a demand leaves some twenty loose objects behind."""

@@ -20,7 +20,7 @@ from generator.cli.output import (
     progress,
     state_repo_option,
 )
-from generator.decision import Decision, decide
+from generator.decision import Decision, admit, decide
 from generator.demand import wire
 from generator.errors import DemandOpsError, Fault, InvalidInput, fault
 from generator.service import Generator, Receipt
@@ -60,8 +60,7 @@ def request(
         raise InvalidInput([fault("", "no request in " + ", ".join(files))])
     faulty = [wire.form_faults(document.goal) for document in documents]
     if any(faulty):
-        pairs = enumerate(zip(documents, faulty, strict=True))
-        rows = [_unbooked(index, document, found) for index, (document, found) in pairs]
+        rows = _unbooked(documents, faulty, state_repo)
     elif dry_run:
         rows = _rehearse(documents, state_repo, output)
     else:
@@ -102,9 +101,22 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
     } | more
 
 
-def _unbooked(index: int, document: _Document, faults: list[Fault]) -> dict[str, Any]:
-    found = faults or [fault("", "not booked, for another request of this call does not parse")]
-    return _row(index, document.request_id, "refused", errors=_errors(found))
+def _unbooked(
+    documents: list[_Document], faulty: list[list[Fault]], state_repo: str
+) -> list[dict[str, Any]]:
+    """Tell every fault of the documents that do not parse, those of their contents as well."""
+    with reader.opened(state_repo) as repo:
+        state = repo.snapshot().state
+    rows = []
+    for index, (document, found) in enumerate(zip(documents, faulty, strict=True)):
+        faults = [fault("", "not booked, for another request of this call does not parse")]
+        if found:
+            try:
+                admit(state, document.goal)
+            except InvalidInput as error:
+                faults = list(error.faults)
+        rows.append(_row(index, document.request_id, "refused", errors=_errors(faults)))
+    return rows
 
 
 def _errors(faults: Iterable[Fault]) -> list[dict[str, str]]:

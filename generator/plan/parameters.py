@@ -6,22 +6,24 @@ The appdef says how several values become one; where it does not, they must agre
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
-from generator.catalog.appdef import ApplicationDefinition, Parameter
+from generator.catalog.appdef import Parameter
 from generator.demand.claim import ApplicationClaim
 from generator.errors import Refused, fault
 
 
-def merged(appdef: ApplicationDefinition, claims: Iterable[ApplicationClaim]) -> dict[str, object]:
-    """Return the value of every parameter of ``appdef``.
+def merged(
+    definitions: Mapping[str, Parameter], claims: Iterable[ApplicationClaim]
+) -> dict[str, object]:
+    """Return the value of every parameter, over the claims of all applications concerned.
 
     Raises:
         Refused: where two claims give values that neither agree nor can be merged.
     """
     claims = list(claims)
     values: dict[str, object] = {}
-    for name, parameter in sorted(appdef.parameters.items()):
+    for name, parameter in sorted(definitions.items()):
         given = [claim for claim in claims if name in claim.parameters]
         values[name] = _one(name, parameter, given) if given else parameter.default
     return values

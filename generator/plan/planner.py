@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from generator.catalog.appdef import ApplicationDefinition, Service
+from generator.catalog.appdef import ApplicationDefinition, Parameter, Service
 from generator.catalog.catalog import Catalog
 from generator.catalog.inventory import AccessDomain, Node
 from generator.demand.admission import choose_broker
@@ -114,10 +114,10 @@ def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceReleas
         inputs = {service.each: _shared_input(claims, service.each, key)}
     else:
         inputs = _application_inputs(catalog, appdef, service, claims)
-    values: dict[str, object] = {}
-    for name in sorted({claim.appdef for claim in claims}):
-        of_appdef = [claim for claim in claims if claim.appdef == name]
-        values |= parameters.merged(_appdef(catalog, name), of_appdef)
+    definitions: dict[str, Parameter] = {}
+    for name in sorted({claim.appdef for claim in claims}, reverse=True):
+        definitions |= _appdef(catalog, name).parameters
+    values = parameters.merged(definitions, claims)
     return ServiceRelease(
         key=key,
         name=service_name(catalog, service, key),

@@ -41,13 +41,25 @@ def check_values(values: Mapping[str, Any], chart: Chart, catalog: Catalog, temp
     schema = catalog.files.get(f"{chart.folder}/values.schema.json") if chart.folder else None
     if schema is None:
         return
-    whole = _laid_over(_defaults(catalog.files.get(f"{chart.folder}/values.yaml", "")), values)
+    file = f"{chart.folder}/values.schema.json"
+    try:
+        validator = _values_validator(schema)
+    except ValueError as error:  # what JSON and the schema's own rules raise
+        reason = str(error).splitlines()[0]
+        message = f"is no JSON schema that can be used: {reason}; mend it"
+        raise InvalidInput([fault("", message).within(file)]) from None
+    file = f"{chart.folder}/values.yaml"
+    try:
+        defaults = _defaults(catalog.files.get(file, ""))
+    except InvalidInput as error:
+        raise InvalidInput(yamlio.faults_in(error, file)) from None
+    whole = _laid_over(defaults, values)
     faults = [
         fault(
             f"values.{path}" if path else "values",
             f"{message}; mend the template or {chart.folder}",
         ).within(template)
-        for path, message in _problems(_values_validator(schema), whole)
+        for path, message in _problems(validator, whole)
     ]
     if faults:
         raise InvalidInput(faults)

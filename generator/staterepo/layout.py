@@ -57,21 +57,26 @@ def init(target: Path, now: datetime, *, bare: bool, gitops: str, url: str = "")
     Raises:
         StateRepoError: where the folder is in use. Nothing is written then.
     """
+    target = target.resolve()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise StateRepoError(
             f"{target} exists and is not empty; name a new folder (nothing was changed)"
         )
     content = files(gitops=gitops, url=url)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
     try:
-        commit = _write(partial, content, now, bare)
-        if target.exists():
-            target.rmdir()
-        partial.rename(target)
-    finally:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        partial = target.with_name(f".{target.name}.partial")
         shutil.rmtree(partial, ignore_errors=True)
+        try:
+            commit = _write(partial, content, now, bare)
+            if target.exists():
+                target.rmdir()
+            partial.rename(target)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise StateRepoError(f"{target} cannot be made: {reason}; name another folder") from None
     return commit
 
 

@@ -16,6 +16,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import IO, Any
 
+from generator.errors import StateRepoError
+
 _COMPACT_ABOVE = 1 << 20
 _MAX_SLOTS = 256
 
@@ -117,7 +119,13 @@ class Slot:
     """
 
     def __init__(self, root: Path) -> None:
-        root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        try:
+            root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError as error:
+            raise StateRepoError(
+                f"the data folder {root} cannot be made: {error.strerror}; set DEMANDOPS_DATA_HOME "
+                "to a folder that can be written to"
+            ) from None
         for number in range(_MAX_SLOTS):
             folder = root / f"slot-{number}"
             lock = _lock(folder)

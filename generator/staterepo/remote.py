@@ -30,6 +30,7 @@ _ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
 _HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
 _USER = re.compile(r"(://)[^/@\s]*@")
 _BEHIND = re.compile(r"\[rejected\]")
+_REMOTE_SAYS = re.compile(r"remote: ?(.*)")
 _REFUSED = re.compile(r"\[remote rejected\] \((.*)\)")
 _PASSING = re.compile(r"lock|failed to update ref|incorrect old value")
 _NO_RIGHT = re.compile(r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE)
@@ -242,11 +243,7 @@ class ClonedRepository(StateRepository):
         """Tell a push that can be tried again from one that is denied."""
         refused = _REFUSED.search(text)
         if refused and not _PASSING.search(refused[1]):
-            said = " ".join(
-                line.removeprefix("remote:").strip(" '")
-                for line in text.splitlines()
-                if line.startswith("remote:")
-            )
+            said = " ".join(line.strip(" '") for line in _REMOTE_SAYS.findall(text)).strip()
             reason = f"{refused[1]}: {said}" if said else refused[1]
             return PushDenied(f"{self.address} takes no push: {reason}")
         if _NO_RIGHT.search(text):

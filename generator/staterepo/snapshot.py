@@ -14,14 +14,15 @@ from pygit2 import Commit, Oid, Repository, Tree
 from pygit2.enums import SortMode
 from rpds import HashTrieMap
 
-from generator.catalog.catalog import CONFIG_ROOTS, Catalog
+from generator import yamlio
+from generator.catalog.catalog import CONFIG_ROOTS, ROOT_FILE, Catalog
 from generator.catalog.catalog import load as load_catalog
-from generator.decision import State
+from generator.decision import State, rehearse
 from generator.demand.claim import Claim, ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger
-from generator.settings import GENERATED_ROOTS
+from generator.settings import GENERATED_ROOTS, RENDER_VERSION
 from generator.staterepo import message
 from generator.staterepo import tree as trees
 
@@ -120,6 +121,24 @@ def load_last_valid(
     return Snapshot(commit.id, State.of(catalog, ledger), keys, (*problems, *faults))
 
 
+def refuse_newer(tree: Tree) -> None:
+    """Raise where a newer generator writes the repo: two versions would undo each other's files.
+
+    Raises:
+        StateRepoError: saying which version it is.
+    """
+    try:
+        data = yamlio.load(trees.read_text(tree, ROOT_FILE) or "")
+    except InvalidInput:
+        return
+    version = data.get("renderVersion") if isinstance(data, dict) else None
+    if isinstance(version, int) and version > RENDER_VERSION:
+        raise StateRepoError(
+            f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
+            f"{RENDER_VERSION}; update the generator"
+        )
+
+
 def _last_valid_catalog(repo: Repository, commit: Commit, fault: InvalidInput) -> Catalog:
     seen = {_config_ids(commit.tree)}
     while commit.parents:
@@ -215,11 +234,14 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     What is not valid there is left as it was before, and told in the new snapshot's problems.
     """
     before, after = commit_of(repo, snapshot.commit).tree, commit_of(repo, to).tree
+    refuse_newer(after)
     state, problems = snapshot.state, list[Fault]()
     catalog_changed = _edited_by_hand(repo, snapshot.commit, to)
     if any(_id(before, root) != _id(after, root) for root in CONFIG_ROOTS) or snapshot.problems:
         try:
             catalog = catalog_at(after)
+            if catalog != state.catalog:
+                rehearse(State.of(catalog, Ledger()))
             catalog_changed = catalog_changed or catalog != state.catalog
             state = State(catalog, State.of(catalog, state.ledger).engine, state.ledger)
         except (InvalidInput, StateRepoError) as error:

@@ -95,6 +95,10 @@ def write(repo: Repository, base: Tree | None, files: Mapping[str, str | None]) 
     return _builder(repo, base, files).write()
 
 
+def _writes(files: Mapping[str, str | None]) -> bool:
+    return any(text is not None for text in files.values())
+
+
 def _builder(
     repo: Repository, base: Tree | None, files: Mapping[str, str | None]
 ) -> pygit2.TreeBuilder:
@@ -109,7 +113,8 @@ def _builder(
             here[name] = text
     for name, inner in below.items():
         entry = builder.get(name)
-        folder = entry if isinstance(entry, Tree) else None
+        replaced = name in here and here[name] is None
+        folder = entry if isinstance(entry, Tree) and not replaced else None
         subtree = _builder(repo, folder, inner)
         if len(subtree):
             builder.insert(name, subtree.write(), FileMode.TREE)
@@ -118,6 +123,6 @@ def _builder(
     for name, text in here.items():  # last, so that a file may take the place of a folder
         if text is not None:
             builder.insert(name, repo.create_blob(text.encode()), FileMode.BLOB)
-        elif name not in below and builder.get(name) is not None:
+        elif builder.get(name) is not None and not _writes(below.get(name, {})):
             builder.remove(name)
     return builder

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
 
+import pygit2
 from pygit2 import Oid, Signature
 
 from generator.decision import Decision, State, consequence, rendered
@@ -23,6 +24,8 @@ from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.remote import StateRepository
 from generator.staterepo.snapshot import Advance, Progress, Snapshot
+
+_ATTEMPTS = 5
 
 
 class Line:
@@ -118,9 +121,18 @@ class Line:
     def _write(
         self, files: Mapping[str, str | None], text: str, author: Signature, now: datetime
     ) -> Oid:
-        tree = trees.write(self._objects, self._tree, files)
         committer = message.generator_signature(now)
-        made = self._objects.create_commit(None, author, committer, text, tree, [self.head.commit])
+        for attempt in range(1, _ATTEMPTS + 1):
+            try:
+                tree = trees.write(self._objects, self._tree, files)
+                made = self._objects.create_commit(
+                    None, author, committer, text, tree, [self.head.commit]
+                )
+                break
+            except (OSError, pygit2.GitError):
+                # git's housekeeping removes a folder of loose objects just as one is put there
+                if attempt == _ATTEMPTS:
+                    raise
         self._tree = snapshots.commit_of(self._objects, made).tree
         return made
 
@@ -146,5 +158,6 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
         StateRepoError: where this is no state repo.
     """
     tip = repository.tip()
+    snapshots.refuse_newer(snapshots.commit_of(repository.objects, tip).tree)
     base = history.last_generated(repository.objects, tip)
     return snapshots.load_last_valid(repository.objects, base or tip, progress)
