@@ -90,6 +90,8 @@ class ControlPlane:
             # With the defaults of 20 and 30 a burst of releases waits for this client, not for us.
             "--kube-api-qps=200",
             "--kube-api-burst=400",
+            # A machine that stands still for a minute has lost no node.
+            "--node-monitor-grace-period=10m",
             *self._serving(port),
         ]
         probe = answers(port, "/healthz", self.pki.authority)

@@ -61,8 +61,11 @@ class Kube:
         """Give the connections back."""
         self.api.close()
 
-    def apply(self, *manifests: Manifest | str) -> None:
-        """Apply manifests on the server's side; text may hold several YAML documents."""
+    def apply(self, *manifests: Manifest | str, dry_run: bool = False) -> None:
+        """Apply manifests on the server's side; text may hold several YAML documents.
+
+        A dry run has the server check everything, admission included, and store nothing.
+        """
         for manifest in _documents(manifests):
             meta = manifest["metadata"]
             self._resource(manifest["kind"], manifest["apiVersion"]).server_side_apply(
@@ -71,6 +74,7 @@ class Kube:
                 namespace=meta.get("namespace"),
                 field_manager=_MANAGER,
                 force_conflicts=True,
+                dry_run="All" if dry_run else None,
             )
 
     def get(self, kind: str, name: str, namespace: str = "", version: str = "") -> Manifest | None:

@@ -270,7 +270,7 @@ def test_values_of_a_fusion() -> None:
     }
     assert values["watcher"] == {
         "image": IMAGES["k8s-configmap-watcher"],
-        "nodeName": "of_edge_object_detection_fusion_watcher",
+        "nodeName": "of_edge_object_detection_fusion__watcher",
     }
 
 

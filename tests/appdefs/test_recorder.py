@@ -1,0 +1,389 @@
+"""Further types of applications: folders of YAML and templates, demanded like the first.
+
+``recorder`` and ``monitor`` share a driver that runs where the sensor is. The reference's message
+has no parameters, so what merges them is tested below the wire, by ledger and plan.
+"""
+
+from __future__ import annotations
+
+import json
+from datetime import timedelta
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import pygit2
+import pytest
+import yaml
+from asking import (
+    BODY,
+    CLOUD,
+    FAST,
+    NOW,
+    STATION_CLOUD,
+    Books,
+    application,
+    connection,
+    goal,
+    skeleton,
+)
+
+from generator.cli.main import run
+from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
+from generator.errors import Refused
+from generator.ledger import ledger as booking
+from generator.ledger.ledger import Ledger
+from generator.plan.planner import all_keys, plan
+from generator.plan.release import ServiceRelease
+from generator.staterepo import layout
+from generator.staterepo import tree as trees
+
+HERE = Path(__file__).parent
+RECORDER, MONITOR = 2, 3
+
+
+def additions() -> dict[str, str]:
+    """Return what a platform engineer adds to a state repo: the folders and two registry lists."""
+    found = {
+        f"appdefs/{path.relative_to(HERE).as_posix()}": path.read_text()
+        for name in ("recorder", "monitor")
+        for path in sorted((HERE / name).rglob("*"))
+        if path.is_file()
+    }
+    folder = "appdefs/recorder/charts/recorder"
+    charts = f"  recorder:\n    folder: {folder}\n    version: 0.1.0\n"
+    images = "".join(
+        f"  {name}:\n    repository: ghcr.io/example/{name}\n    tag: v1\n"
+        for name in ("driver", "recorder")
+    )
+    return found | {
+        "registry/charts.yaml": skeleton()["registry/charts.yaml"] + charts,
+        "registry/images.yaml": skeleton()["registry/images.yaml"] + images,
+    }
+
+
+@pytest.fixture
+def books() -> Books:
+    return Books(additions())
+
+
+def record(id: str = "edge/record", **more: Any) -> dict[str, Any]:
+    return application(id, type=RECORDER, **more)
+
+
+def monitor(id: str = "cloud/monitor", **more: Any) -> dict[str, Any]:
+    return application(id, type=MONITOR, **{"node": "cloud", **more})
+
+
+def test_it_is_demanded_with_yaml_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    state = tmp_path / "state.git"
+    layout.init(state, NOW, bare=True, gitops="flux")
+    repo = pygit2.Repository(str(state))
+    tip = repo[repo.references["refs/heads/main"].target]
+    who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
+    tree = trees.write(repo, tip.peel(pygit2.Tree), additions())
+    repo.create_commit("refs/heads/main", who, who, "Add the recorder\n", tree, [tip.id])
+
+    file = tmp_path / "record.yaml"
+    file.write_text(
+        """
+        id: night shift
+        apps:
+        - header: {id: edge/record, node_id: edge}
+          type: 2
+          object_detection_fusion_app:
+            requester_ids: [vehicle00]
+            pointcloud_topics:
+            - topic_name: /vehicles/vehicle00/drivers/lidar/pointcloud
+              source_node_id: vehicle00
+        """
+    )
+    assert run(["request", str(file), "--state-repo", str(state), "--output", "json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert (row["outcome"], row["warnings"]) == ("booked", [])
+    assert run(["bookkeeping", "--state-repo", str(state), "--output", "json"]) == 0
+    found = json.loads(capsys.readouterr().out)["services"]
+    assert found == {
+        "drv-vehicle00-vehicle00": {
+            "applications": ["edge/record"],
+            "service": "driver",
+            "node": "vehicle00",
+            "source": "vehicle00",
+            "source_topic": CLOUD[0],
+            "inputs": {"point_cloud": [CLOUD[0]]},
+            "requesters": ["vehicle00"],
+        },
+        next(name for name in found if name.startswith("rec-")): {
+            "applications": ["edge/record"],
+            "service": "recorder",
+            "node": "edge",
+            "source": None,
+            "source_topic": None,
+            "inputs": {"clouds": ["/vehicle00/driver/points"]},
+            "requesters": ["vehicle00"],
+        },
+    }
+    assert run(["verify", "--state-repo", str(state)]) == 0
+
+
+def test_no_python_of_the_generator_knows_it() -> None:
+    generator = HERE.parents[1] / "generator"
+    for path in generator.rglob("*.py"):
+        text = path.read_text().lower()
+        assert "recorder" not in text, path
+        assert "object-fusion" not in text, path
+
+
+def test_a_service_for_each_topic_runs_where_its_source_is(books: Books) -> None:
+    books.send(goal([record(clouds=[CLOUD, STATION_CLOUD])]))
+    releases = books.objects("HelmRelease")
+    assert releases.keys() >= {"drv-vehicle00-vehicle00", "drv-station00-station00"}
+    values = releases["drv-vehicle00-vehicle00"]["spec"]["values"]
+    assert values == {
+        "replicas": 1,
+        "image": "ghcr.io/example/driver:v1",
+        "nodeSelector": {"node_id": "vehicle00"},
+        "topics": [CLOUD[0]],
+        "output": "/vehicle00/driver/points",
+        "rate": 1,
+    }
+    assert "clusters/c-its/perception/vehicle00/drv-vehicle00-vehicle00.yaml" in books.rendered()
+
+
+def test_what_runs_at_its_source_needs_no_connection_to_the_application(books: Books) -> None:
+    assert books.send(goal([record()])).warnings == ()
+
+
+def test_two_applications_of_different_kinds_share_a_driver(books: Books) -> None:
+    books.send(goal([record(who=["vehicle00"])], id="1"))
+    before = books.rendered()
+    decision = books.send(goal([monitor(who=["operator"])], id="2"))
+    drivers = {n: e for n, e in books.books()["services"].items() if e["service"] == "driver"}
+    assert drivers == {
+        "drv-vehicle00-vehicle00": {
+            "applications": ["cloud/monitor", "edge/record"],
+            "service": "driver",
+            "node": "vehicle00",
+            "source": "vehicle00",
+            "source_topic": CLOUD[0],
+            "inputs": {"point_cloud": [CLOUD[0]]},
+            "requesters": ["operator", "vehicle00"],
+        }
+    }
+    assert all(books.rendered()[path] == text for path, text in before.items())
+    assert [release.name[:4] for release in decision.releases] == ["mon-"]
+
+
+def test_a_shared_driver_stops_with_the_last_who_needs_it(books: Books) -> None:
+    for demanded in (record(), monitor()):
+        books.send(goal([demanded], id=demanded["header"]["id"]))
+    down = goal([record()], id="edge/record", shutdown=True)
+    books.send(down)
+    assert "drv-vehicle00-vehicle00" in books.objects("HelmRelease")
+    assert books.books()["services"]["drv-vehicle00-vehicle00"]["applications"] == ["cloud/monitor"]
+    books.send(goal([monitor()], id="cloud/monitor", shutdown=True))
+    assert books.rendered() == {}
+
+
+def test_a_driver_does_not_depend_on_which_of_its_users_came_first() -> None:
+    ends = []
+    for order in ((record(), monitor()), (monitor(), record())):
+        books = Books(additions())
+        for demanded in order:
+            books.send(goal([demanded], id=demanded["header"]["id"]))
+        ends.append(books.rendered())
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize(
+    ("topics", "replicas"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3), (6, 3), (7, 3), (20, 3)]
+)
+def test_replicas_follow_the_topics_within_bounds(books: Books, topics: int, replicas: int) -> None:
+    clouds = [(f"/points_{number}", "vehicle00") for number in range(topics)]
+    books.send(goal([record(clouds=clouds)]))
+    (values,) = (
+        release["spec"]["values"]
+        for name, release in books.objects("HelmRelease").items()
+        if name.startswith("rec-")
+    )
+    assert values["replicas"] == replicas
+    assert len(values["topics"]) == topics
+
+
+def test_replicas_go_down_again_when_topics_are_released(books: Books) -> None:
+    clouds = [(f"/points_{number}", "vehicle00") for number in range(5)]
+    books.send(goal([record(clouds=clouds)]))
+    decision = books.send(goal([record(clouds=clouds[1:])], shutdown=True))
+    (change,) = (release for release in decision.releases if release.name.startswith("rec-"))
+    assert change.details[-2:] == ("- replicas 3", "+ replicas 1")
+
+
+def test_a_list_of_the_message_that_it_does_not_take_is_refused(books: Books) -> None:
+    assert books.faults(goal([record(ego=[("/ego", "vehicle00")])])) == [
+        f"{BODY}.ego_data_topics: recorder takes no such input; known: point_cloud"
+    ]
+
+
+def test_another_kind_for_a_claimed_application_is_refused(books: Books) -> None:
+    books.send(goal([record("edge/x")]))
+    assert books.faults(goal([application("edge/x", who=["vehicle01"])])) == [
+        "apps[0].type: 'object-detection-fusion' contradicts what stands: 'edge/x' is held by "
+        "vehicle00 as 'recorder'; use another application id"
+    ]
+
+
+def test_an_unknown_type_is_told_with_all_that_are_known(books: Books) -> None:
+    assert books.faults(goal([application(type=9)])) == [
+        "apps[0].type: 9 names no application definition; known: 3 (monitor), "
+        "1 (object-detection-fusion), 2 (recorder)"
+    ]
+
+
+def test_all_three_kinds_run_side_by_side(books: Books) -> None:
+    books.send(goal([application(), record(), monitor()], [connection()]))
+    kinds = sorted(entry["service"] for entry in books.books()["services"].values())
+    assert kinds == ["driver", "monitor", "object-detection", "object-fusion", "recorder"]
+    for path, text in books.rendered().items():
+        assert list(yaml.load_all(text, Loader=FAST)), path
+
+
+class TestParameters:
+    """Each demand's value, merged as the appdef says; what cannot be merged is refused."""
+
+    @staticmethod
+    def book(
+        ledger: Ledger, who: str, appdef: str = "recorder", minute: int = 0, **parameters: object
+    ) -> Ledger:
+        request = DemandRequest(
+            id=who,
+            operation=Operation.JOIN,
+            applications=(
+                ApplicationDemand(
+                    id=f"edge/{appdef}",
+                    appdef=appdef,
+                    node="edge",
+                    requesters=(who,),
+                    inputs={"point_cloud": (InputTopic(*CLOUD),)},
+                    parameters=MappingProxyType(parameters),
+                ),
+            ),
+        )
+        return booking.apply(ledger, request, NOW + timedelta(minutes=minute))[0]
+
+    @staticmethod
+    def planned(books: Books, ledger: Ledger, service: str = "recorder") -> dict[str, object]:
+        for key in all_keys(ledger, books.catalog):
+            release = plan(ledger, books.catalog, key)
+            if isinstance(release, ServiceRelease) and key.service == service:  # type: ignore[union-attr]
+                return dict(release.parameters)
+        raise AssertionError(f"no {service} is planned")
+
+    def test_nobody_says_anything(self, books: Books) -> None:
+        assert self.planned(books, self.book(Ledger(), "a")) == {
+            "labels": [],
+            "rate": 1,
+            "quality": None,
+            "title": "untitled",
+            "format": "mcap",
+        }
+
+    @pytest.mark.parametrize(
+        ("name", "given", "merged"),
+        [
+            ("labels", [["b", "a"], ["c", "b"]], ["a", "b", "c"]),
+            ("labels", ["b", ["a"]], ["a", "b"]),
+            ("labels", [[], []], []),
+            ("rate", [10, 20], 20),
+            ("rate", [2.5, 2], 2.5),
+            ("rate", [-3, -2], -2),
+            ("quality", [10, 20], 10),
+            ("quality", [0, 0.5], 0),
+            ("title", ["first", "second"], "second"),
+            ("format", ["bag", "bag"], "bag"),
+        ],
+    )
+    def test_two_values_become_one(
+        self, books: Books, name: str, given: list[object], merged: object
+    ) -> None:
+        ledger = Ledger()
+        for minute, value in enumerate(given):
+            ledger = self.book(ledger, f"who{minute}", minute=minute, **{name: value})
+        assert self.planned(books, ledger)[name] == merged
+
+    @pytest.mark.parametrize("name", ["labels", "rate", "quality", "format"])
+    def test_the_order_of_demands_does_not_matter(self, books: Books, name: str) -> None:
+        values = {
+            "labels": [["a"], ["b"]],
+            "rate": [1, 2],
+            "quality": [1, 2],
+            "format": ["bag"] * 2,
+        }
+        ends = []
+        for order in ((0, 1), (1, 0)):
+            ledger = Ledger()
+            for index in order:
+                ledger = self.book(ledger, f"who{index}", **{name: values[name][index]})
+            ends.append(self.planned(books, ledger)[name])
+        assert ends[0] == ends[1]
+
+    def test_who_says_nothing_does_not_count_as_saying_the_default(self, books: Books) -> None:
+        ledger = self.book(self.book(Ledger(), "a"), "b", rate=0.5, format="bag")
+        assert self.planned(books, ledger)["rate"] == 0.5
+        assert self.planned(books, ledger)["format"] == "bag"
+
+    def test_what_was_released_no_longer_counts(self, books: Books) -> None:
+        ledger = self.book(self.book(Ledger(), "a", rate=5), "b", rate=9)
+        (claim,) = (claim for claim in ledger if claim.requesters == ("b",))
+        assert self.planned(books, ledger.replace(claim.key, None))["rate"] == 5
+
+    def test_values_that_nobody_said_how_to_merge_must_agree(self, books: Books) -> None:
+        ledger = self.book(
+            self.book(Ledger(), "vehicle00", format="mcap"), "vehicle01", format="bag"
+        )
+        with pytest.raises(Refused) as refused:
+            self.planned(books, ledger)
+        (found,) = refused.value.faults
+        assert found.code == "conflict"
+        values = {'"mcap" for vehicle00', '"bag" for vehicle01'}
+        start, _, rest = found.message.partition("demands contradict each other: ")
+        shown, _, remedy = rest.partition("; ")
+        assert (start, set(shown.split(" and "))) == ("", values)
+        assert remedy == "agree, or have the application definition say how to merge them"
+
+    def test_a_text_where_a_number_is_merged_is_refused(self, books: Books) -> None:
+        ledger = self.book(self.book(Ledger(), "a", rate=5), "b", rate="fast")
+        with pytest.raises(Refused) as refused:
+            self.planned(books, ledger)
+        assert [(found.field, found.message) for found in refused.value.faults] == [
+            (
+                "parameters.rate",
+                "'fast' is no number, and the application definition takes the max",
+            )
+        ]
+
+    def test_parameters_are_in_the_values(self, books: Books) -> None:
+        ledger = self.book(Ledger(), "a", rate=7, title="{{ x }}\n: 'y'", labels=["yes", "1e3"])
+        from generator.decision import State, rendered
+
+        files = rendered(State(books.catalog, books.state.engine, ledger))
+        (text,) = (text for path, text in files.items() if "/rec-" in path)
+        values = yaml.safe_load(text)["spec"]["values"]
+        assert values["rate"] == 7
+        assert values["title"] == "{{ x }}\n: 'y'"
+        assert values["labels"] == ["1e3", "yes"]
+        assert "quality" not in values
+
+    @pytest.mark.parametrize(("recorder", "monitor"), [(10, 20), (20, 10)])
+    def test_a_shared_driver_merges_over_all_kinds_of_its_applications(
+        self, books: Books, recorder: int, monitor: int
+    ) -> None:
+        ledger = self.book(Ledger(), "a", "recorder", rate=recorder)
+        ledger = self.book(ledger, "b", "monitor", rate=monitor)
+        assert self.planned(books, ledger, "driver")["rate"] == 20
+
+    def test_a_shared_driver_does_not_fall_back_to_the_default_of_one_kind(
+        self, books: Books
+    ) -> None:
+        ledger = self.book(Ledger(), "a", "monitor", rate=20)
+        ledger = self.book(ledger, "b", "recorder")
+        assert self.planned(books, ledger, "driver")["rate"] == 20

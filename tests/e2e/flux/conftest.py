@@ -1,0 +1,83 @@
+"""One cluster for all tests here, and for each module a state repo that it follows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.rig.capture import uncaptured
+from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.tools import Report
+
+from .expected import NODES, STANDING
+from .ros import Client
+from .world import World
+
+CLUSTER = "c-its"
+NAMESPACE = "perception"  # of the skeleton's access domain
+
+MakeWorld = Callable[[], World]
+
+
+@pytest.fixture(scope="session")
+def say(request: pytest.FixtureRequest) -> Report:
+    return uncaptured(request.config)
+
+
+@pytest.fixture(scope="session")
+def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
+    """A cluster with a node for each of the skeleton's inventory."""
+    failed = request.session.testsfailed
+    cluster = Rig(CLUSTER, nodes=NODES, report=say)
+    cluster.start()
+    say(f"\nrig started: {cluster.timings}")
+    try:
+        yield cluster
+    finally:
+        if cluster.existing:
+            cluster.kube.delete("Namespace", NAMESPACE)
+        cluster.stop(failed=request.session.testsfailed > failed)
+
+
+@pytest.fixture(scope="session")
+def ros_domain() -> int:
+    """A ROS domain for this process, so that nothing else answers."""
+    return 120 + os.getpid() % 100
+
+
+@pytest.fixture(scope="session")
+def client(ros_domain: int) -> Iterator[Client]:
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    made = Client(ros_domain)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def make_world(
+    rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[MakeWorld]:
+    """Lay down a state repo that no cluster follows yet; all go at the end of the module."""
+    made: list[World] = []
+
+    def make() -> World:
+        folder: Path = tmp_path_factory.mktemp("world")
+        made.append(World(rig, folder, ros_domain, client))
+        return made[-1]
+
+    yield make
+    for world in made:
+        world.remove()
+
+
+@pytest.fixture(scope="module")
+def world(make_world: MakeWorld, rig: Rig) -> World:
+    """A state repo that the cluster follows, with its generator running and nothing demanded."""
+    made = make_world()
+    made.bootstrap(CLUSTER, rig)
+    made.generator.start()
+    made.domain.wait_lines(STANDING)
+    return made

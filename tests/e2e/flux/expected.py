@@ -1,0 +1,92 @@
+"""What must run after each step of the paper's experiment, as lines that a diff can show.
+
+From the paper's table, not from the program: the names are written out here, and which of them
+exist follows from the rows that have requesters (`examples/experiment/paper.py`).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+EXPERIMENT = Path(__file__).resolve().parents[3] / "examples" / "experiment"
+sys.path.insert(0, str(EXPERIMENT))
+
+import paper  # noqa: E402 - beside its example, which is no package
+
+STEPS = range(1, len(paper.STEPS) + 1)
+VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
+NODES = (*VEHICLES, "station00", "edge", "cloud")
+
+FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
+DETECTION = {"station00": "od-edge-station00", "vehicle00": "od-edge-vehicle00"}
+_ENDS = {
+    "station00": ("8f7ef611a10a", "5001de78ddb2"),
+    "vehicle00": ("d3ca91c2df6c", "3c0f22bda69b"),
+    "vehicle01": ("092a70a6cc97", "f918b3fb6980"),
+    "vehicle02": ("8e8a3b8b98be", "18e6ba1f4096"),
+    "vehicle03": ("f675fa2fc9b2", "b53be9798cf6"),
+}
+
+# What `_domain.yaml` holds, and what Kubernetes puts into every namespace.
+STANDING = frozenset({"ConfigMap demandops-domain", "ConfigMap kube-root-ca.crt"})
+
+
+def demand(step: int) -> dict[str, Any]:
+    """The goal of a step."""
+    (file,) = EXPERIMENT.glob(f"{step}-*.yaml")
+    goal: dict[str, Any] = yaml.safe_load(file.read_text())
+    return goal
+
+
+def title(step: int) -> str:
+    """What happens in a step."""
+    return str(paper.STEPS[step - 1])
+
+
+def source_end(node: str) -> str:
+    """Name of the client at the source of a node's connection to the edge."""
+    return f"mqtt-{node}-edge-source-{_ENDS[node][0]}"
+
+
+def target_end(node: str) -> str:
+    """Name of the client at the edge."""
+    return f"mqtt-{node}-edge-target-{_ENDS[node][1]}"
+
+
+def after(step: int, nodes: Collection[str] = NODES) -> frozenset[str]:
+    """All that must be in the namespace of a cluster with these nodes, and nothing else."""
+    rows = paper.expected(step) if step else {}
+    lines = [line for row in rows for node, line in _of_row(row, rows) if node in nodes]
+    return STANDING | frozenset(lines)
+
+
+def _of_row(row: str, rows: dict[str, list[str]]) -> Iterator[tuple[str, str]]:
+    kind, subject = row.split(" ", 1)
+    if kind == "connection":
+        node = subject.removesuffix(" to edge")
+        yield from _end(node, source_end(node))
+        yield from _end("edge", target_end(node))
+        return
+    name = FUSION if kind == "object-fusion" else DETECTION[subject]
+    yield from (("edge", line) for line in (f"HelmRelease {name}", *_deployed("edge", name)))
+    if kind == "object-fusion":
+        yield from (("edge", f"ConfigMap {name}-{part}") for part in ("params", "watcher"))
+        for node in rows[row]:
+            if node in VEHICLES:
+                yield "edge", f"fusion takes /vehicles/{node}/ego_data"
+        for source in DETECTION:
+            if f"object-detection {source}" in rows:
+                yield "edge", f"fusion takes /{source}_local_objectlist"
+
+
+def _end(node: str, name: str) -> Iterator[tuple[str, str]]:
+    yield from ((node, line) for line in (f"ConfigMap {name}", *_deployed(node, name)))
+
+
+def _deployed(node: str, name: str) -> tuple[str, str]:
+    return f"Deployment {name}", f"pod of {name} on {node}, ready"

@@ -1,0 +1,120 @@
+"""A ROS 2 action client that notes when it hears what.
+
+It spins in a thread of its own, so that a test may wait for the cluster meanwhile and a stage is
+timed when it is told, not when somebody looks.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import rclpy
+from action_msgs.msg import GoalStatus
+from application_manager_interfaces.action import DeploymentRequest
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+
+from generator.settings import DEFAULT_ACTION_NAME
+from ros_bridge.convert import from_data
+from ros_bridge.node import DEEP
+
+Goal = dict[str, Any]
+
+_STATUS = {
+    GoalStatus.STATUS_SUCCEEDED: "succeeded",
+    GoalStatus.STATUS_ABORTED: "aborted",
+    GoalStatus.STATUS_CANCELED: "cancelled",
+}
+_ANSWER_S = 60.0
+
+
+@dataclass
+class Sent:
+    """A goal under way: the stages told so far by their time, and in the end the result."""
+
+    at: float
+    stages: dict[str, float] = field(default_factory=dict)
+    status: str = ""
+    message: str = ""
+    accepted: threading.Event = field(default_factory=threading.Event)
+    answered: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def commit(self) -> str:
+        """The commit that the result names."""
+        return self.message.splitlines()[0].split()[-1]
+
+    def hears(self, stage: str, timeout: float = 10.0) -> None:
+        """Wait until a stage is told."""
+        deadline = time.monotonic() + timeout
+        while stage not in self.stages:
+            assert time.monotonic() < deadline, f"not told '{stage}', only {list(self.stages)}"
+            time.sleep(0.005)
+
+
+class Client:
+    """Sends goals to the node of one ROS domain."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self._node = rclpy.create_node("e2e_client", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        deep = {f"{service}_service_qos_profile": DEEP for service in ("goal", "result", "cancel")}
+        self._client = ActionClient(self._node, DeploymentRequest, DEFAULT_ACTION_NAME, **deep)
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
+
+    def reaches_a_node(self) -> bool:
+        """Whether an action server is in sight."""
+        return bool(self._client.server_is_ready())
+
+    def send(self, goal: Goal) -> Sent:
+        """Send a goal and return at once."""
+        sent = Sent(time.monotonic())
+        future = self._client.send_goal_async(
+            from_data(DeploymentRequest.Goal(), goal),
+            feedback_callback=lambda told: _hear(sent, told.feedback.message),
+        )
+        future.add_done_callback(lambda done: self._on_response(sent, done.result()))
+        return sent
+
+    def call(self, goal: Goal) -> Sent:
+        """Send a goal and wait for its result; one that nobody accepts is sent again.
+
+        A server that was killed stays in sight of the client for a while and swallows goals.
+        """
+        deadline = time.monotonic() + _ANSWER_S
+        sent = self.send(goal)
+        while not sent.accepted.wait(3):
+            assert time.monotonic() < deadline, "no node takes the goal"
+            sent = self.send(goal)
+        assert sent.answered.wait(_ANSWER_S), f"no result; told {list(sent.stages)}"
+        return sent
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown(timeout_sec=1)
+        self._thread.join(5)
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    @staticmethod
+    def _on_response(sent: Sent, handle: Any) -> None:
+        assert handle.accepted
+        sent.accepted.set()
+        handle.get_result_async().add_done_callback(lambda done: _finish(sent, done.result()))
+
+
+def _hear(sent: Sent, message: str) -> None:
+    sent.stages[message.split(maxsplit=1)[0]] = time.monotonic()
+
+
+def _finish(sent: Sent, answer: Any) -> None:
+    sent.stages.setdefault("pushed", time.monotonic())
+    sent.message, sent.status = answer.result.message, _STATUS[answer.status]
+    sent.answered.set()

@@ -1,0 +1,125 @@
+"""Two clusters on one state repo: the vehicles' and that of the rest, which may lose its link."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import yaml
+
+from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.tools import Report
+
+from . import expected
+from .conftest import CLUSTER, NAMESPACE, MakeWorld
+from .expected import NODES, STANDING, STEPS, VEHICLES
+from .relay import Relay
+from .view import Domain
+from .world import World
+
+FLEET = "vehicles"
+OTHERS = tuple(node for node in NODES if node not in VEHICLES)
+CLUSTERS, INVENTORY = "inventory/clusters.yaml", "inventory/nodes.yaml"
+
+
+@pytest.fixture(scope="module")
+def fleet(rig: Rig, request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
+    """The vehicles' own cluster; it reads the same Git server."""
+    failed = request.session.testsfailed
+    cluster = Rig(FLEET, nodes=VEHICLES, git_of=rig, report=say)
+    if rig.existing and cluster.existing == rig.existing:
+        pytest.skip(f"E2E_KUBECONFIG_{FLEET.upper()} names no second cluster")
+    cluster.start()
+    try:
+        yield cluster
+    finally:
+        if cluster.existing:
+            cluster.kube.delete("Namespace", NAMESPACE)
+        cluster.stop(failed=request.session.testsfailed > failed)
+
+
+@pytest.fixture(scope="module")
+def link(rig: Rig) -> Iterator[Relay]:
+    made = Relay(rig.git_url(""))
+    yield made
+    made.cut()
+
+
+@pytest.fixture(scope="module")
+def world(make_world: MakeWorld, rig: Rig, fleet: Rig, link: Relay) -> Iterator[World]:
+    """A state repo whose inventory has the vehicles in a cluster of their own."""
+    made = make_world()
+    clusters = yaml.safe_load(made.file(CLUSTERS))
+    clusters["clusters"].append({"name": FLEET})
+    inventory = yaml.safe_load(made.file(INVENTORY))
+    for node in inventory["nodes"]:
+        node["cluster"] = FLEET if node["id"] in VEHICLES else CLUSTER
+    made.push({CLUSTERS: yaml.safe_dump(clusters), INVENTORY: yaml.safe_dump(inventory)})
+    made.generator.start()
+    made.demand(expected.demand(1))  # with it the generator takes the inventory in
+    made.bootstrap(CLUSTER, rig)
+    url = rig.git_url(made.name)
+    made.bootstrap(FLEET, fleet, url=url if rig.existing else link.url + made.name)
+    yield made
+    made.remove()  # while both clusters are there
+
+
+def test_each_cluster_gets_what_its_own_nodes_run(world: World) -> None:
+    here, there = both(world)
+    for step in STEPS:
+        sent = world.demand(expected.demand(step))
+        for domain, nodes in ((here, OTHERS), (there, VEHICLES)):
+            domain.wake()
+            domain.wait_applied(sent.commit)
+            domain.wait_lines(expected.after(step, nodes))
+        assert here.lines() == expected.after(step, OTHERS)
+    assert here.lines() == there.lines() == STANDING
+
+
+def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(
+    world: World, rig: Rig, link: Relay
+) -> None:
+    if rig.existing:
+        pytest.skip("the link of an existing cluster is not ours to cut")
+    here, there = both(world)
+    first = world.demand(expected.demand(1))
+    for domain, nodes in ((here, OTHERS), (there, VEHICLES)):
+        domain.wake()
+        domain.wait_applied(first.commit)
+        domain.wait_lines(expected.after(1, nodes))
+    before, pods = link.pulls, pod_uids(there)
+    link.cut()
+    for step in (2, 3, 4, 5, 6):
+        sent = world.demand(expected.demand(step))
+        for domain in (here, there):
+            domain.wake()
+        here.wait_lines(expected.after(step, OTHERS))
+    there.kube.wait("the cut to be noticed", lambda: there.trouble("GitRepository", "demandops"))
+    assert there.lines() == expected.after(1, VEHICLES)
+    assert pod_uids(there) == pods, "what runs there goes on"
+    link.mend()
+    there.wait_applied(sent.commit)
+    there.wait_lines(expected.after(6, VEHICLES))
+    assert link.pulls == before + 1
+    assert applied_since(there, first.commit) == [sent.commit]
+    for step in (7, 8):
+        last = world.demand(expected.demand(step))
+    for domain in (here, there):
+        domain.wake()
+        domain.wait_applied(last.commit)
+        domain.wait_lines(STANDING)
+
+
+def both(world: World) -> tuple[Domain, Domain]:
+    return world.domains[CLUSTER], world.domains[FLEET]
+
+
+def pod_uids(domain: Domain) -> set[str]:
+    return {pod["metadata"]["uid"] for pod in domain.find("Pod")}
+
+
+def applied_since(domain: Domain, commit: str) -> list[str]:
+    """The commits that the Kustomization has applied after one, newest first."""
+    history = domain.get("Kustomization", domain.name)["status"]["history"]
+    commits = [entry["metadata"]["revision"].rpartition(":")[2] for entry in history]
+    return commits[: commits.index(commit)]

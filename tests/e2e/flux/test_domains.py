@@ -1,0 +1,150 @@
+"""An access domain's service account reaches its own namespace and nothing else.
+
+Each case commits to the domain's folder what a mistake or somebody with write access there might.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tests.e2e.rig.cluster import Rig
+
+from . import expected
+from .view import Domain
+from .world import World
+
+NEIGHBOUR = "neighbour"
+FILE = "clusters/c-its/perception/edge/foreign.yaml"
+_RBAC = "rbac.authorization.k8s.io"
+
+
+@pytest.fixture(scope="module")
+def neighbour(rig: Rig) -> Iterator[Domain]:
+    rig.kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NEIGHBOUR}})
+    domain = Domain(rig.kube, NEIGHBOUR, "none")
+    # what Kubernetes itself puts there
+    rig.kube.wait("the account", lambda: rig.kube.get("ServiceAccount", "default", NEIGHBOUR))
+    rig.kube.wait("the root", lambda: rig.kube.get("ConfigMap", "kube-root-ca.crt", NEIGHBOUR))
+    yield domain
+    rig.kube.delete("Namespace", NEIGHBOUR)
+
+
+Slip = Callable[..., None]
+
+
+@pytest.fixture
+def slip_in(world: World, neighbour: Domain) -> Iterator[Slip]:
+    """Commit manifests to the domain's folder and wait until Flux has tried them."""
+
+    def push(*manifests: dict[str, Any]) -> None:
+        text = "\n---\n".join(json.dumps(manifest) for manifest in manifests)
+        commit = world.push({FILE: text})
+        world.domain.wake()
+        world.domain.wait_attempted(commit)
+
+    yield push
+    if FILE in world.person.git("ls-files").split():
+        take_out(world)
+
+
+def take_out(world: World) -> None:
+    commit = world.push({FILE: None})
+    world.domain.wake()
+    world.domain.wait_applied(commit)
+
+
+def test_a_foreign_namespace_is_refused_and_holds_up_the_domain(
+    world: World, neighbour: Domain, slip_in: Slip
+) -> None:
+    """What runs goes on; nothing new is applied until the file is gone: all or nothing."""
+    domain, untouched = world.domain, neighbour.inventory()
+    world.step(1, expected.after(1))
+    slip_in(config("foreign", NEIGHBOUR), config("own", domain.namespace))
+    wait_refused(domain, f'in the namespace "{NEIGHBOUR}"')
+    sent = world.demand(expected.demand(2))
+    domain.wake()
+    domain.wait_attempted(sent.commit)
+    wait_refused(domain, f'in the namespace "{NEIGHBOUR}"')
+    assert domain.lines() == expected.after(1)
+    assert neighbour.inventory() == untouched
+    take_out(world)
+    domain.wait_lines(expected.after(2))
+    assert neighbour.inventory() == untouched
+
+
+def config(name: str, namespace: str) -> dict[str, Any]:
+    return object_("v1", "ConfigMap", name, namespace, data={"made": "by hand"})
+
+
+def release(**spec: Any) -> dict[str, Any]:
+    """A release of the detection's chart that wants to be in the neighbour's namespace."""
+    chart = {"kind": "HelmChart", "name": "object-detection-0.1.0"}
+    spec = {"interval": "10m", "chartRef": chart, "targetNamespace": NEIGHBOUR, **spec}
+    return object_("helm.toolkit.fluxcd.io/v2", "HelmRelease", "foreign", "perception", spec=spec)
+
+
+def object_(version: str, kind: str, name: str, namespace: str = "", **rest: Any) -> dict[str, Any]:
+    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
+    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}
+
+
+def binding(kind: str, namespace: str = "") -> dict[str, Any]:
+    """Administrator's rights for the domain's account."""
+    account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
+    role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
+    return object_(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])
+
+
+KUSTOMIZATION = object_(
+    "kustomize.toolkit.fluxcd.io/v1",
+    "Kustomization",
+    "foreign",
+    "perception",
+    spec={
+        "interval": "10m",
+        "path": "./clusters",
+        "prune": True,
+        "sourceRef": {"kind": "GitRepository", "name": "demandops"},
+        "targetNamespace": NEIGHBOUR,
+    },
+)
+
+
+@pytest.mark.parametrize(
+    "manifest",
+    [
+        pytest.param(release(serviceAccountName="demandops"), id="release elsewhere"),
+        pytest.param(release(), id="release that names no account"),
+        pytest.param(release(serviceAccountName="default"), id="release of another account"),
+        pytest.param(KUSTOMIZATION, id="Kustomization that names no account"),
+        pytest.param(binding("ClusterRoleBinding"), id="rights everywhere"),
+        pytest.param(binding("RoleBinding", "perception"), id="more rights at home"),
+        pytest.param(binding("RoleBinding", NEIGHBOUR), id="rights at the neighbour's"),
+    ],
+)
+def test_no_way_around_the_account(
+    world: World, neighbour: Domain, slip_in: Slip, manifest: dict[str, Any]
+) -> None:
+    domain, untouched, here = world.domain, neighbour.inventory(), world.domain.inventory()
+    slip_in(manifest)
+    wait_refused(domain, "forbidden", manifest)
+    assert neighbour.inventory() == untouched
+    take_out(world)
+    domain.wait_inventory(here)
+    assert neighbour.inventory() == untouched
+
+
+def wait_refused(domain: Domain, why: str, manifest: dict[str, Any] | None = None) -> None:
+    """Wait until the Kustomization, or the release that it made, says that it may not."""
+    looks = [("Kustomization", domain.name)]
+    if manifest is not None and manifest["kind"] == "HelmRelease":
+        looks.append(("HelmRelease", manifest["metadata"]["name"]))
+
+    def refused() -> bool:
+        return any(why in domain.trouble(kind, name) for kind, name in looks)
+
+    domain.kube.wait(f"'{why}' to be reported", refused, 15)

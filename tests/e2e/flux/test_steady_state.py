@@ -1,0 +1,144 @@
+"""What nobody demanded does not change: a further requester, and what is changed by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.e2e.rig.kube import Manifest
+
+from . import expected
+from .expected import DETECTION, FUSION, source_end, target_end
+from .view import Domain
+from .world import World
+
+PLAIN, OTHER = source_end("vehicle00"), target_end("station00")
+CHART = "appdefs/object-detection-fusion/charts/object-fusion/Chart.yaml"
+REGISTRY = "registry/charts.yaml"
+
+
+@pytest.fixture
+def running(world: World) -> World:
+    """Step 1 runs, whatever ran before, and nothing changes any more."""
+    world.follow(world.demand(expected.demand(1)), expected.after(1))
+    world.domain.wait_releases_ready()
+    return world
+
+
+def test_a_further_requester_changes_no_object_of_a_release(running: World) -> None:
+    domain = running.domain
+    before = domain.wait_quiet()
+    sent = running.demand(asked_by("vehicle03", expected.demand(1)))
+    assert running.changed_by(sent.commit)
+    assert all(path.startswith("ledger/") for path in running.changed_by(sent.commit))
+    running.follow(sent, expected.after(1))
+    for chart in domain.find("HelmChart"):  # they look at every commit
+        name = chart["metadata"]["name"]
+        domain.kube.wait(f"{name} to have looked", lambda n=name: sent.commit in looked(domain, n))
+    assert domain.wait_quiet(2.0) == before
+    goal = asked_by("vehicle03", expected.demand(1))
+    running.follow(running.demand(goal | {"shutdown": True}), expected.after(1))
+    assert domain.wait_quiet() == before
+
+
+def test_what_helm_deployed_is_restored(running: World) -> None:
+    domain, namespace = running.domain, running.domain.namespace
+    detection, params = DETECTION["vehicle00"], f"{FUSION}-params"
+
+    def ask() -> None:
+        for release in (detection, FUSION):
+            domain.kube.reconcile("HelmRelease", release, namespace)
+
+    template, inputs = pod_template(domain, detection), domain.get("ConfigMap", params)["data"]
+    change_image(domain, detection)
+    empty(domain, params, "params.yml")
+    ask()
+    wait_for(domain, template, inputs, detection, params)
+
+    domain.kube.delete("Deployment", detection, namespace)
+    domain.kube.delete("ConfigMap", params, namespace)
+    domain.kube.wait_gone("Deployment", detection, namespace)
+    ask()
+    domain.wait_lines(expected.after(1))
+    wait_for(domain, template, inputs, detection, params)
+
+
+def test_plain_manifests_are_restored(running: World) -> None:
+    domain, namespace = running.domain, running.domain.namespace
+    template, topics = pod_template(domain, PLAIN), domain.get("ConfigMap", PLAIN)["data"]
+    change_image(domain, PLAIN)
+    empty(domain, PLAIN, "params.yaml")
+    gone = [("Deployment", OTHER), ("ConfigMap", OTHER), ("HelmRelease", DETECTION["station00"])]
+    for kind, name in gone:
+        domain.kube.delete(kind, name, namespace)
+        domain.kube.wait_gone(kind, name, namespace)
+    domain.kube.reconcile("Kustomization", domain.name, namespace)
+    domain.wait_lines(expected.after(1))
+    wait_for(domain, template, topics, PLAIN, PLAIN)
+
+
+def test_a_new_version_of_a_chart_restarts_no_pod_that_it_leaves_as_it_was(
+    running: World,
+) -> None:
+    domain = running.domain
+    domain.wait_quiet()
+    charts, pods = names(domain.find("HelmChart")), domain.identity(FUSION)
+    chart, registry = yaml.safe_load(running.file(CHART)), yaml.safe_load(running.file(REGISTRY))
+    old = f"object-fusion-{chart['version']}"
+    chart["version"] = registry["charts"]["object-fusion"]["version"] = "99.0.0"
+    running.push({CHART: yaml.safe_dump(chart), REGISTRY: yaml.safe_dump(registry)})
+    sent = running.demand(asked_by("vehicle02", expected.demand(1)))  # takes the change in
+    running.follow(sent, expected.after(1))
+    domain.wait_releases_ready()
+    assert domain.get("HelmRelease", FUSION)["status"]["history"][0]["chartVersion"][:4] == "99.0"
+    assert names(domain.find("HelmChart")) == charts - {old} | {"object-fusion-99.0.0"}
+    assert domain.identity(FUSION) == pods
+
+
+def names(items: list[Manifest]) -> set[str]:
+    return {item["metadata"]["name"] for item in items}
+
+
+def asked_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
+    """The same applications and connections, demanded for somebody else."""
+    requesters = {"requester_ids": [vehicle, "station00"]}
+    apps = [
+        app | {"object_detection_fusion_app": app["object_detection_fusion_app"] | requesters}
+        for app in goal["apps"]
+    ]
+    connections = [connection | requesters for connection in goal["connections"]]
+    return goal | {"apps": apps, "connections": connections}
+
+
+def looked(domain: Domain, chart: str) -> str:
+    """The commit that a HelmChart was last held against."""
+    status: dict[str, str] = domain.get("HelmChart", chart)["status"]
+    return status.get("observedSourceArtifactRevision", "")
+
+
+def pod_template(domain: Domain, deployment: str) -> dict[str, Any]:
+    template: dict[str, Any] = domain.get("Deployment", deployment)["spec"]["template"]
+    return template
+
+
+def change_image(domain: Domain, deployment: str) -> None:
+    containers = pod_template(domain, deployment)["spec"]["containers"]
+    containers[0]["image"] = "example.invalid/other:1"
+    body = {"spec": {"template": {"spec": {"containers": containers}}}}
+    domain.kube.patch("Deployment", deployment, body, domain.namespace)
+    changed = pod_template(domain, deployment)["spec"]["containers"][0]["image"]
+    assert changed == "example.invalid/other:1"
+
+
+def empty(domain: Domain, config: str, key: str) -> None:
+    domain.kube.patch("ConfigMap", config, {"data": {key: "by hand"}}, domain.namespace)
+    assert domain.get("ConfigMap", config)["data"] == {key: "by hand"}
+
+
+def wait_for(domain: Domain, template: dict[str, Any], data: dict[str, str], *names: str) -> None:
+    """Wait until a Deployment's pods and a ConfigMap's content are as they were."""
+    deployment, config = names
+    domain.kube.wait("the image", lambda: pod_template(domain, deployment) == template)
+    domain.kube.wait("the content", lambda: domain.get("ConfigMap", config)["data"] == data)

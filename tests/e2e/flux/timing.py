@@ -1,0 +1,53 @@
+"""Where the time goes between a goal and its pods, as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+
+_STAGES = ("committed", "pushed", "fetched", "applied", "ready", "in all")
+
+
+@dataclass(frozen=True)
+class Times:
+    """When a demand reached each stage, on one monotonic clock, in seconds.
+
+    `committed` and `pushed` are told by the node; the others are when a poll every 0.1 s saw them.
+    """
+
+    goal: float
+    committed: float
+    pushed: float
+    fetched: float
+    applied: float
+    ready: float
+
+    @property
+    def total(self) -> float:
+        """Seconds from the goal to the last pod ready, or gone."""
+        return self.ready - self.goal
+
+    def row(self) -> list[float]:
+        """Seconds that each stage took, and their sum."""
+        at = astuple(self)
+        return [at[place + 1] - at[place] for place in range(len(at) - 1)] + [self.total]
+
+
+class Table:
+    """Rows by title, shown at the end."""
+
+    def __init__(self, heading: str) -> None:
+        self._heading = heading
+        self._rows: list[tuple[str, Times]] = []
+
+    def add(self, title: str, times: Times) -> None:
+        """Note one demand."""
+        self._rows.append((title, times))
+
+    def show(self, say: Callable[[str], None]) -> None:
+        """Print all rows, in seconds."""
+        width = max(len(title) for title, _ in self._rows)
+        say(f"\n{self._heading} (seconds)")
+        say(" " * (width + 2) + "".join(f"{stage:>11}" for stage in _STAGES))
+        for title, times in self._rows:
+            say(f"  {title:<{width}}" + "".join(f"{value:11.2f}" for value in times.row()))

@@ -1,0 +1,196 @@
+"""Generators in processes of their own, made to be killed: each tells its receipts as they come.
+
+Imports once and forks for every run, which it reads from standard input as one line of JSON. A run
+has lanes of demands, each lane a client that waits for an answer before it sends the next. With an
+opening demand the lanes start while the worker is busy with it, so that their first demands are one
+batch. ``die_at`` (``<point>`` or ``<point>:<n>``) ends the process, as kill -9 would, at the n-th
+time that it comes to the point.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+from generator.service import Generator, Receipt
+from generator.staterepo.outbox import Outbox
+from generator.staterepo.remote import ClonedRepository, EmbeddedRepository
+from generator.staterepo.writer import Line
+
+Demand = dict[str, Any]
+
+
+def tell(**event: object) -> None:
+    """Write one line whole: shorter than a pipe's buffer, it is there or it is not."""
+    os.write(1, (json.dumps(event)[:4000] + "\n").encode())
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+    threading.Event().wait()
+
+
+class _At:
+    """Dies at the n-th call."""
+
+    def __init__(self, times: int) -> None:
+        self._left = times
+
+    def __call__(self) -> None:
+        self._left -= 1
+        if self._left <= 0:
+            die()
+
+
+def _before(owner: type, name: str, point: Callable[[], None]) -> None:
+    known = getattr(owner, name)
+
+    def wrapped(*args: Any, **options: Any) -> Any:
+        point()
+        return known(*args, **options)
+
+    setattr(owner, name, wrapped)
+
+
+def _after(owner: type, name: str, point: Callable[[], None]) -> None:
+    known = getattr(owner, name)
+
+    def wrapped(*args: Any, **options: Any) -> Any:
+        result = known(*args, **options)
+        point()
+        return result
+
+    setattr(owner, name, wrapped)
+
+
+def arm(where: str) -> None:
+    point, _, times = where.partition(":")
+    at = _At(int(times or 1))
+    if point == "journaled":
+        _after(Outbox, "append", at)
+    elif point == "committed":
+        _after(Line, "commit", at)
+    elif point == "publishing":
+        _before(ClonedRepository, "publish", at)
+        _before(EmbeddedRepository, "publish", at)
+    elif point == "published":
+        _after(ClonedRepository, "publish", at)
+        _after(EmbeddedRepository, "publish", at)
+    elif point == "unanswered":
+        _after(Outbox, "done", at)
+    elif point == "withdrawn":
+        Lanes.withdrawn = staticmethod(at)  # type: ignore[method-assign]
+    elif point:
+        raise SystemExit(f"no such point: {point}")
+
+
+class Lanes:
+    """Clients that each send a demand when the one before it is answered.
+
+    A demand marked ``withdraw`` is taken back when the next one is admitted.
+    """
+
+    @staticmethod
+    def withdrawn() -> None:
+        """Stand for the moment right after a demand was taken back."""
+
+    def __init__(self, generator: Generator, lanes: list[list[Demand]]) -> None:
+        self._generator = generator
+        self._lanes = [lane for lane in lanes if lane]
+        self._left = len(self._lanes)
+        self._lock = threading.Lock()
+        self._to_withdraw: list[Demand] = []
+        self.ended = threading.Event()
+        if not self._left:
+            self.ended.set()
+
+    def start(self) -> None:
+        for lane in self._lanes:
+            self._next(lane, 0)
+
+    def _next(self, lane: list[Demand], index: int) -> None:
+        if index == len(lane):
+            with self._lock:
+                self._left -= 1
+                if not self._left:
+                    self.ended.set()
+            return
+        tell(sent=lane[index]["name"])
+        if lane[index].get("withdraw"):
+            self._to_withdraw.append(lane[index])
+        ticket = self._generator.submit(
+            lane[index]["goal"],
+            lane[index]["operation"],
+            lambda stage, text: self._take_back() if stage == "admitted" else None,
+        )
+        ticket.future.add_done_callback(lambda future: self._answered(lane, index, future))
+
+    def _take_back(self) -> None:
+        while self._to_withdraw:
+            item = self._to_withdraw.pop()
+            if self._generator.withdraw(item["operation"]):
+                tell(withdrawn=item["name"])
+                self.withdrawn()
+
+    def _answered(self, lane: list[Demand], index: int, future: Future[Receipt]) -> None:
+        tell_answer(lane[index]["name"], future)
+        self._next(lane, index + 1)
+
+
+def tell_answer(name: str, future: Future[Receipt]) -> None:
+    error = future.exception()
+    if error is not None:
+        tell(answer=name, outcome=type(error).__name__, text=str(error), commit="")
+    else:
+        tell(answer=name, outcome=future.result().outcome, text="", commit=future.result().commit)
+
+
+def run(plan: dict[str, Any]) -> None:
+    arm(plan["die_at"])
+    generator = Generator(plan["address"])
+    tell(ready=os.getpid())
+    lanes = Lanes(generator, plan["lanes"])
+    opening = plan["opening"]
+    if opening:
+        tell(sent=opening["name"])
+        ticket = generator.submit(
+            opening["goal"],
+            opening["operation"],
+            lambda stage, text: lanes.start() if stage == "admitted" else None,
+        )
+        ticket.future.add_done_callback(lambda future: tell_answer(opening["name"], future))
+    else:
+        lanes.start()
+    lanes.ended.wait()
+    tell(finished=generator.close())
+
+
+def main() -> None:
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr)
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the dead
+    for line in sys.stdin:
+        if os.fork():
+            continue
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        plan = json.loads(line)
+        os.environ.update(plan["environment"])
+        os.chdir(plan["cwd"])
+        os.dup2(os.open(plan["to"], os.O_WRONLY), 1)
+        try:
+            run(plan)
+        except BaseException as error:
+            logging.exception("the run ended early")
+            tell(failed=repr(error))
+        finally:
+            os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

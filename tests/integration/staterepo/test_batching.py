@@ -1,0 +1,105 @@
+"""Demands that come together are one commit each and one push; a lone one is pushed at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Gate, goal, leave
+
+
+@pytest.fixture
+def pushes(bare: Path) -> Path:
+    """A file with a line for each push that the remote took."""
+    log = bare / "pushes"
+    log.touch()
+    hook = bare / "hooks" / "post-receive"
+    hook.parent.mkdir(exist_ok=True)
+    hook.write_text(f"#!/bin/sh\ncat >> {log}\n")
+    hook.chmod(0o755)
+    return log
+
+
+def _count(pushes: Path) -> int:
+    return len(pushes.read_text().splitlines())
+
+
+def test_demands_that_come_while_the_worker_is_busy_are_one_commit_each_and_one_push(
+    url: str, bare: Path, pushes: Path
+) -> None:
+    gate = Gate()
+    with rig.running(url) as generator:
+        first = generator.submit(goal(0), "op-0", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        rest = [generator.submit(goal(n), f"op-{n}") for n in range(1, 21)]
+        gate.open.set()
+        receipts = [rig.receipt(ticket) for ticket in (first, *rest)]
+    assert _count(pushes) == 2, "the first alone, all others together"
+    assert [receipt.commit for receipt in receipts] == [commit.id for commit in rig.commits(bare)]
+    assert rig.operations(bare) == [f"op-{n}" for n in range(21)], "in the order they came"
+    assert rig.books(bare) == rig.books_after(map(goal, range(21)))
+    rig.assert_sound(bare)
+
+
+def test_a_lone_demand_is_pushed_at_once(url: str, bare: Path, pushes: Path) -> None:
+    with rig.running(url) as generator:
+        for number in range(3):
+            receipt = rig.receipt(generator.submit(goal(number)))
+            assert rig.tip(bare) == receipt.commit, "it is there when its requester is told"
+            assert _count(pushes) == number + 1
+
+
+def test_a_batch_of_which_nothing_changes_is_not_pushed(url: str, bare: Path, pushes: Path) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        tip = rig.tip(bare)
+        again = rig.book(generator, goal(1))[0]
+        with pytest.raises(Exception, match="nowhere"):
+            rig.book(generator, rig.impossible())
+    assert (again.outcome, again.commit) == ("unchanged", tip)
+    assert _count(pushes) == 1
+
+
+def test_a_refused_demand_in_a_batch_stops_none_of_the_others(
+    url: str, bare: Path, pushes: Path
+) -> None:
+    gate = Gate()
+    with rig.running(url) as generator:
+        generator.submit(goal(0), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        tickets = [generator.submit(made) for made in (goal(1), rig.impossible(), goal(2))]
+        gate.open.set()
+        assert rig.receipt(tickets[0]).outcome == "booked"
+        with pytest.raises(Exception, match="nowhere"):
+            rig.receipt(tickets[1])
+        assert rig.receipt(tickets[2]).outcome == "booked"
+    assert _count(pushes) == 2
+    rig.assert_sound(bare)
+
+
+def test_a_batch_is_judged_in_order_a_release_behind_its_join_finds_it(
+    address: str, bare: Path
+) -> None:
+    gate = Gate()
+    with rig.running(address) as generator:
+        generator.submit(goal(0), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        tickets = [generator.submit(made) for made in (goal(1), goal(1), leave(1), goal(1))]
+        gate.open.set()
+        outcomes = [rig.receipt(ticket).outcome for ticket in tickets]
+    assert outcomes == ["booked", "unchanged", "released", "booked"]
+    assert rig.books(bare) == rig.books_after([goal(0), goal(1)])
+    rig.assert_sound(bare)
+
+
+def test_more_demands_than_a_batch_holds_are_all_answered_in_order(bare: Path) -> None:
+    gate = Gate()
+    with rig.running(bare) as generator:
+        first = generator.submit(goal(0), "op-0", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        rest = [generator.submit(goal(n), f"op-{n}") for n in range(1, 50)]
+        gate.open.set()
+        for ticket in (first, *rest):
+            assert rig.receipt(ticket).outcome == "booked"
+    assert rig.operations(bare) == [f"op-{n}" for n in range(50)]

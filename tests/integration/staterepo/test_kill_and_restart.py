@@ -1,0 +1,365 @@
+"""kill -9 at any moment, start again: nothing acknowledged is missing, nothing counts twice."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Drivers, Run, Told, demand, goal, leave
+
+from generator.service import Generator
+
+KILLS = 15
+LANES = 4
+
+
+def _client(lane: int) -> list[tuple[str, rig.Goal]]:
+    """A client's demands in its order: of every three that joined, two leave again."""
+    made = []
+    for turn in range(60):
+        number = lane + turn * LANES
+        made.append((f"join-{number}", goal(number)))
+        if turn % 3:
+            made.append((f"leave-{number}", leave(number)))
+    return made
+
+
+@pytest.mark.limit(60)
+@pytest.mark.parametrize("seed", [20260301])
+def test_killed_at_random_moments_loses_and_doubles_nothing(
+    drivers: Drivers, address: str, bare: Path, seed: int
+) -> None:
+    random = Random(f"{address.partition('://')[0]} {seed}")
+    clients = [_client(lane) for lane in range(LANES)]
+    acknowledged: dict[str, str] = {}
+    sent: list[str] = []
+    for turn in range(KILLS + 1):
+        last = turn == KILLS
+        lanes = []
+        for client in clients:
+            open_ = [(name, made) for name, made in client if name not in acknowledged]
+            if last:  # bring to an end what was begun, and a little more
+                open_ = open_[:2]
+            # the same goal id again, or a new one as a client that starts anew makes it
+            again = "" if random.random() < 0.5 else f"-try{turn}"
+            lanes.append([demand(name, made, f"op-{name}{again}") for name, made in open_])
+        run = drivers.start(address, lanes)
+        delay = random.choice([random.uniform(0, 0.03), random.uniform(0.03, 0.16)])
+        killer = threading.Timer(delay, run.kill)
+        told = run.listen(on_ready=(lambda: None) if last else killer.start)
+        _note(told, sent, acknowledged)
+        sent += [name for name in told.sent if name not in sent]
+    assert told.finished is True, "the last run, which nobody kills, must end by itself"
+
+    rig.assert_sound(bare)
+    made = {name: wanted for client in clients for name, wanted in client}
+    in_history = [
+        f"{'leave' if commit.one('Operation') == 'shutdown' else 'join'}-"
+        f"{commit.one('Request-Id').removeprefix('demand-')}"
+        for commit in rig.commits(bare)
+    ]
+    assert sorted(in_history) == sorted(acknowledged), "one commit for each acknowledged demand"
+    for name, commit in acknowledged.items():
+        if commit:
+            rig.git(bare, "merge-base", "--is-ancestor", commit, "main")
+        assert name in in_history
+    assert rig.books(bare) == rig.books_after(made[name] for name in acknowledged)
+
+
+def _note(told: Told, sent: list[str], acknowledged: dict[str, str]) -> None:
+    for name, answer in told.answers.items():
+        # a release sent again may find that its first hand-in was carried out after all
+        again = name in sent and "nothing that the shutdown lists is held" in answer["text"]
+        assert answer["outcome"] in ("booked", "released", "unchanged") or again, answer
+        acknowledged[name] = answer["commit"]
+
+
+POINTS = [
+    ("journaled", "the demand is in the journal and nowhere else", False),
+    ("committed", "a commit object stands that no branch knows", False),
+    ("publishing", "all commits of the batch stand, none is published", False),
+    ("published", "the remote has it, the outbox does not know", True),
+    ("unanswered", "the outbox knows, the requester does not", True),
+]
+
+
+@pytest.mark.parametrize(("point", "reason", "published"), POINTS, ids=[p[0] for p in POINTS])
+def test_killed_at_a_point_each_demand_is_committed_once(
+    drivers: Drivers, address: str, bare: Path, point: str, reason: str, published: bool
+) -> None:
+    lanes = [[demand(f"join-{number}", goal(number))] for number in (1, 2, 3)]
+    told = drivers.start(
+        address, lanes, opening=demand("join-0", goal(0)), die_at=f"{point}:2"
+    ).listen()
+    assert told.finished is None
+    # the opening demand was a batch of its own, except where a commit was counted, not a batch
+    assert set(told.answers) == {"join-0"}, reason
+    assert len(rig.operations(bare)) == (4 if published else 1), reason
+
+    assert rig.restart(address) is True
+    assert sorted(rig.operations(bare)) == [f"op-join-{number}" for number in range(4)]
+    rig.assert_sound(bare)
+    assert rig.books(bare) == rig.books_after(map(goal, range(4)))
+
+
+@pytest.mark.parametrize("point", ["journaled", "published"])
+def test_a_demand_that_was_taken_up_again_is_not_taken_up_a_third_time(
+    drivers: Drivers, address: str, bare: Path, point: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    drivers.start(address, [[demand("join-1", goal(1))]], die_at=point).listen()
+    with caplog.at_level("INFO", "demandops"):
+        assert rig.restart(address) is True
+    assert "taking up demand op-join-1 from the outbox" in caplog.text
+    tip = rig.tip(bare)
+    caplog.clear()
+    with caplog.at_level("INFO", "demandops"):
+        assert rig.restart(address) is True
+    assert "from the outbox" not in caplog.text
+    assert rig.tip(bare) == tip
+
+
+# ---- what was released stays released ----
+
+
+def test_a_published_join_that_is_replayed_after_its_release_is_skipped(
+    drivers: Drivers, address: str, bare: Path, tmp_path: Path
+) -> None:
+    drivers.start(address, [[demand("join-1", goal(1))]], die_at="published").listen()
+    assert rig.operations(bare) == ["op-join-1"]
+    with rig.running(address, data=tmp_path / "another-machine") as other:
+        assert rig.book(other, leave(1))[0].outcome == "released"
+    tip = rig.tip(bare)
+
+    assert rig.restart(address) is True
+    assert rig.tip(bare) == tip, "the replayed join must not book again what was released"
+    assert rig.claims(bare) == []
+
+
+def test_a_release_in_the_same_batch_as_its_join_stays_when_both_are_replayed(
+    drivers: Drivers, address: str, bare: Path
+) -> None:
+    lanes = [[demand("join-1", goal(1))], [demand("leave-1", leave(1))]]
+    drivers.start(address, lanes, opening=demand("join-0", goal(0)), die_at="published:2").listen()
+    tip = rig.tip(bare)
+    assert rig.operations(bare) == ["op-join-0", "op-join-1", "op-leave-1"]
+
+    assert rig.restart(address) is True
+    assert rig.tip(bare) == tip
+    assert rig.claims(bare, "user1") == []
+
+
+def test_a_join_that_changed_nothing_before_its_release_is_not_booked_by_a_replay(
+    drivers: Drivers, address: str, bare: Path
+) -> None:
+    """The repeated join has no commit that shows it was dealt with; the release behind it does."""
+    opening = demand("join-1", goal(1))
+    lanes = [[demand("join-1-again", goal(1))], [demand("leave-1", leave(1))]]
+    drivers.start(address, lanes, opening=opening, die_at="published:2").listen()
+    assert rig.operations(bare) == ["op-join-1", "op-leave-1"]
+    tip = rig.tip(bare)
+
+    assert rig.restart(address) is True
+    assert rig.claims(bare) == [], "what was released stands again"
+    assert rig.tip(bare) == tip
+
+
+def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
+    drivers: Drivers, address: str, bare: Path
+) -> None:
+    """Judged again behind the release, nothing stands in its way any more; in order, it had."""
+    elsewhere = goal(1)
+    elsewhere["apps"][0]["header"]["node_id"] = "cloud"
+    lanes = [[demand("join-elsewhere", elsewhere)], [demand("leave-1", leave(1))]]
+    opening = demand("join-1", goal(1))
+    drivers.start(address, lanes, opening=opening, die_at="published:2").listen()
+    assert rig.operations(bare) == ["op-join-1", "op-leave-1"]
+
+    assert rig.restart(address) is True
+    assert rig.claims(bare) == [], "its requester has left since"
+
+
+# ---- what a kill leaves lying about ----
+
+
+def test_a_branch_lock_left_by_a_killed_generator_does_not_stop_the_next_one(
+    drivers: Drivers,
+    bare: Path,
+) -> None:
+    """libgit2 holds main.lock while it fsyncs it: one kill in twenty falls into that moment."""
+    lock = bare / "refs" / "heads" / "main.lock"
+    for turn in range(5):  # the poll loses the race now and then
+        numbers = range(20 * turn, 20 * turn + 20)
+        run = drivers.start(bare, [[demand(f"join-{n}", goal(n)) for n in numbers]])
+
+        def kill_it_in_the_act(run: Run = run) -> None:
+            end = time.monotonic() + 5
+            while not lock.exists() and time.monotonic() < end:
+                pass
+            run.kill()
+
+        run.listen(on_ready=kill_it_in_the_act)
+        if lock.exists():
+            break
+    assert lock.exists(), "no kill fell into the moment; the test proves nothing"
+
+    with rig.running(bare) as generator:
+        error = None
+        ticket = generator.submit(goal(99))
+        try:
+            rig.receipt(ticket, timeout=15)
+        except TimeoutError:
+            error = "no answer within 15 s, and nothing said why"
+    assert error is None
+    rig.assert_sound(bare)
+
+
+def test_a_lock_left_in_the_clone_by_a_killed_generator_does_not_stop_the_next_one(
+    url: str, bare: Path, data_home: Path
+) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+    tracking = next(data_home.glob("*/slot-0/clone.git/refs/remotes/origin"))
+    (tracking / "main.lock").touch()  # the slot is locked by its owner, so nobody else holds this
+
+    with rig.running(url) as generator:
+        rig.book(generator, goal(2))
+    assert len(rig.operations(bare)) == 2
+
+
+def test_a_clone_cut_off_half_way_is_made_anew(url: str, bare: Path, data_home: Path) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+    clone = next(data_home.glob("*/slot-0/clone.git"))
+    for part in ("packed-refs", "refs/remotes/origin/main"):
+        (clone / part).unlink(missing_ok=True)
+    clone.with_name("clone.git.partial").mkdir()
+
+    with rig.running(url) as generator:
+        rig.book(generator, goal(2))
+    assert len(rig.operations(bare)) == 2
+    rig.assert_sound(bare)
+
+
+# ---- outboxes of the dead ----
+
+
+def _leave_pending(url: str, bare: Path, numbers: list[int]) -> None:
+    """Have a generator accept demands that it cannot publish, and end."""
+    away = bare.with_name("away.git")
+    generator = Generator(url)
+    bare.rename(away)
+    for number in numbers:
+        generator.submit(goal(number), f"op-{number}")
+    assert generator.close(timeout=0) is False
+    away.rename(bare)
+
+
+def _torn(text: bytes) -> bytes:
+    return text + text.splitlines()[-1][: len(text) // 5]
+
+
+def _binary(text: bytes) -> bytes:
+    return b"\x00\xff\xfe not text \x9c\n" + text
+
+
+def _other_shapes(text: bytes) -> bytes:
+    return b'42\nnull\n"done"\n[]\n{}\n{"done": []}\n{"operation": []}\n' + text
+
+
+def _bad_time(text: bytes) -> bytes:
+    return b'{"operation": "op-x", "goal": {}, "received": "soon", "base": ""}\n' + text
+
+
+DAMAGES: list[Callable[[bytes], bytes]] = [bytes, _torn, _binary, _other_shapes, _bad_time]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__.strip("_"))
+@pytest.mark.parametrize("whose", ["own", "orphan"])
+def test_a_journal_is_taken_up_whatever_a_crash_left_in_it(
+    url: str,
+    bare: Path,
+    data_home: Path,
+    damage: Callable[[bytes], bytes],
+    whose: str,
+) -> None:
+    _leave_pending(url, bare, [1, 2])
+    journal = next(data_home.glob("*/slot-0/outbox.jsonl"))
+    text = damage(journal.read_bytes())
+    if whose == "orphan":
+        slot = journal.parent.with_name("slot-7")
+        slot.mkdir()
+        (slot / "outbox.jsonl").write_bytes(text)
+        journal.unlink()
+    else:
+        journal.write_bytes(text)
+
+    with rig.running(url) as generator:
+        rig.book(generator, goal(3))
+    assert {"op-1", "op-2"} < set(rig.operations(bare))
+    assert len(rig.operations(bare)) == 3
+    rig.assert_sound(bare)
+
+
+@pytest.mark.parametrize("whose", ["own", "orphan"])
+def test_an_empty_journal_holds_nothing_and_harms_nothing(
+    url: str, bare: Path, data_home: Path, whose: str
+) -> None:
+    with rig.running(url):
+        pass
+    folder = next(data_home.glob("*/slot-0")) if whose == "own" else None
+    slot = folder or next(data_home.glob("*/slot-0")).with_name("slot-7")
+    slot.mkdir(exist_ok=True)
+    (slot / "outbox.jsonl").write_bytes(b"")
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+    assert len(rig.operations(bare)) == 1
+
+
+def test_two_processes_have_slots_of_their_own_and_a_dead_ones_outbox_is_adopted(
+    drivers: Drivers, bare: Path, url: str, data_home: Path
+) -> None:
+    with rig.running(url) as first:
+        # a second process, beside the first, dies with a demand in its journal
+        told = drivers.start(url, [[demand("join-1", goal(1))]], die_at="journaled").listen()
+        assert told.finished is None
+        slots = sorted(path.name for path in next(data_home.iterdir()).iterdir())
+        assert slots == ["slot-0", "slot-1"]
+        rig.book(first, goal(2))
+        assert len(rig.operations(bare)) == 1, "the first had no reason to look at the other's slot"
+    assert rig.restart(url) is True
+    assert "op-join-1" in rig.operations(bare)
+    assert not list(data_home.glob("*/slot-1/outbox.jsonl"))
+    rig.assert_sound(bare)
+
+
+def test_the_outbox_of_one_state_repo_is_never_played_into_another(
+    drivers: Drivers,
+    new_repo: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two state repos that are called the same, each from a folder of its own."""
+    for folder in ("here", "there"):
+        (tmp_path / folder).mkdir()
+        new_repo(f"{folder}/state.git")
+    here, there = tmp_path / "here", tmp_path / "there"
+    plan = [[demand("join-1", goal(1))]]
+    drivers.start("state.git", plan, cwd=here, die_at="journaled").listen()
+
+    monkeypatch.chdir(there)
+    assert rig.restart("state.git") is True
+    assert rig.operations(there / "state.git") == []
+
+
+def test_the_outbox_is_found_again_however_the_folder_is_named(
+    drivers: Drivers, bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = [[demand("join-1", goal(1))]]
+    drivers.start("state.git", plan, cwd=bare.parent, die_at="journaled").listen()
+    assert rig.restart(bare) is True
+    assert rig.operations(bare) == ["op-join-1"]

@@ -1,0 +1,397 @@
+"""People push between demands: their change stays, the demand goes on top, history is one line."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from concurrent.futures import TimeoutError as NotAnswered
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Person, goal, leave
+
+from generator.errors import InvalidInput, Refused
+from generator.service import Generator
+
+NODES = "inventory/nodes.yaml"
+BROKERS = "inventory/brokers.yaml"
+BROKEN = "nodes: [}\n"
+
+
+@pytest.fixture
+def person(bare: Path, tmp_path: Path) -> Person:
+    return Person(bare, tmp_path / "person")
+
+
+def _edit_readme(person: Person) -> str:
+    return person.change({"README.md": "Ours, since today.\n"}, "Say whose it is")
+
+
+def _move_broker(person: Person) -> str:
+    return person.edit(BROKERS, "service-mqtt-broker-edge", "broker-of-the-edge")
+
+
+def _add_node(person: Person) -> str:
+    return person.edit(NODES, "  - id: cloud\n", "  - id: tram07\n    type: vehicle\n"
+                       "    cluster: c-its\n  - id: cloud\n")  # fmt: skip
+
+
+def _break_nodes(person: Person) -> str:
+    return person.change({NODES: BROKEN}, "A merge gone wrong")
+
+
+def _take_vehicle01_away(bare: Path, person: Person) -> str:
+    nodes = rig.git(bare, "show", f"main:{NODES}") + "\n"
+    start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
+    return person.change({NODES: nodes[:start] + nodes[end:]}, "vehicle01 is sold")
+
+
+def _delete_claims(bare: Path) -> Callable[[Person], str]:
+    return lambda person: person.change(
+        dict.fromkeys(rig.claims(bare, "user1")), "Release what user1 holds"
+    )
+
+
+def _break_claim(bare: Path) -> Callable[[Person], str]:
+    path = next(path for path in rig.claims(bare, "user1") if "applications" in path)
+    return lambda person: person.change({path: "requesters: nobody\n"}, "Tidy up")
+
+
+RUNNING = pytest.mark.parametrize("running", [True, False], ids=["running", "stopped"])
+
+
+def _around(
+    address: str,
+    running: bool,
+    before: list[rig.Goal],
+    change: Callable[[], str],
+    after: list[rig.Goal],
+) -> str:
+    """Book demands before and after a person's change, which the generator sees live or not."""
+    if running:
+        with rig.running(address) as generator:
+            rig.book(generator, *before)
+            made = change()
+            rig.book(generator, *after)
+        return made
+    with rig.running(address) as generator:
+        rig.book(generator, *before)
+    made = change()
+    with rig.running(address) as generator:
+        rig.book(generator, *after)
+    return made
+
+
+def _kinds(bare: Path) -> list[str]:
+    """What each commit is, oldest first: the trailer, or whose it is."""
+    return [commit.one("Operation") or "person" for commit in rig.commits(bare)]
+
+
+@RUNNING
+def test_an_edited_readme_is_kept_and_asks_for_no_commit_of_its_own(
+    address: str, bare: Path, person: Person, running: bool
+) -> None:
+    _around(address, running, [goal(1)], lambda: _edit_readme(person), [goal(2)])
+    assert _kinds(bare) == ["join", "person", "join"]
+    assert rig.git(bare, "show", "main:README.md") == "Ours, since today."
+    assert rig.books(bare) == rig.books_after([goal(1), goal(2)])
+    rig.assert_sound(bare)
+
+
+@RUNNING
+def test_an_edited_inventory_is_carried_out_before_the_next_demand(
+    address: str, bare: Path, person: Person, running: bool
+) -> None:
+    made = _around(address, running, [goal(1)], lambda: _move_broker(person), [goal(2)])
+    assert _kinds(bare) == ["join", "person", "follow", "join"]
+    first, change, follow, _ = rig.commits(bare)
+    assert change.id == made
+    assert dict(follow.trailers) == {
+        "Operation": "follow",
+        "Follows": made,
+        "Since": first.id,
+        "Render-Version": "1",
+    }
+    changed = rig.git(bare, "diff-tree", "-r", "--name-only", "--no-commit-id", follow.id)
+    assert changed.splitlines()
+    assert all(path.startswith("clusters/") for path in changed.splitlines())
+    assert "broker-of-the-edge" in rig.git(bare, "show", follow.id)
+    assert "broker-of-the-edge" in rig.git(bare, "show", f"main:{BROKERS}")
+    rig.assert_sound(bare)
+
+
+@RUNNING
+def test_a_deleted_claim_is_released_with_what_ran_for_it_alone(
+    address: str, bare: Path, person: Person, running: bool
+) -> None:
+    delete = lambda: _delete_claims(bare)(person)  # noqa: E731
+    _around(address, running, [goal(1), goal(2)], delete, [goal(3)])
+    assert _kinds(bare) == ["join", "join", "person", "follow", "join"]
+    assert rig.claims(bare, "user1") == []
+    assert rig.books(bare) == rig.books_after([goal(2), goal(3)])
+    rig.assert_sound(bare)
+
+
+@RUNNING
+def test_an_invalid_inventory_leaves_its_last_valid_version_in_force_and_is_logged(
+    address: str, bare: Path, person: Person, running: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken_and_mended(generator: Generator) -> None:
+        before = rig.git(bare, "show", f"main:{NODES}") + "\n"
+        person.change({NODES: BROKEN}, "A merge gone wrong")
+        rig.book(generator, goal(2))
+        assert rig.git(bare, "show", f"main:{NODES}") == BROKEN.rstrip("\n"), "theirs to mend"
+        person.change({NODES: before}, "Mend it")
+        rig.book(generator, goal(3))
+
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        if running:
+            broken_and_mended(generator)
+    if not running:
+        with rig.running(address) as generator:
+            broken_and_mended(generator)
+    assert _kinds(bare) == ["join", "person", "join", "person", "join"]
+    errors = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert any(
+        text.startswith(f"{NODES}: ") and text.endswith("(its last valid version stays in force)")
+        for text in errors
+    ), errors
+    assert rig.books(bare) == rig.books_after([goal(1), goal(2), goal(3)])
+    rig.assert_sound(bare)
+
+
+def test_an_inventory_still_invalid_at_a_restart_leaves_its_last_valid_version_in_force(
+    address: str, bare: Path, person: Person
+) -> None:
+    """The newest commit of the generator holds the person's broken file by then."""
+    _around(address, True, [goal(1)], lambda: _break_nodes(person), [goal(2)])
+    with rig.running(address) as generator:
+        rig.book(generator, goal(3))
+    assert _kinds(bare) == ["join", "person", "join", "join"]
+
+
+def test_a_claim_still_broken_at_a_restart_leaves_its_last_valid_version_in_force(
+    address: str, bare: Path, person: Person
+) -> None:
+    _around(address, True, [goal(1)], lambda: _break_claim(bare)(person), [goal(2)])
+    with rig.running(address) as generator:
+        rig.book(generator, goal(3), leave(1))
+    assert _kinds(bare) == ["join", "person", "join", "join", "shutdown"]
+    assert rig.books(bare) == rig.books_after([goal(2), goal(3)])
+
+
+@RUNNING
+def test_a_broken_claim_file_leaves_the_claim_as_it_was_and_is_logged(
+    address: str, bare: Path, person: Person, running: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    _around(address, running, [goal(1)], lambda: _break_claim(bare)(person), [goal(2)])
+    assert _kinds(bare) == ["join", "person", "join"]
+    fusions = rig.git(bare, "ls-tree", "-r", "--name-only", "main", "clusters/")
+    assert "of-edge-fusion-1" in fusions, "the claim stands, so its fusion runs"
+    assert any(
+        record.levelname == "ERROR" and record.getMessage().startswith("ledger/applications/")
+        for record in caplog.records
+    )
+    assert [c.id for c in rig.commits(bare) if len(c.parents) != 1] == []
+
+
+def test_a_claim_whose_file_a_person_broke_can_still_be_released(
+    address: str, bare: Path, person: Person
+) -> None:
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        _break_claim(bare)(person)
+        assert rig.book(generator, leave(1))[0].outcome == "released"
+        rig.book(generator, goal(2))
+    assert rig.claims(bare, "nobody") == []
+    assert rig.books(bare) == rig.books_after([goal(2)])
+    rig.assert_sound(bare)
+
+
+@RUNNING
+def test_a_node_that_is_taken_away_while_it_is_in_use_does_not_stop_other_demands(
+    address: str, bare: Path, person: Person, running: bool
+) -> None:
+    """vehicle01's claims cannot be planned without it; nor may they be dropped by guess."""
+    take = lambda: _take_vehicle01_away(bare, person)  # noqa: E731
+    # demand 6 shares application edge/fusion-1 with demand 1, which is vehicle01's
+    _around(address, running, [goal(1)], take, [goal(6), goal(2)])
+    assert [kind for kind in _kinds(bare) if kind != "follow"] == ["join", "person", "join", "join"]
+    assert rig.books_after([goal(1), goal(6), goal(2)])["connections"].keys() == {
+        path.split("/")[3].rsplit("-", 1)[0].replace("-edge", "/edge")
+        for path in rig.claims(bare)
+        if "connections" in path
+    }
+    rig.assert_sound(bare)
+
+
+def test_a_node_taken_away_while_it_is_in_use_stops_no_demand_after_a_restart(
+    address: str, bare: Path, person: Person
+) -> None:
+    take = lambda: _take_vehicle01_away(bare, person)  # noqa: E731
+    _around(address, True, [goal(1)], take, [goal(6)])
+    with rig.running(address) as generator:
+        rig.book(generator, goal(11))
+    assert [kind for kind in _kinds(bare) if kind != "follow"] == ["join", "person", "join", "join"]
+
+
+def test_a_node_taken_away_is_gone_for_new_demands_once_it_is_released(
+    address: str, bare: Path, person: Person
+) -> None:
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        _take_vehicle01_away(bare, person)
+        rig.book(generator, leave(1))
+        with pytest.raises(Refused, match="vehicle01"):
+            rig.book(generator, goal(1))
+
+
+def test_a_generated_file_that_a_person_edited_is_put_right_with_the_next_commit(
+    address: str, bare: Path, person: Person
+) -> None:
+    """`demandops check` says that such an edit is lost, and verify holds at every commit."""
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        paths = rig.git(bare, "ls-tree", "-r", "--name-only", "main", "clusters/").splitlines()
+        edited = next(path for path in paths if "of-edge-fusion-1" in path)
+        text = rig.git(bare, "show", f"main:{edited}") + "\n"
+        person.change({edited: text + "# by hand\n"})
+        rig.book(generator, goal(2))
+    assert rig.git(bare, "show", f"main:{edited}") + "\n" == text
+    assert rig.differing(bare) == {}
+
+
+# ---- never a text merge, never a force push ----
+
+
+def test_the_remote_is_never_force_pushed_and_nothing_is_merged(
+    url: str, bare: Path, person: Person
+) -> None:
+    rig.git(bare, "config", "receive.denyNonFastForwards", "true")
+    rig.git(bare, "config", "core.logAllRefUpdates", "always")
+    with rig.running(url) as generator:
+        for number in range(4):
+            if number:
+                person.change({"README.md": f"{number}\n"})
+            rig.book(generator, goal(number))
+    moves = rig.git(bare, "log", "--walk-reflogs", "--format=%H", "main").splitlines()[::-1]
+    for older, newer in pairwise(moves):
+        rig.git(bare, "merge-base", "--is-ancestor", older, newer)
+    assert _kinds(bare) == ["join", *["person", "join"] * 3]
+    rig.assert_sound(bare)
+
+
+def test_a_merge_commit_of_a_person_is_followed_like_any_other(
+    address: str, bare: Path, tmp_path: Path
+) -> None:
+    work = tmp_path / "work"
+    rig.git(tmp_path, "clone", "--quiet", str(bare), str(work))
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        rig.git(work, "switch", "--quiet", "--create", "move-broker")
+        brokers = work / BROKERS
+        brokers.write_text(brokers.read_text().replace("broker-edge", "broker-moved"))
+        rig.git(work, "commit", "--quiet", "--all", "--message", "Move the broker")
+        rig.git(work, "switch", "--quiet", "main")
+        rig.git(work, "pull", "--quiet", "--ff-only")
+        rig.git(work, "merge", "--quiet", "--no-ff", "--message", "Merge", "move-broker")
+        rig.git(work, "push", "--quiet", "origin", "main")
+        rig.book(generator, goal(2))
+    first_parents = rig.git(bare, "log", "--reverse", "--first-parent", "--format=%s", "main")
+    assert first_parents.splitlines()[2:4] == ["Merge", "Carry out changes made in the state repo"]
+    assert "broker-moved" in rig.git(bare, "grep", "-h", "broker-moved", "main", "--", "clusters")
+    assert rig.differing(bare) == {}
+
+
+LATIN_1 = b"Na\xefve caf\xe9"
+
+
+@pytest.mark.parametrize("declared", [True, False], ids=["declared", "undeclared"])
+def test_commits_of_people_in_other_encodings_are_read(
+    address: str, bare: Path, declared: bool
+) -> None:
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        tree = rig.git(bare, "rev-parse", "main^{tree}")
+        who = LATIN_1 + b" <someone@example.org> 1767225600 +0000"
+        parent = rig.tip(bare).encode()
+        text = b"tree %s\nparent %s\nauthor %s\ncommitter %s\n" % (tree.encode(), parent, who, who)
+        text += b"encoding ISO-8859-1\n" if declared else b""
+        made = subprocess.run(
+            ["git", "-C", str(bare), "hash-object", "-t", "commit", "-w", "--stdin"],
+            input=text + b"\n" + LATIN_1 + b"\n",
+            capture_output=True,
+            check=True,
+        )
+        rig.git(bare, "update-ref", "refs/heads/main", made.stdout.decode().strip())
+        rig.book(generator, goal(2))
+    with rig.running(address) as generator:
+        rig.book(generator, goal(3))
+    assert _kinds(bare) == ["join", "person", "join", "join"]
+    assert rig.differing(bare) == {}
+
+
+# ---- a clone that is behind ----
+
+
+def test_a_demand_that_seems_booked_already_is_judged_against_the_remote(
+    url: str, bare: Path, person: Person
+) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        _delete_claims(bare)(person)
+        receipt = rig.book(generator, goal(1))[0]
+    assert receipt.outcome == "booked"
+    assert rig.books(bare) == rig.books_after([goal(1)])
+
+
+def test_a_demand_that_changes_nothing_tells_the_newest_commit(
+    url: str, bare: Path, person: Person
+) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        made = _edit_readme(person)
+        receipt = rig.book(generator, goal(1))[0]
+    assert (receipt.outcome, receipt.commit) == ("unchanged", made)
+
+
+def test_a_node_that_seems_unknown_is_looked_for_at_the_remote(
+    url: str, bare: Path, person: Person
+) -> None:
+    wanted = goal(1)
+    wanted["connections"][0] |= {"source_node_id": "tram07", "id": "tram07/edge"}
+    with rig.running(url) as generator:
+        _add_node(person)
+        assert rig.book(generator, wanted)[0].outcome == "booked"
+
+
+def test_a_release_of_what_another_generator_booked_is_not_refused(
+    url: str, bare: Path, tmp_path: Path
+) -> None:
+    with rig.running(url) as generator:
+        with rig.running(url, data=tmp_path / "another-machine") as other:
+            rig.book(other, goal(1))
+        assert rig.book(generator, leave(1))[0].outcome == "released"
+
+
+def test_a_verdict_on_a_stale_clone_is_not_given_while_the_remote_is_away(
+    url: str, bare: Path, person: Person
+) -> None:
+    """Both seem settled without a push; the clone is behind, and nobody can be asked."""
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        _delete_claims(bare)(person)
+        away = bare.rename(bare.with_name("away.git"))
+        again = generator.submit(goal(1))
+        late = generator.submit(rig.impossible())
+        with pytest.raises(NotAnswered):
+            again.future.result(2.5)
+        assert not late.future.done()
+        away.rename(bare)
+        assert rig.receipt(again).outcome == "booked"
+        with pytest.raises(InvalidInput, match="nowhere"):
+            rig.receipt(late)
+    assert rig.books(bare) == rig.books_after([goal(1)])

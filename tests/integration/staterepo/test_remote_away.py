@@ -1,0 +1,254 @@
+"""While the remote is away goals stay open; what a remote denies is told and forgotten."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Gate, Stages, goal, leave
+
+from generator.errors import QueueFull, Refused, ShuttingDown, StateRepoError, Withdrawn
+from generator.service import Generator
+
+
+@contextmanager
+def away(bare: Path) -> Iterator[None]:
+    """The remote's folder is somewhere else for the length of a block."""
+    elsewhere = bare.rename(bare.with_name("away.git"))
+    try:
+        yield
+    finally:
+        elsewhere.rename(bare)
+
+
+def _hook(bare: Path, name: str, script: str) -> Path:
+    path = bare / "hooks" / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return path
+
+
+# ---- away and back ----
+
+
+def test_goals_stay_open_while_the_remote_is_away_and_are_published_once_it_is_back(
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(0))
+        with away(bare):
+            stages = Stages()
+            tickets = [generator.submit(goal(1), listener=stages)]
+            rig.wait_until(lambda: "committed" in stages.names, "the first demand is committed")
+            tickets += [generator.submit(goal(number)) for number in (2, 3)]
+            rig.wait_until(lambda: "trying again" in caplog.text, "the log says so")
+            assert not any(ticket.future.done() for ticket in tickets)
+        receipts = [rig.receipt(ticket) for ticket in tickets]
+    assert [receipt.commit for receipt in receipts] == [commit.id for commit in rig.commits(bare)][
+        1:
+    ]
+    assert stages.names == ["admitted", "booked", "committed", "pushed"], "each told once"
+    assert rig.books(bare) == rig.books_after(map(goal, range(4)))
+    rig.assert_sound(bare)
+
+
+def test_closing_while_the_remote_is_away_leaves_the_demands_to_the_next_start(
+    url: str, bare: Path
+) -> None:
+    generator = Generator(url)
+    with away(bare):
+        tickets = [generator.submit(goal(number), f"op-{number}") for number in range(3)]
+        assert generator.close(timeout=0.3) is False
+        for ticket in tickets:
+            with pytest.raises(ShuttingDown, match="stays in the outbox"):
+                ticket.future.result(0)
+    assert rig.operations(bare) == []
+    assert rig.restart(url) is True
+    assert rig.operations(bare) == ["op-0", "op-1", "op-2"], "in the order in which they came"
+    assert rig.books(bare) == rig.books_after(map(goal, range(3)))
+    rig.assert_sound(bare)
+
+
+def test_what_waits_in_the_outbox_is_judged_on_what_the_remote_has_become(
+    url: str, bare: Path, tmp_path: Path
+) -> None:
+    """A join waits; meanwhile another generator books the same, and somebody takes a claim away."""
+    generator = Generator(url)
+    with away(bare):
+        generator.submit(goal(1), "op-1")
+        generator.submit(goal(2), "op-2")
+        generator.close(timeout=0)
+    with rig.running(url, data=tmp_path / "another-machine") as other:
+        rig.book(other, goal(1), goal(3))
+    assert rig.restart(url) is True
+    assert "op-1" not in rig.operations(bare), "it changed nothing any more"
+    assert rig.operations(bare)[-1] == "op-2"
+    assert rig.books(bare) == rig.books_after(map(goal, (1, 3, 2)))
+    rig.assert_sound(bare)
+
+
+def test_a_demand_that_the_new_tip_makes_impossible_is_refused_with_the_reason(
+    url: str, bare: Path, tmp_path: Path
+) -> None:
+    elsewhere = goal(1)
+    elsewhere["apps"][0]["header"]["node_id"] = "cloud"
+    with rig.running(url) as generator:
+        with rig.running(url, data=tmp_path / "another-machine") as other:
+            rig.book(other, elsewhere)
+        ticket = generator.submit(goal(6))  # the same application, on the edge
+        with pytest.raises(Refused, match="contradicts what stands"):
+            rig.receipt(ticket)
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+    rig.assert_sound(bare)
+
+
+def test_a_demand_taken_back_while_the_remote_is_away_is_answered_and_never_published(
+    url: str, bare: Path
+) -> None:
+    gate = Gate()
+    generator = Generator(url)
+    with away(bare):
+        generator.submit(goal(1), "op-1", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        ticket = generator.submit(goal(2), "op-2")
+        assert generator.withdraw("op-2") is True
+        gate.open.set()
+        with pytest.raises(Withdrawn):
+            ticket.future.result(5)
+        generator.close(timeout=0)
+    assert rig.restart(url) is True
+    assert rig.operations(bare) == ["op-1"]
+
+
+def test_more_demands_than_may_wait_are_not_kept_while_the_remote_is_away(
+    url: str, bare: Path
+) -> None:
+    tickets = []
+    with rig.running(url, queue_limit=5) as generator:
+        with away(bare), pytest.raises(QueueFull):
+            for number in range(500):
+                tickets.append(generator.submit(goal(number)))
+        for ticket in tickets:
+            assert rig.receipt(ticket).outcome == "booked", "what was taken is not lost"
+    assert rig.books(bare) == rig.books_after(map(goal, range(len(tickets))))
+
+
+def test_without_a_clone_a_remote_that_is_away_is_told_at_once(bare: Path) -> None:
+    with pytest.raises(StateRepoError) as error:
+        Generator(bare.with_name("nothing.git").as_uri())
+    assert str(error.value).startswith(
+        f"{bare.with_name('nothing.git').as_uri()} cannot be fetched"
+    )
+
+
+# ---- denied ----
+
+
+@pytest.mark.parametrize("name", ["pre-receive", "update"])
+def test_a_declined_push_fails_the_demand_with_the_hooks_words_and_leaves_no_trace(
+    url: str, bare: Path, name: str
+) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(0))
+        hook = _hook(bare, name, "echo 'main is frozen until Monday' >&2; exit 1")
+        with pytest.raises(StateRepoError, match="main is frozen until Monday"):
+            rig.receipt(generator.submit(goal(1), "op-denied"))
+        hook.unlink()
+        rig.book(generator, goal(2))
+    assert "op-denied" not in rig.operations(bare)
+    assert rig.claims(bare, "user1") == []
+    assert rig.books(bare) == rig.books_after([goal(0), goal(2)])
+    tip = rig.tip(bare)
+    assert rig.restart(url) is True
+    assert rig.tip(bare) == tip, "nothing of it is left in the outbox either"
+    rig.assert_sound(bare)
+
+
+def test_a_declined_push_is_told_to_all_of_its_batch_but_not_to_those_refused_before(
+    url: str, bare: Path
+) -> None:
+    gate = Gate()
+    hook = _hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
+    with rig.running(url) as generator:
+        tickets = [generator.submit(goal(1), listener=gate)]
+        assert gate.reached.wait(rig.PATIENCE_S)
+        tickets += [generator.submit(goal(number)) for number in (2, 3)]
+        refused = generator.submit(rig.impossible())
+        gate.open.set()
+        for ticket in tickets:
+            with pytest.raises(StateRepoError, match="takes no push"):
+                rig.receipt(ticket)
+        with pytest.raises(Refused, match="nowhere"):
+            rig.receipt(refused)
+        hook.unlink()
+        rig.book(generator, goal(4))
+    assert rig.books(bare) == rig.books_after([goal(4)])
+    rig.assert_sound(bare)
+
+
+def test_a_declined_release_leaves_what_is_held(url: str, bare: Path) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        hook = _hook(bare, "pre-receive", "exit 1")
+        with pytest.raises(StateRepoError, match="takes no push"):
+            rig.book(generator, leave(1))
+        assert len(rig.claims(bare, "user1")) == 2
+        hook.unlink()
+        assert rig.book(generator, leave(1))[0].outcome == "released"
+
+
+@pytest.mark.limit(15)
+def test_a_remote_that_cannot_take_the_push_is_told_or_warned_of(
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its disk is full, say, or a rule stands against it: no hook speaks, and nothing has moved."""
+    with rig.running(url) as generator:
+        rig.git(bare, "config", "receive.maxInputSize", "1")
+        ticket = generator.submit(goal(1))
+        rig.wait_until(
+            lambda: (
+                ticket.future.done()
+                or any(r.levelname in ("WARNING", "ERROR") for r in caplog.records)
+            ),
+            "a requester or a reader of the log who knows why nothing happens",
+            timeout=5,
+        )
+        rig.git(bare, "config", "--unset", "receive.maxInputSize")
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+        assert ticket.future.done()
+    rig.assert_sound(bare)
+
+
+@pytest.mark.limit(15)
+def test_a_remote_with_main_checked_out_is_told_instead_of_tried_for_ever(
+    bare: Path, tmp_path: Path
+) -> None:
+    work = tmp_path / "work"
+    rig.git(tmp_path, "clone", "--quiet", str(bare), str(work))
+    with rig.running(work.as_uri()) as generator:
+        ticket = generator.submit(goal(1))
+        with pytest.raises(StateRepoError, match="checked out"):
+            rig.receipt(ticket, timeout=6)
+
+
+@pytest.mark.limit(15)
+def test_a_stale_lock_at_the_remote_is_told_in_the_log_and_survived(
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A receive-pack was killed there. Somebody has to see it, and the demand outlives it."""
+    lock = bare / "refs" / "heads" / "main.lock"
+    with rig.running(url) as generator:
+        lock.touch()
+        ticket = generator.submit(goal(1))
+        rig.wait_until(
+            lambda: any(r.levelname in ("WARNING", "ERROR") for r in caplog.records),
+            "a warning that the push does not get through",
+            timeout=5,
+        )
+        lock.unlink()
+        assert rig.receipt(ticket).outcome == "booked"
+    rig.assert_sound(bare)

@@ -1,0 +1,176 @@
+"""Several generators write to one state repo at once: nothing is lost, nothing counts twice."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Drivers, demand, goal, leave
+
+from generator.service import Generator, Receipt, Ticket
+
+EACH = 60
+
+
+def _demands(who: int) -> list[tuple[str, rig.Goal]]:
+    """What one generator is asked for: of every three that join, one leaves again."""
+    made = []
+    for turn in range(EACH * 3 // 4):
+        number = 2 * turn + who
+        made.append((f"join-{number}", goal(number)))
+        if turn % 3 == 2:
+            made.append((f"leave-{number}", leave(number)))
+    return made[:EACH]
+
+
+def _assert_all_there(bare: Path) -> None:
+    names = [*_demands(0), *_demands(1)]
+    rig.assert_sound(bare, verify_last=10)
+    assert sorted(rig.operations(bare)) == sorted(f"op-{name}" for name, _ in names)
+    assert rig.books(bare) == rig.books_after(made for _, made in names)
+
+
+@pytest.mark.limit(60)
+def test_two_generators_in_one_process_lose_and_double_nothing(
+    address: str, bare: Path, tmp_path: Path
+) -> None:
+    results: dict[str, Receipt] = {}
+    failures: list[str] = []
+
+    def client(generator: Generator, demands: list[tuple[str, rig.Goal]]) -> None:
+        tickets: list[tuple[str, Ticket]] = []
+        for name, made in demands:
+            tickets.append((name, generator.submit(made, f"op-{name}")))
+            if len(tickets) > 3:  # some are always under way
+                _note(*tickets.pop(0))
+        for name, ticket in tickets:
+            _note(name, ticket)
+
+    def _note(name: str, ticket: Ticket) -> None:
+        try:
+            results[name] = rig.receipt(ticket, timeout=45)
+        except Exception as error:
+            failures.append(f"{name}: {error!r}")
+
+    with rig.running(address) as first, rig.running(address, data=tmp_path / "other") as second:
+        threads = [
+            threading.Thread(target=client, args=(generator, _demands(who)), daemon=True)
+            for who, generator in enumerate((first, second))
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(50)
+    assert failures == []
+    assert len(results) == 2 * EACH
+    assert {r.outcome for r in results.values()} == {"booked", "released"}
+    _assert_all_there(bare)
+    for receipt in results.values():
+        rig.git(bare, "merge-base", "--is-ancestor", receipt.commit, "main")
+
+
+@pytest.mark.limit(60)
+def test_two_processes_on_one_machine_lose_and_double_nothing(
+    drivers: Drivers, address: str, bare: Path, data_home: Path
+) -> None:
+    runs = []
+    for who in (0, 1):
+        demands = [demand(name, made) for name, made in _demands(who)]
+        # a leave stays in its join's lane, behind it
+        lanes: list[list[dict[str, object]]] = [[], [], []]
+        for item in demands:
+            lanes[int(item["name"].rpartition("-")[2]) // 2 % 3].append(item)
+        runs.append(drivers.start(address, lanes))
+    with ThreadPoolExecutor(len(runs)) as pool:
+        told = list(pool.map(rig.Run.listen, runs))
+    answers = {name: answer for one in told for name, answer in one.answers.items()}
+    assert [a for a in answers.values() if a["outcome"] not in ("booked", "released")] == []
+    assert [one.finished for one in told] == [True, True]
+    assert len(answers) == 2 * EACH
+    slots = {path.name for path in next(data_home.iterdir()).iterdir()}
+    assert slots == {"slot-0", "slot-1"}
+    _assert_all_there(bare)
+
+
+@pytest.mark.limit(40)
+def test_the_same_demand_at_two_generators_at_once_is_booked_once(
+    address: str, bare: Path, tmp_path: Path
+) -> None:
+    with rig.running(address) as first, rig.running(address, data=tmp_path / "other") as second:
+        for number in range(10):
+            tickets = [one.submit(goal(number)) for one in (first, second)]
+            outcomes = sorted(rig.receipt(ticket).outcome for ticket in tickets)
+            assert outcomes == ["booked", "unchanged"]
+    assert len(rig.operations(bare)) == 10
+    rig.assert_sound(bare)
+
+
+@pytest.mark.limit(40)
+def test_people_and_generators_push_at_once_and_nobody_loses_anything(
+    url: str, bare: Path, tmp_path: Path
+) -> None:
+    person = rig.Person(bare, tmp_path / "person")
+    pushed: list[str] = []
+
+    def edit() -> None:
+        for number in range(6):
+            for _ in range(30):  # as a person would: fetch and try again
+                try:
+                    pushed.append(person.change({f"notes/{number}.md": f"{number}\n"}))
+                    break
+                except AssertionError:
+                    continue
+
+    with rig.running(url) as generator:
+        thread = threading.Thread(target=edit, daemon=True)
+        thread.start()
+        tickets = [generator.submit(goal(number), f"op-{number}") for number in range(10)]
+        for ticket in tickets:
+            assert rig.receipt(ticket, 30).outcome == "booked"
+        thread.join(30)
+    assert len(pushed) == 6
+    for commit in pushed:
+        rig.git(bare, "merge-base", "--is-ancestor", commit, "main")
+    assert sorted(rig.operations(bare)) == sorted(f"op-{number}" for number in range(10))
+    rig.assert_sound(bare)
+
+
+def test_a_branch_that_another_writer_holds_for_a_moment_is_tried_again(bare: Path) -> None:
+    """As `git push` does, and as a second generator does while it fsyncs the branch."""
+    lock = bare / "refs" / "heads" / "main.lock"
+    with rig.running(bare) as generator:
+        lock.touch()
+        let_go = threading.Timer(0.3, lock.unlink)
+        let_go.start()
+        ticket = generator.submit(goal(1))
+        try:
+            assert rig.receipt(ticket).outcome == "booked"
+        finally:
+            let_go.join()
+    rig.assert_sound(bare)
+
+
+@pytest.mark.limit(40)
+def test_housekeeping_by_git_during_demands_loses_nothing(bare: Path) -> None:
+    stop = threading.Event()
+
+    def tidy_up() -> None:
+        while not stop.is_set():
+            for command in (["pack-refs", "--all"], ["gc", "--quiet"]):
+                subprocess.run(["git", "-C", str(bare), *command], check=False, capture_output=True)
+
+    thread = threading.Thread(target=tidy_up, daemon=True)
+    thread.start()
+    try:
+        with rig.running(bare) as generator:
+            for number in range(30):
+                rig.book(generator, goal(number))
+    finally:
+        stop.set()
+        thread.join(20)
+    assert len(rig.operations(bare)) == 30
+    rig.assert_sound(bare, verify_last=5)

@@ -1,0 +1,159 @@
+"""The state repo behind smart HTTP: a real server, answers lost on the way, and a server away."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import staterepo_rig as rig
+from git_over_http import Server, serving
+from staterepo_rig import Gate, goal, leave
+
+from generator.errors import StateRepoError
+
+
+@pytest.fixture
+def server(bare: Path) -> Iterator[Server]:
+    with serving(bare.parent) as running:
+        yield running
+
+
+@pytest.fixture
+def http(server: Server) -> str:
+    return f"{server.url}/state.git"
+
+
+def test_demands_over_http_are_published_one_commit_each(
+    http: str, server: Server, bare: Path
+) -> None:
+    gate = Gate()
+    with rig.running(http) as generator:
+        first = generator.submit(goal(0), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        rest = [generator.submit(made) for made in (goal(1), goal(2), leave(1), goal(3))]
+        gate.open.set()
+        outcomes = [rig.receipt(ticket).outcome for ticket in (first, *rest)]
+    assert outcomes == ["booked", "booked", "booked", "released", "booked"]
+    assert server.taken == 2
+    assert rig.books(bare) == rig.books_after(map(goal, (0, 2, 3)))
+    rig.assert_sound(bare)
+
+
+def test_an_answer_lost_after_the_push_was_taken_counts_the_demand_once(
+    http: str, server: Server, bare: Path
+) -> None:
+    with rig.running(http) as generator:
+        server.faults.cut_answers = 1
+        receipt = rig.receipt(generator.submit(goal(1), "op-1"))
+        assert receipt.commit == rig.tip(bare)
+        server.faults.cut_answers = 1
+        assert rig.receipt(generator.submit(leave(1), "op-2")).outcome == "released"
+    assert server.taken == 2
+    assert rig.operations(bare) == ["op-1", "op-2"]
+    rig.assert_sound(bare)
+
+
+def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
+    http: str, server: Server, bare: Path
+) -> None:
+    """Nobody can be asked whether the push was taken, and other demands come meanwhile."""
+    gate = Gate()
+    with rig.running(http) as generator:
+        rig.book(generator, goal(0))
+        server.faults.cut_answers, server.faults.away_after_cut = 1, True
+        tickets = [generator.submit(goal(1), "op-1", gate)]
+        assert gate.reached.wait(rig.PATIENCE_S)
+        tickets.append(generator.submit(leave(0), "op-2"))
+        gate.open.set()
+        rig.wait_until(lambda: server.faults.away, "the server has taken the push and is away")
+        tickets.append(generator.submit(goal(3), "op-3"))
+        rig.wait_until(lambda: server.refused > 3, "it was asked again in vain")
+        time.sleep(1.1)  # a commit made anew has another time, so another id
+        assert not tickets[0].future.done()
+        server.faults.away = server.faults.away_after_cut = False
+        outcomes = [rig.receipt(ticket).outcome for ticket in tickets]
+        commits = [rig.receipt(ticket).commit for ticket in tickets]
+    assert outcomes == ["booked", "released", "booked"]
+    assert rig.operations(bare)[1:] == ["op-1", "op-2", "op-3"]
+    assert commits == [commit.id for commit in rig.commits(bare)][1:]
+    assert rig.books(bare) == rig.books_after(map(goal, (1, 3)))
+    rig.assert_sound(bare)
+
+
+def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
+    http: str, server: Server, bare: Path
+) -> None:
+    """The push was taken: [join again: nothing to commit, leave]. Asked again, the join is new."""
+    gate = Gate()
+    with rig.running(http) as generator:
+        rig.book(generator, goal(1))
+        opening = generator.submit(goal(0), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        again = generator.submit(goal(1), "op-again")
+        released = generator.submit(leave(1), "op-leave")
+        taken = server.taken
+        opening.future.add_done_callback(lambda _: _cut(server))
+        gate.open.set()
+        rig.wait_until(lambda: server.taken == taken + 2, "both pushes were taken")
+        rig.wait_until(lambda: server.refused > 3, "it was asked again in vain")
+        time.sleep(1.1)  # a commit made anew has another time, so another id
+        server.faults.away = server.faults.away_after_cut = False
+        assert rig.receipt(again).outcome in ("unchanged", "booked")
+        assert rig.receipt(released).outcome == "released"
+    assert rig.books(bare) == rig.books_after([goal(0)]), "what was released stands again"
+
+
+def _cut(server: Server) -> None:
+    server.faults.cut_answers, server.faults.away_after_cut = 1, True
+
+
+def test_a_server_that_is_away_for_a_while_is_waited_for(
+    http: str, server: Server, bare: Path
+) -> None:
+    with rig.running(http) as generator:
+        rig.book(generator, goal(0))
+        server.faults.away = True
+        tickets = [generator.submit(goal(number)) for number in (1, 2)]
+        rig.wait_until(lambda: server.refused > 4, "it was asked again in vain")
+        assert not any(ticket.future.done() for ticket in tickets)
+        server.faults.away = False
+        assert [rig.receipt(ticket).outcome for ticket in tickets] == ["booked"] * 2
+    assert rig.books(bare) == rig.books_after(map(goal, range(3)))
+    rig.assert_sound(bare)
+
+
+# 403 in an address, a port or a commit's id says nothing about rights
+@pytest.mark.parametrize("prefix", ["", "/403", "/denied-and-rejected"])
+def test_a_server_that_takes_no_push_for_a_while_is_waited_for(bare: Path, prefix: str) -> None:
+    with serving(bare.parent, prefix) as server, rig.running(f"{server.url}/state.git") as one:
+        server.faults.no_pushes, server.faults.status = 3, 503
+        assert rig.receipt(one.submit(goal(1))).outcome == "booked"
+        assert server.refused == 3
+    rig.assert_sound(bare)
+
+
+@pytest.mark.limit(15)
+def test_a_server_that_forbids_the_push_is_told_and_not_asked_for_ever(
+    http: str, server: Server, bare: Path
+) -> None:
+    with rig.running(http) as generator:
+        server.faults.no_pushes, server.faults.status = 1000, 403
+        with pytest.raises(StateRepoError, match="takes no push"):
+            rig.receipt(generator.submit(goal(1)), timeout=6)
+        server.faults.no_pushes = 0
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+    assert rig.books(bare) == rig.books_after([goal(2)])
+
+
+def test_two_generators_push_over_http_at_once(
+    http: str, server: Server, bare: Path, tmp_path: Path
+) -> None:
+    with rig.running(http) as first, rig.running(http, data=tmp_path / "other") as second:
+        tickets = [(first, second)[n % 2].submit(goal(n), f"op-{n}") for n in range(10)]
+        for ticket in tickets:
+            assert rig.receipt(ticket).outcome == "booked"
+    assert sorted(rig.operations(bare)) == sorted(f"op-{n}" for n in range(10))
+    assert rig.books(bare) == rig.books_after(map(goal, range(10)))
+    rig.assert_sound(bare)

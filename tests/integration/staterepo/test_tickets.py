@@ -1,0 +1,307 @@
+"""What the generator promises to whoever hands in a demand, whatever they do."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Drivers, Gate, Stages, demand, goal
+
+from generator.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
+from generator.service import Generator, Ticket
+
+# ---- taking back ----
+
+
+def test_a_demand_that_waits_can_be_taken_back_and_leaves_no_trace(
+    address: str, bare: Path
+) -> None:
+    gate = Gate()
+    with rig.running(address) as generator:
+        generator.submit(goal(1), "op-1", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        stages = Stages()
+        ticket = generator.submit(goal(2), "op-2", stages)
+        assert generator.withdraw("op-2") is True
+        assert generator.withdraw("op-2") is True, "saying it twice does no harm"
+        gate.open.set()
+        with pytest.raises(Withdrawn):
+            rig.receipt(ticket)
+    assert rig.operations(bare) == ["op-1"]
+    assert rig.claims(bare, "user2") == []
+    assert stages.names == []
+    assert rig.restart(address) is True
+    assert rig.operations(bare) == ["op-1"]
+
+
+@pytest.mark.parametrize("stage", ["admitted", "booked"])
+def test_a_demand_can_be_taken_back_until_it_is_committed(
+    address: str, bare: Path, stage: str
+) -> None:
+    answers: list[bool] = []
+    with rig.running(address) as generator:
+
+        def take_back(told: str, text: str) -> None:
+            if told == stage:
+                answers.append(generator.withdraw("op-1"))
+
+        ticket = generator.submit(goal(1), "op-1", take_back)
+        with pytest.raises(Withdrawn):
+            rig.receipt(ticket)
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+    assert answers == [True]
+    assert len(rig.operations(bare)) == 1
+    assert rig.books(bare) == rig.books_after([goal(2)])
+
+
+@pytest.mark.parametrize("stage", ["committed", "pushed"])
+def test_a_committed_demand_cannot_be_taken_back(address: str, bare: Path, stage: str) -> None:
+    answers: list[bool] = []
+    with rig.running(address) as generator:
+
+        def take_back(told: str, text: str) -> None:
+            if told == stage:
+                answers.append(generator.withdraw("op-1"))
+
+        assert rig.receipt(generator.submit(goal(1), "op-1", take_back)).outcome == "booked"
+        assert generator.withdraw("op-1") is False
+        assert generator.withdraw("never-known") is False
+    assert answers == [False]
+    assert rig.operations(bare) == ["op-1"]
+
+
+def test_taking_back_races_with_committing_and_both_agree_on_who_won(
+    bare: Path, address: str
+) -> None:
+    with rig.running(address) as generator:
+        tickets = [generator.submit(goal(n), f"op-{n}") for n in range(30)]
+        taken = {n for n in range(29, -1, -1) if generator.withdraw(f"op-{n}")}
+        for number, ticket in enumerate(tickets):
+            if number in taken:
+                with pytest.raises(Withdrawn):
+                    rig.receipt(ticket)
+            else:
+                assert rig.receipt(ticket).outcome == "booked"
+    kept = [n for n in range(30) if n not in taken]
+    assert rig.operations(bare) == [f"op-{n}" for n in kept]
+    assert rig.books(bare) == rig.books_after(map(goal, kept))
+    rig.assert_sound(bare)
+
+
+# ---- closing ----
+
+
+def test_closing_finishes_what_is_in_hand(address: str, bare: Path) -> None:
+    gate = Gate()
+    generator = Generator(address)
+    tickets = [generator.submit(goal(0), "op-0", gate)]
+    assert gate.reached.wait(rig.PATIENCE_S)
+    tickets += [generator.submit(goal(n), f"op-{n}") for n in range(1, 30)]
+    stopped = generator.stop()
+    gate.open.set()
+    assert stopped.result(rig.PATIENCE_S) is True
+    assert all(ticket.future.done() for ticket in tickets)
+    assert rig.operations(bare) == [f"op-{n}" for n in range(30)]
+
+
+def test_a_demand_after_closing_is_told_so(address: str) -> None:
+    generator = Generator(address)
+    generator.close()
+    with pytest.raises(ShuttingDown) as error:
+        generator.submit(goal(1))
+    assert str(error.value) == "the generator is shutting down; send the demand again later"
+
+
+@pytest.mark.limit(10)
+def test_closing_twice_ends_twice(address: str) -> None:
+    generator = Generator(address)
+    assert generator.close() is True
+    assert generator.stop().result(3) is True
+
+
+@pytest.mark.limit(10)
+def test_stopping_from_two_threads_ends_for_both(address: str) -> None:
+    generator = Generator(address)
+    rig.book(generator, goal(1))
+    both = [generator.stop(), generator.stop()]
+    assert [one.result(3) for one in both] == [True, True]
+
+
+def test_a_demand_handed_in_while_closing_is_answered_or_not_taken(bare: Path) -> None:
+    for _ in range(5):
+        generator = Generator(str(bare))
+        tickets: list[Ticket] = []
+
+        def hand_in(generator: Generator = generator, tickets: list[Ticket] = tickets) -> None:
+            for number in range(100_000):
+                try:
+                    tickets.append(generator.submit(goal(number % 20)))
+                except ShuttingDown:
+                    return
+
+        thread = threading.Thread(target=hand_in, daemon=True)
+        thread.start()
+        rig.wait_until(tickets.__len__, "the first demand is in")
+        assert generator.close() is True
+        thread.join(rig.PATIENCE_S)
+        for ticket in tickets:
+            assert ticket.future.done(), "closed, but never answered"
+
+
+# ---- limits ----
+
+
+def test_a_full_queue_takes_no_more_and_takes_again_when_there_is_room(
+    address: str, bare: Path
+) -> None:
+    gate = Gate()
+    with rig.running(address, queue_limit=3) as generator:
+        first = generator.submit(goal(0), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        waiting = [generator.submit(goal(n)) for n in (1, 2, 3)]
+        with pytest.raises(QueueFull) as error:
+            generator.submit(goal(4))
+        assert str(error.value) == "3 demands are waiting already; send it again later"
+        gate.open.set()
+        for ticket in (first, *waiting):
+            rig.receipt(ticket)
+        assert rig.book(generator, goal(4))[0].outcome == "booked"
+    assert rig.books(bare) == rig.books_after(map(goal, range(5)))
+
+
+# ---- callers that misbehave ----
+
+
+@pytest.mark.limit(15)
+def test_a_caller_that_cancels_its_future_stops_nobody_else(address: str, bare: Path) -> None:
+    """`asyncio.wait_for(asyncio.wrap_future(ticket.future), …)` does just this."""
+    gate = Gate()
+    with rig.running(address) as generator:
+        first = generator.submit(goal(1), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        second = generator.submit(goal(2))
+        first.future.cancel()
+        second.future.cancel()
+        third = generator.submit(goal(3))
+        gate.open.set()
+        assert rig.receipt(third, timeout=6).outcome == "booked"
+        assert rig.receipt(generator.submit(goal(4)), timeout=6).outcome == "booked"
+    rig.assert_sound(bare)
+
+
+def test_a_listener_that_fails_stops_nothing(address: str, bare: Path) -> None:
+    def fail(stage: str, text: str) -> None:
+        raise RuntimeError(stage)
+
+    with rig.running(address) as generator:
+        assert rig.receipt(generator.submit(goal(1), listener=fail)).outcome == "booked"
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+
+
+def test_a_done_callback_may_hand_in_the_next_demand(address: str, bare: Path) -> None:
+    done = threading.Event()
+    with rig.running(address) as generator:
+
+        def then(future: Any) -> None:
+            generator.submit(goal(2)).future.add_done_callback(lambda _: done.set())
+
+        generator.submit(goal(1)).future.add_done_callback(then)
+        assert done.wait(rig.PATIENCE_S)
+    assert rig.books(bare) == rig.books_after([goal(1), goal(2)])
+
+
+NOT_PLAIN: list[Any] = [
+    {**goal(1), "id": b"bytes"},
+    {**goal(1), "apps": {1, 2}},
+    {**goal(1), ("a", "b"): 1},
+    object(),
+    None,
+    float("nan"),
+    "a text",
+]
+
+
+@pytest.mark.limit(15)
+@pytest.mark.parametrize("made", NOT_PLAIN, ids=lambda made: type(made).__name__)
+def test_a_goal_that_is_no_plain_data_fails_alone(bare: Path, made: Any) -> None:
+    gate = Gate()
+    with rig.running(bare) as generator:
+        generator.submit(goal(0), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        before, odd = generator.submit(goal(1)), None
+        with suppress(DemandOpsError):  # told at once, or by the ticket
+            odd = generator.submit(made)
+        after = generator.submit(goal(2))
+        gate.open.set()
+        if odd is not None:
+            with pytest.raises(DemandOpsError):
+                rig.receipt(odd, timeout=5)
+        assert rig.receipt(before, timeout=5).outcome == "booked"
+        assert rig.receipt(after, timeout=5).outcome == "booked"
+    assert rig.restart(bare) is True
+    assert rig.books(bare) == rig.books_after(map(goal, range(3)))
+
+
+def test_an_operation_id_cannot_forge_a_trailer(bare: Path) -> None:
+    with rig.running(bare) as generator:
+        try:
+            rig.receipt(generator.submit(goal(1), "op-1\nRequester: somebody else"))
+        except (DemandOpsError, ValueError):
+            return
+    made = rig.commits(bare)[-1]
+    assert ("Requester", "somebody else") not in made.trailers
+
+
+def test_one_operation_id_handed_in_twice_is_one_commit(address: str, bare: Path) -> None:
+    gate = Gate()
+    with rig.running(address) as generator:
+        generator.submit(goal(0), "op-0", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        tickets = [generator.submit(goal(1), "op-1"), generator.submit(goal(1), "op-1")]
+        gate.open.set()
+        for ticket in tickets:
+            rig.receipt(ticket)
+        rig.receipt(generator.submit(goal(1), "op-1"))
+    assert rig.operations(bare) == ["op-0", "op-1"]
+
+
+# ---- a disk that is full ----
+
+
+@pytest.mark.limit(15)
+def test_a_journal_that_cannot_be_written_fails_the_demand_and_works_again_later(
+    bare: Path,
+) -> None:
+    with rig.running(bare) as generator:
+        outbox = generator._slot.outbox
+        journal, outbox._file = outbox._file, Path("/dev/full").open("a")  # noqa: SIM115
+        ticket = generator.submit(goal(1))
+        with pytest.raises(DemandOpsError):
+            rig.receipt(ticket, timeout=5)
+        with suppress(OSError):
+            outbox._file.close()
+        outbox._file = journal
+        rig.book(generator, goal(2))
+    assert rig.books(bare) == rig.books_after([goal(2)])
+
+
+# ---- what was promised holds after a crash ----
+
+
+def test_what_was_taken_back_stays_so_after_a_crash(
+    drivers: Drivers, address: str, bare: Path
+) -> None:
+    """Both are in the journal when the second is taken back and the process is killed."""
+    lanes = [[demand("first", goal(1))], [demand("second", goal(2)) | {"withdraw": True}]]
+    told = drivers.start(
+        address, lanes, opening=demand("opening", goal(0)), die_at="withdrawn"
+    ).listen()
+    assert told.finished is None
+    assert told.withdrawn == ["second"]
+    assert rig.restart(address) is True
+    assert sorted(rig.operations(bare)) == ["op-first", "op-opening"]
+    rig.assert_sound(bare)

@@ -1,0 +1,812 @@
+"""The command line of design §7: text, JSON and exit codes of every command.
+
+Exit codes: 0 done, 1 the user's to mend, 2 wrong usage, 3 a fault of the program.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pygit2
+import pytest
+import yaml
+from asking import APP, CLOUD, FAST, Goal, application, connection, goal, perception
+
+from generator import __version__
+from generator.cli import views
+
+EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("*.yaml"))
+SHA = re.compile(r"[0-9a-f]{40}")
+FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
+REQUEST_KEYS = ["index", "request_id", "outcome", "commit", "errors", "warnings", "not_held"]
+NO_CARRIER = (
+    "application 'edge/object_detection_fusion': no connection carries point_cloud "
+    "/vehicles/vehicle00/drivers/lidar/pointcloud of 'vehicle00' to 'edge'"
+)
+
+Run = Callable[..., Any]
+
+
+def text(*goals: Goal) -> str:
+    return yaml.safe_dump_all(goals, sort_keys=False)
+
+
+@pytest.fixture
+def joined(request_json: Run, state: Any) -> Any:
+    """Return a state repo with the plain demand booked."""
+    assert request_json(perception()).code == 0
+    return state
+
+
+class TestInit:
+    def test_a_bare_state_repo(self, demandops: Run, tmp_path: Path) -> None:
+        folder = tmp_path / "new" / "state.git"
+        ran = demandops("init", folder, "--bare")
+        assert (ran.code, ran.err) == (0, "")
+        repo = pygit2.Repository(str(folder))
+        tip = repo.references["refs/heads/main"].target
+        assert repo.is_bare
+        assert repo.references["HEAD"].target == "refs/heads/main"
+        assert ran.out.startswith(f"state repo in {folder}, first commit {str(tip)[:10]} on main\n")
+        assert f"next: demandops serve --state-repo {folder}\n" in ran.out
+        assert demandops("bookkeeping", "--state-repo", folder).code == 0
+
+    def test_a_state_repo_to_edit(self, demandops: Run, tmp_path: Path) -> None:
+        folder = tmp_path / "state"
+        ran = demandops("init", folder, "--output", "json")
+        found = ran.json()
+        assert SHA.fullmatch(found.pop("commit"))
+        assert found == {"directory": str(folder), "gitops": "flux", "bare": False}
+        assert (folder / "inventory" / "nodes.yaml").is_file()
+        assert not subprocess.run(
+            ["git", "-C", folder, "status", "--porcelain"], capture_output=True, check=True
+        ).stdout
+        assert demandops("check", folder).code == 0
+
+    def test_an_empty_folder_is_used(self, demandops: Run, tmp_path: Path) -> None:
+        folder = tmp_path / "state"
+        folder.mkdir()
+        assert demandops("init", folder).code == 0
+        assert (folder / "demandops.yaml").is_file()
+
+    @pytest.mark.parametrize("place", [".", "state/..", "./"])
+    def test_the_folder_one_stands_in_is_used(
+        self, demandops: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+    ) -> None:
+        folder = tmp_path / "state"
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        if ".." in place:
+            (folder / "state").mkdir()
+            ran = demandops("init", place)
+            assert (ran.code, ran.out) == (1, "")
+            return
+        ran = demandops("init", place)
+        assert (ran.code, ran.err) == (0, "")
+        assert (folder / "demandops.yaml").is_file()
+
+    def test_a_folder_in_use_is_refused_and_left_alone(
+        self, demandops: Run, tmp_path: Path
+    ) -> None:
+        folder = tmp_path / "state"
+        folder.mkdir()
+        (folder / "mine").write_text("precious")
+        ran = demandops("init", folder)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            f"error: {folder} exists and is not empty; name a new folder (nothing was changed)\n"
+        )
+        assert [path.name for path in tmp_path.iterdir() if path.name != "home"] == ["state"]
+        assert [path.name for path in folder.iterdir()] == ["mine"]
+
+    def test_a_file_in_the_way_is_the_users_to_mend(self, demandops: Run, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("precious")
+        for place in ("file", "file/state"):
+            ran = demandops("init", tmp_path / place)
+            assert (ran.code, ran.out) == (1, "")
+            assert ran.err.startswith("error: ")
+            assert str(tmp_path / "file") in ran.err
+        assert (tmp_path / "file").read_text() == "precious"
+
+    def test_a_controller_that_does_not_exist_is_wrong_usage(
+        self, demandops: Run, tmp_path: Path
+    ) -> None:
+        ran = demandops("init", tmp_path / "state", "--gitops", "helm")
+        assert (ran.code, ran.out) == (2, "")
+        assert "'helm' is not" in ran.err
+        assert not (tmp_path / "state").exists()
+
+
+class TestRequest:
+    def test_the_json_is_what_programs_rely_on(
+        self, demandops: Run, state: Any, request_json: Run
+    ) -> None:
+        ran = request_json(goal([application()], id="r"))
+        assert (ran.code, ran.err) == (0, "")
+        (row,) = ran.json()
+        assert list(row) == REQUEST_KEYS
+        assert row == {
+            "index": 0,
+            "request_id": "r",
+            "outcome": "booked",
+            "commit": state.tip,
+            "errors": [],
+            "warnings": [NO_CARRIER],
+            "not_held": [],
+        }
+
+    def test_unchanged_gives_the_tip_and_succeeds(self, request_json: Run, joined: Any) -> None:
+        ran = request_json(perception())
+        (row,) = ran.json()
+        assert (ran.code, row["outcome"], row["commit"]) == (0, "unchanged", joined.tip)
+        assert len(joined.commits()) == 2
+
+    def test_released_tells_what_was_not_held(self, request_json: Run, joined: Any) -> None:
+        asked = goal([application(), application("other")], shutdown=True)
+        (row,) = request_json(asked).json()
+        assert (row["outcome"], row["commit"]) == ("released", joined.tip)
+        assert row["not_held"] == ["application 'other' for vehicle00"]
+
+    def test_refused_has_no_commit(self, request_json: Run, state: Any) -> None:
+        before = state.tip
+        ran = request_json(goal([application(node="egde")]))
+        (row,) = ran.json()
+        assert ran.code == 1
+        assert list(row) == REQUEST_KEYS
+        assert (row["outcome"], row["commit"], state.tip) == ("refused", None, before)
+        assert row["errors"] == [
+            {
+                "field": "apps[0].header.node_id",
+                "message": "'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",
+            }
+        ]
+
+    def test_the_text_tells_the_same(self, demandops: Run, state: Any) -> None:
+        ran = demandops(
+            "request", "-", "--state-repo", state.path,
+            stdin=text(perception(id="one"), goal([application(node="egde")], id="two"),
+                       goal([application(), application("other")], id="one", shutdown=True)),
+        )  # fmt: skip
+        first, second = (commit for commit in log_of(demandops, state)[:2][::-1])
+        assert ran.code == 1
+        assert ran.out == (
+            f"standard input: request 0 'one' booked in {first}\n"
+            f"standard input: request 2 'one' released in {second}\n"
+        )
+        assert ran.err == (
+            "standard input: request 1 'two' refused\n"
+            "  apps[0].header.node_id: 'egde' is not in inventory/nodes.yaml; did you mean "
+            "'edge'?\n"
+            "  not held: application 'other' for vehicle00\n"
+        )
+
+    def test_a_warning_goes_to_standard_error(self, demandops: Run, state: Any) -> None:
+        ran = demandops(
+            "request", "-", "--state-repo", state.path, stdin=text(goal([application()]))
+        )
+        assert ran.code == 0
+        assert ran.err == f"  warning: {NO_CARRIER}\n"
+
+    def test_files_and_documents_are_taken_in_order(
+        self, demandops: Run, state: Any, tmp_path: Path
+    ) -> None:
+        for name in "ab":
+            documents = (goal([], [connection(name)], id=f"{name}{number}") for number in (1, 2))
+            (tmp_path / f"{name}.yaml").write_text(text(*documents))
+        ran = demandops(
+            "request", tmp_path / "b.yaml", "-", tmp_path / "a.yaml", "--state-repo", state.path,
+            "--output", "json", stdin=text(goal([], [connection("c")], id="c1")),
+        )  # fmt: skip
+        rows = ran.json()
+        assert [(row["index"], row["request_id"]) for row in rows] == [
+            (0, "b1"),
+            (1, "b2"),
+            (2, "c1"),
+            (3, "a1"),
+            (4, "a2"),
+        ]
+        assert [row["commit"] for row in rows] == log_of(demandops, state)[:5][::-1]
+
+    def test_empty_documents_are_passed_over(self, demandops: Run, state: Any) -> None:
+        given = f"---\n---\n{text(perception())}\n---\n# nothing\n---\n{text(perception())}"
+        ran = demandops("request", "-", "--state-repo", state.path, "--output", "json", stdin=given)
+        assert [(row["index"], row["outcome"]) for row in ran.json()] == [
+            (0, "booked"),
+            (1, "unchanged"),
+        ]
+
+    def test_one_that_is_refused_does_not_stop_the_next(
+        self, request_json: Run, state: Any
+    ) -> None:
+        ran = request_json(
+            perception(id="1"), goal([application("..")], id="2"), perception(id="3")
+        )
+        assert ran.code == 1
+        assert [row["outcome"] for row in ran.json()] == ["booked", "refused", "booked"]
+        assert len(state.commits()) == 3
+
+    def test_one_of_the_wrong_form_books_nothing_at_all(
+        self, request_json: Run, state: Any
+    ) -> None:
+        before = state.tip
+        ran = request_json(perception(id="1"), {"id": 5}, perception(id="3"))
+        assert (ran.code, state.tip) == (1, before)
+        rows = ran.json()
+        assert [(row["index"], row["outcome"], row["commit"]) for row in rows] == [
+            (index, "refused", None) for index in range(3)
+        ]
+        assert rows[1]["errors"] == [
+            {"field": "id", "message": "must be text, not 5; put it in quotes"}
+        ]
+        for row in (rows[0], rows[2]):
+            assert row["errors"] == [
+                {
+                    "field": "",
+                    "message": "not booked, for another request of this call does not parse",
+                }
+            ]
+
+    def test_a_file_that_does_not_parse_books_nothing_at_all(
+        self, demandops: Run, state: Any, tmp_path: Path
+    ) -> None:
+        before = state.tip
+        (tmp_path / "good.yaml").write_text(text(perception()))
+        (tmp_path / "bad.yaml").write_text(f"{text(perception())}---\nid: [\n")
+        ran = demandops(
+            "request", tmp_path / "good.yaml", tmp_path / "bad.yaml", "--state-repo", state.path
+        )
+        assert (ran.code, ran.out, state.tip) == (1, "", before)
+        assert ran.err.startswith(f"error: {tmp_path}/bad.yaml: line ")
+
+    def test_a_dry_run_shows_the_consequence_and_books_nothing(
+        self, demandops: Run, state: Any, data_home: Path
+    ) -> None:
+        before = state.tip
+        ran = demandops(
+            "request", "-", "--dry-run", "--state-repo", state.path, stdin=text(perception(id="r"))
+        )
+        assert (ran.code, ran.err, state.tip) == (0, "", before)
+        assert not list(data_home.rglob("outbox.jsonl"))
+        lines = ran.out.splitlines()
+        assert lines[0] == "Request 0: 'r' would be booked"
+        assert "  + od-edge-vehicle00 (object-detection on edge for vehicle00)" in lines
+        assert f"  + {FUSION} (object-fusion on edge for {APP})" in lines
+        paths = [line.split()[-1] for line in lines if line.startswith("  write ")]
+        assert demandops(
+            "request", "-", "--state-repo", state.path, stdin=text(perception(id="r"))
+        ).code == 0  # fmt: skip
+        assert paths == sorted(changed_files(state))
+
+    def test_a_dry_run_decides_each_on_top_of_the_one_before(
+        self, request_json: Run, state: Any
+    ) -> None:
+        before = state.tip
+        ran = request_json(
+            perception(id="r"),
+            perception(id="r"),
+            goal([application(node="cloud")], id="x"),
+            perception(id="r", shutdown=True),
+            perception(id="r", shutdown=True),
+            more=("--dry-run",),
+        )
+        assert [row["outcome"] for row in ran.json()] == [
+            "booked",
+            "unchanged",
+            "refused",
+            "released",
+            "refused",
+        ]
+        assert all(list(row) == REQUEST_KEYS for row in ran.json())
+        assert (ran.code, state.tip) == (1, before)
+
+    def test_the_experiments_files_as_they_are(self, demandops: Run, state: Any) -> None:
+        ran = demandops("request", *EXPERIMENT, "--state-repo", state.path, "--output", "json")
+        assert ran.code == 0
+        assert [row["outcome"] for row in ran.json()] == ["booked"] * 4 + ["released"] * 4
+        books = demandops("bookkeeping", "--state-repo", state.path, "--output", "json").json()
+        assert (books["services"], books["connections"]) == ({}, {})
+
+
+def log_of(demandops: Run, state: Any) -> list[str]:
+    rows = demandops("log", "--state-repo", state.path, "--output", "json").json()
+    return [row["commit"] for row in rows]
+
+
+def changed_files(state: Any) -> list[str]:
+    repo = pygit2.Repository(str(state.path))
+    tip = repo[state.tip].peel(pygit2.Commit)
+    return [patch.delta.new_file.path for patch in repo.diff(tip.parents[0], tip)]
+
+
+class TestBookkeeping:
+    def test_the_json_is_what_programs_rely_on(self, demandops: Run, joined: Any) -> None:
+        ran = demandops("bookkeeping", "--state-repo", joined.path, "--output", "json")
+        assert (ran.code, ran.err) == (0, "")
+        assert ran.json() == {
+            "services": {
+                "od-edge-vehicle00": {
+                    "applications": [APP],
+                    "service": "object-detection",
+                    "node": "edge",
+                    "source": "vehicle00",
+                    "source_topic": CLOUD[0],
+                    "inputs": {"point_cloud": [CLOUD[0]]},
+                    "requesters": ["vehicle00"],
+                },
+                FUSION: {
+                    "applications": [APP],
+                    "service": "object-fusion",
+                    "node": "edge",
+                    "source": None,
+                    "source_topic": None,
+                    "inputs": {"ego_data": [], "object_list": ["/vehicle00_local_objectlist"]},
+                    "requesters": ["vehicle00"],
+                },
+            },
+            "connections": {
+                "vehicle00/edge": {
+                    "source": "vehicle00",
+                    "target": "edge",
+                    "topics": [CLOUD[0]],
+                    "requesters": ["vehicle00"],
+                }
+            },
+            "commit": joined.tip,
+        }
+
+    def test_lists_are_sorted(self, demandops: Run, joined: Any, request_json: Run) -> None:
+        request_json(
+            goal(
+                [application("a/first", who=["z", "a"])],
+                [connection(who=["z", "a"], topics=["/z", "/a"])],
+            )
+        )
+        found = demandops("bookkeeping", "--state-repo", joined.path, "--output", "json").json()
+        detection = found["services"]["od-edge-vehicle00"]
+        assert detection["applications"] == ["a/first", APP]
+        assert detection["requesters"] == ["a", "vehicle00", "z"]
+        entry = found["connections"]["vehicle00/edge"]
+        assert entry["topics"] == ["/a", CLOUD[0], "/z"]
+        assert entry["requesters"] == ["a", "vehicle00", "z"]
+
+    def test_as_it_was_before(self, demandops: Run, joined: Any, request_json: Run) -> None:
+        before = joined.tip
+        request_json(perception(shutdown=True))
+        for revision in (before, before[:10], "main~1", "HEAD~1"):
+            ran = demandops(
+                "bookkeeping", "--at", revision, "--state-repo", joined.path, "--output", "json"
+            )
+            assert ran.json()["commit"] == before
+            assert len(ran.json()["services"]) == 2
+
+    def test_a_revision_that_does_not_exist(self, demandops: Run, state: Any) -> None:
+        ran = demandops("bookkeeping", "--at", "nope", "--state-repo", state.path)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            "error: 'nope' is no commit of the state repo; `demandops log` lists them\n"
+        )
+
+    def test_the_text_is_a_table(self, demandops: Run, joined: Any) -> None:
+        ran = demandops("bookkeeping", "--state-repo", joined.path)
+        assert (ran.code, ran.err) == (0, "")
+        cells = [[c.strip() for c in line.split("│")] for line in ran.out.splitlines()]
+        assert ["", "od-edge-vehicle00", "object-detection", "edge", "vehicle00", CLOUD[0],
+                "vehicle00", ""] in cells  # fmt: skip
+        assert ["", "vehicle00/edge", "vehicle00", "edge", CLOUD[0], "vehicle00", ""] in cells
+        assert ran.out.splitlines()[-1] == f"at {joined.tip}"
+
+    def test_nothing_is_shown_as_nothing(self, demandops: Run, state: Any) -> None:
+        ran = demandops("bookkeeping", "--state-repo", state.path)
+        assert ran.out.count("(nothing)") == 2
+
+    @pytest.mark.parametrize("id", ["a:car:b", "[red]a[/red]", "[/]", "a\\[b"])
+    def test_an_id_is_shown_as_it_is(
+        self, demandops: Run, state: Any, request_json: Run, id: str
+    ) -> None:
+        assert request_json(goal([application(id)], [connection(id)])).code == 0
+        for command in (["bookkeeping"], ["log"], ["diff", "main~1", "main"], ["verify"]):
+            ran = demandops(*command, "--state-repo", state.path)
+            assert (ran.code, ran.err) == (0, "")
+            if command[0] != "diff" or id in ran.out:
+                assert id in ran.out, ran.out
+
+
+class TestLog:
+    KEYS = (
+        "commit", "time", "author", "summary", "operation", "operation_id", "request_id",
+        "demand_ids", "requesters", "applications", "connections", "render_version",
+    )  # fmt: skip
+
+    def test_the_json_tells_all_that_the_trailers_say(self, demandops: Run, joined: Any) -> None:
+        joined.commit({"inventory/README.md": "hello\n"})
+        ran = demandops("log", "--state-repo", joined.path, "--output", "json")
+        by_hand, join, init = ran.json()
+        assert ran.code == 0
+        for row in (by_hand, join, init):
+            assert tuple(row) == self.KEYS
+        assert (join["operation"], join["request_id"], join["author"]) == (
+            "join",
+            "request",
+            "vehicle00",
+        )
+        assert join["requesters"] == ["vehicle00"]
+        assert (join["applications"], join["connections"]) == ([APP], ["vehicle00/edge"])
+        assert len(join["demand_ids"]) == 1
+        assert init["operation"] == "init"
+        assert (by_hand["operation"], by_hand["author"]) == (None, "A person")
+
+    def test_the_text_is_a_table(self, demandops: Run, joined: Any) -> None:
+        joined.commit({"inventory/README.md": "hello\n"})
+        ran = demandops("log", "--state-repo", joined.path)
+        rows = [[c.strip() for c in line.split("│")][1:-1] for line in ran.out.splitlines()
+                if line.startswith("│")]  # fmt: skip
+        assert [(row[0], row[2], row[3], row[4]) for row in rows] == [
+            (joined.tip[:10], "by hand", "A person", "By hand"),
+            (rows[1][0], "join", "vehicle00", f"Join {APP}, vehicle00/edge"),
+            (rows[2][0], "init", "DemandOps generator", "Lay down the state repo"),
+        ]
+
+    def test_as_many_and_from_where_one_says(
+        self, demandops: Run, state: Any, request_json: Run
+    ) -> None:
+        for number in range(3):
+            request_json(goal([], [connection(f"c{number}")]))
+        where = ("--state-repo", state.path, "--output", "json")
+        commits = [row["commit"] for row in demandops("log", *where).json()]
+        assert len(commits) == 4
+        for args, wanted in (
+            (["-n", "2"], commits[:2]),
+            (["main~1"], commits[1:]),
+            ([f"{commits[2]}..main"], commits[:2]),
+            ([f"{commits[2]}.."], commits[:2]),
+            (["main..main"], []),
+        ):
+            assert [row["commit"] for row in demandops("log", *args, *where).json()] == wanted
+
+    @pytest.mark.parametrize("revision", ["nope", "nope..main", "main..nope"])
+    def test_a_revision_that_does_not_exist(
+        self, demandops: Run, state: Any, revision: str
+    ) -> None:
+        ran = demandops("log", revision, "--state-repo", state.path)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            "error: 'nope' is no commit of the state repo; `demandops log` lists them\n"
+        )
+
+
+class TestDiff:
+    def test_the_text_tells_what_differs(
+        self, demandops: Run, joined: Any, request_json: Run
+    ) -> None:
+        request_json(
+            goal(
+                [application(who=["vehicle01"], ego=[("/ego", "vehicle01")])],
+                [connection("vehicle01/edge", who=["vehicle01"], topics=["/ego"])],
+                id="further",
+            )
+        )
+        ran = demandops("diff", "main~1", "main", "--state-repo", joined.path)
+        assert (ran.code, ran.err) == (0, "")
+        assert ran.out.splitlines() == [
+            "~ service od-edge-vehicle00",
+            "    + requester vehicle01",
+            f"~ service {FUSION}",
+            "    + ego_data /ego",
+            "    + requester vehicle01",
+            "+ connection vehicle01/edge for vehicle01",
+        ]
+        back = demandops("diff", "main", "main~1", "--state-repo", joined.path)
+        assert back.out.splitlines()[1] == "    - requester vehicle01"
+        assert back.out.splitlines()[-1] == "- connection vehicle01/edge for vehicle01"
+
+    def test_the_json_tells_the_same(self, demandops: Run, joined: Any) -> None:
+        ran = demandops("diff", "main~1", "main", "--state-repo", joined.path, "--output", "json")
+        found = ran.json()
+        assert found.keys() == {"services", "connections"}
+        assert all(part.keys() == {"added", "removed", "changed"} for part in found.values())
+        assert sorted(found["services"]["added"]) == ["od-edge-vehicle00", FUSION]
+        assert found["connections"]["added"]["vehicle00/edge"]["requesters"] == ["vehicle00"]
+        assert found["services"]["removed"] == found["services"]["changed"] == {}
+
+    def test_no_difference(self, demandops: Run, joined: Any) -> None:
+        ran = demandops("diff", "main", "main", "--state-repo", joined.path)
+        assert (ran.code, ran.out) == (0, "no difference in bookkeeping\n")
+
+    def test_a_revision_that_does_not_exist(self, demandops: Run, state: Any) -> None:
+        ran = demandops("diff", "main", "nope", "--state-repo", state.path)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            "error: 'nope' is no commit of the state repo; `demandops log` lists them\n"
+        )
+
+
+class TestVerify:
+    def test_every_commit_of_the_experiment_holds(self, demandops: Run, state: Any) -> None:
+        first = state.tip
+        demandops("request", *EXPERIMENT, "--state-repo", state.path)
+        ran = demandops("verify", f"{first}..main", "--state-repo", state.path)
+        assert (ran.code, ran.err) == (0, "")
+        assert ran.out.splitlines()[-1] == "8 of 8 commits hold"
+        rows = demandops(
+            "verify", f"{first}..main", "--state-repo", state.path, "--output", "json"
+        ).json()
+        assert [row["holds"] for row in rows] == [True] * 8
+        assert [row["commit"] for row in rows] == log_of(demandops, state)[:8][::-1]
+
+    def test_what_was_tampered_with_does_not_hold(self, demandops: Run, joined: Any) -> None:
+        (path,) = (path for path in joined.manifests() if "/od-" in path)
+        changed = {path: joined.files()[path] + "# changed\n"}
+        joined.commit(changed, "Forged\n\nOperation: join\nRender-Version: 1\n")
+        ran = demandops("verify", "--state-repo", joined.path)
+        assert ran.code == 1
+        assert ran.out.splitlines() == [
+            f"{joined.tip[:10]} DIFFERS  Forged",
+            f"    {path}",
+            "0 of 1 commits hold",
+        ]
+        (row,) = demandops("verify", "--state-repo", joined.path, "--output", "json").json()
+        assert row == {
+            "commit": joined.tip,
+            "summary": "Forged",
+            "holds": False,
+            "skipped": None,
+            "differing": [path],
+        }
+
+    def test_a_commit_of_a_person_is_skipped(self, demandops: Run, joined: Any) -> None:
+        joined.commit({"inventory/README.md": "hello\n"})
+        ran = demandops("verify", "--state-repo", joined.path)
+        assert ran.code == 0
+        assert ran.out.startswith(f"{joined.tip[:10]} skipped (made by a person)  By hand\n")
+
+    def test_a_revision_that_does_not_exist(self, demandops: Run, state: Any) -> None:
+        ran = demandops("verify", "nope", "--state-repo", state.path)
+        assert (ran.code, ran.out) == (1, "")
+
+
+class TestCheck:
+    @pytest.fixture
+    def folder(self, demandops: Run, tmp_path: Path) -> Path:
+        folder = tmp_path / "checked-out"
+        assert demandops("init", folder).code == 0
+        return folder
+
+    def test_what_was_laid_down_is_sound(self, demandops: Run, folder: Path) -> None:
+        ran = demandops("check", folder)
+        assert (ran.code, ran.err) == (0, "")
+        assert ran.out == f"{folder}: all files are valid and everything renders\n"
+
+    def test_every_fault_is_told(self, demandops: Run, folder: Path) -> None:
+        nodes, images = folder / "inventory/nodes.yaml", folder / "registry/images.yaml"
+        nodes.write_text(nodes.read_text().replace("type: vehicle", "type: car", 1))
+        images.write_text(images.read_text().replace("tag: 2025-04", "tag: 2025", 1))
+        expected = [
+            (
+                "inventory/nodes.yaml",
+                "nodes[0].type",
+                "is 'car', but must be 'vehicle', 'station', 'edge' or 'cloud'",
+            ),
+            (
+                "registry/images.yaml",
+                "images.object-detection.tag",
+                "must be text, not 2025; put it in quotes",
+            ),
+        ]
+        ran = demandops("check", folder)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err.splitlines() == [f"error: {': '.join(fault)}" for fault in expected]
+        found = demandops("check", folder, "--output", "json")
+        assert found.code == 1
+        assert [tuple(fault.values()) for fault in found.json()["faults"]] == expected
+
+    def test_a_folder_that_is_no_state_repo(self, demandops: Run, tmp_path: Path) -> None:
+        ran = demandops("check", tmp_path)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            f"error: {tmp_path} is no state repo, for it has no demandops.yaml; `demandops init` "
+            "makes one\n"
+        )
+
+
+class TestStateRepo:
+    """Which state repo: named by option or environment, and refused with a remedy."""
+
+    COMMANDS = (
+        ["bookkeeping"],
+        ["log"],
+        ["diff", "main", "main"],
+        ["verify"],
+        ["request", "-"],
+        ["request", "-", "--dry-run"],
+    )
+
+    @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+    def test_it_may_be_named_by_the_environment(
+        self, demandops: Run, state: Any, monkeypatch: pytest.MonkeyPatch, command: list[str]
+    ) -> None:
+        monkeypatch.setenv("DEMANDOPS_STATE_REPO", str(state.path))
+        assert demandops(*command, stdin=text(perception())).code == 0
+
+    @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+    def test_without_one_the_usage_is_wrong(self, demandops: Run, command: list[str]) -> None:
+        ran = demandops(*command)
+        assert (ran.code, ran.out) == (2, "")
+        assert "--state-repo" in ran.err
+
+    @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+    def test_one_that_is_checked_out_is_refused_with_the_remedy(
+        self, demandops: Run, tmp_path: Path, command: list[str]
+    ) -> None:
+        folder = tmp_path / "checked-out"
+        demandops("init", folder)
+        ran = demandops(*command, "--state-repo", folder, stdin=text(perception()))
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            f"error: {folder} has 'main' checked out, and its files would fall behind the commits; "
+            f"use a bare clone: git clone --bare {folder} {folder}.git\n"
+        )
+
+    @pytest.mark.parametrize(
+        "url",
+        [
+            "https://somebody:hunter2@git.invalid/x.git",
+            "ssh://somebody:hunter2@git.invalid/x.git",
+            "http://:hunter2@git.invalid/x.git",
+            "https://somebody:hunter2@127.0.0.1:1/x.git?hunter2",
+        ],
+    )
+    @pytest.mark.parametrize("command", [["bookkeeping"], ["request", "-"]], ids=" ".join)
+    def test_a_password_in_its_address_is_refused_and_not_shown(
+        self, demandops: Run, data_home: Path, command: list[str], url: str
+    ) -> None:
+        ran = demandops("-v", *command, "--state-repo", url, stdin=text(perception()))
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err.startswith("error: the state repo's address holds a password, which ")
+        assert "hunter2" not in ran.err
+        for path in data_home.rglob("*"):
+            assert "hunter2" not in path.name
+            assert not path.is_file() or "hunter2" not in path.read_text()
+
+    @pytest.mark.parametrize("scheme", ["ftp://", "rsync://", "ext::", "helper::"])
+    def test_an_address_that_git_must_not_follow_is_refused(
+        self, demandops: Run, scheme: str
+    ) -> None:
+        """With two colons it names a program of git's that is run with the rest."""
+        ran = demandops("bookkeeping", "--state-repo", f"{scheme}sh")
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            f"error: '{scheme}' is no way to reach a state repo; use https, ssh, git or file\n"
+        )
+
+    def test_what_is_no_state_repo_is_told_with_the_remedy(
+        self, demandops: Run, tmp_path: Path
+    ) -> None:
+        folder, empty = tmp_path / "folder", tmp_path / "empty.git"
+        folder.mkdir()
+        pygit2.init_repository(str(empty), bare=True)
+        for place, message in (
+            (
+                tmp_path / "none",
+                f"{tmp_path}/none does not exist; make a state repo with `demandops init "
+                f"{tmp_path}/none --bare`",
+            ),
+            (
+                folder,
+                f"{folder} is no Git repository; make one with `demandops init {folder} --bare`",
+            ),
+            (
+                empty,
+                f"{empty} has no branch 'main'; make a state repo with `demandops init DIR --bare`",
+            ),
+        ):
+            ran = demandops("bookkeeping", "--state-repo", place)
+            assert (ran.code, ran.out, ran.err) == (1, "", f"error: {message}\n")
+
+    def test_a_repository_of_something_else_is_told(self, demandops: Run, tmp_path: Path) -> None:
+        folder = tmp_path / "other.git"
+        repo = pygit2.init_repository(str(folder), bare=True, initial_head="main")
+        who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
+        tree = repo.TreeBuilder().write()
+        repo.create_commit("refs/heads/main", who, who, "Empty\n", tree, [])
+        for command in (["bookkeeping"], ["request", "-"]):
+            ran = demandops(*command, "--state-repo", folder, stdin=text(perception()))
+            assert (ran.code, ran.out) == (1, "")
+            assert ran.err == (
+                "error: this is no state repo, for it has no demandops.yaml; `demandops init DIR` "
+                "makes one\n"
+            )
+
+    def test_a_newer_generators_state_repo_is_refused(self, demandops: Run, state: Any) -> None:
+        root = state.files()["demandops.yaml"].replace("renderVersion: 1", "renderVersion: 99")
+        state.commit({"demandops.yaml": root}, "Newer\n\nRender-Version: 99\n")
+        before = state.tip
+        ran = demandops("request", "-", "--state-repo", state.path, stdin=text(perception()))
+        assert (ran.code, state.tip) == (1, before)
+        assert "update the generator" in ran.err
+
+    def test_a_data_folder_that_cannot_be_made_is_the_users_to_mend(
+        self, demandops: Run, state: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "file").write_text("")
+        monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path / "file" / "home"))
+        ran = demandops("request", "-", "--state-repo", state.path, stdin=text(perception()))
+        assert (ran.code, ran.out) == (1, "")
+        assert str(tmp_path / "file") in ran.err
+
+    def test_a_url_is_cloned_and_pushed_to(self, demandops: Run, state: Any) -> None:
+        url = f"file://{state.path}"
+        ran = demandops(
+            "request", "-", "--state-repo", url, "--output", "json", stdin=text(perception())
+        )
+        assert ran.json()[0]["commit"] == state.tip
+        found = demandops("bookkeeping", "--state-repo", url, "--output", "json").json()
+        assert found["commit"] == state.tip
+        assert len(found["services"]) == 2
+
+
+class TestUsage:
+    @pytest.mark.parametrize(
+        "args",
+        [
+            ["nonsense"],
+            ["request"],
+            ["init"],
+            ["diff", "main"],
+            ["log", "-n", "0"],
+            ["log", "-n", "many"],
+            ["bookkeeping", "--output", "xml"],
+            ["--nonsense"],
+            ["verify", "a", "b"],
+        ],
+        ids=" ".join,
+    )
+    def test_wrong_usage_is_told(
+        self, demandops: Run, state: Any, monkeypatch: pytest.MonkeyPatch, args: list[str]
+    ) -> None:
+        monkeypatch.setenv("DEMANDOPS_STATE_REPO", str(state.path))
+        ran = demandops(*args)
+        assert (ran.code, ran.out) == (2, "")
+        assert ran.err.startswith("Usage: demandops ")
+
+    def test_the_version_and_the_help(self, demandops: Run) -> None:
+        assert demandops("--version").out == f"demandops, version {__version__}\n"
+        for args in ([], ["init"], ["request"], ["bookkeeping"], ["log"], ["diff"], ["check"]):
+            ran = demandops(*args, "--help")
+            assert ran.code == 0
+            assert ran.out.startswith("Usage: demandops")
+
+    def test_a_fault_of_the_program_has_a_code_of_its_own(
+        self, demandops: Run, state: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def broken(*args: object) -> None:
+            raise RuntimeError("boom")
+
+        monkeypatch.setattr(views, "derive", broken)
+        ran = demandops("bookkeeping", "--state-repo", state.path)
+        assert (ran.code, ran.out) == (3, "")
+        assert ran.err == (
+            "error: a fault of demandops itself: RuntimeError: boom\n"
+            "please report it with the output of the same command after `demandops -v`\n"
+        )
+
+    def test_the_process_ends_with_the_code(self, state: Any, data_home: Path) -> None:
+        command = [sys.executable, "-m", "generator.cli.main", "request", "-", "--output", "json"]
+        ran = subprocess.run(
+            [*command, "--state-repo", str(state.path)],
+            input=text(perception(id="1"), goal(id="2")),
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert ran.returncode == 1
+        assert [row["outcome"] for row in json.loads(ran.stdout)] == ["booked", "refused"]
+        assert ran.stderr == ""
+
+    def test_what_a_demand_renders_is_yaml_for_kubectl(self, joined: Any) -> None:
+        for path, content in joined.manifests().items():
+            for document in yaml.load_all(content, Loader=FAST):
+                assert {"apiVersion", "kind", "metadata"} <= document.keys(), path

@@ -1,0 +1,1 @@
+"""An independent model of the bookkeeping, to hold the program against."""

@@ -1,0 +1,344 @@
+"""Demand requests by chance, in the words of the reference's action.
+
+The same maker serves Hypothesis (whose ``randoms()`` is a ``Random`` that it can shrink) and plain
+seeds. Few subjects, few requesters and few topics, so that requests meet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from random import Random
+from typing import Any, TypeVar
+
+from model.books import Goal, Item, World
+
+T = TypeVar("T")
+
+STATION = "station00"
+VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
+PARTIES = (*VEHICLES, STATION)
+
+SKELETON = World(
+    nodes=frozenset({*PARTIES, "edge", "cloud"}),
+    brokers=frozenset({"edge", "cloud"}),
+)
+"""The inventory that ``demandops init`` lays down."""
+
+REQUESTS = ("station00/collective-perception-intersection", "again", "")
+
+APPLICATIONS = {
+    "edge/object_detection_fusion": "edge",
+    "edge/object-detection_fusion": "edge",
+    "cloud/fusion": "cloud",
+}
+"""Each application's own node: the first two share their detections, and nearly their name."""
+
+STATION_CLOUD = (STATION, "/stations/station00/pointcloud")
+VEHICLE_CLOUD = ("vehicle00", "/vehicles/vehicle00/drivers/lidar/pointcloud")
+CLOUDS = (
+    STATION_CLOUD,
+    VEHICLE_CLOUD,
+    ("vehicle00", "/vehicles/vehicle00/drivers/rear/pointcloud"),
+    ("vehicle01", "/shared/points"),
+    ("vehicle02", "/shared/points"),
+)
+"""Usual clouds, a second one of a vehicle, and one topic name that two vehicles publish."""
+
+CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
+    "vehicle00/edge": (
+        "vehicle00",
+        "edge",
+        "edge",
+        {
+            "/vehicles/vehicle00/ego_data": "/vehicles/vehicle00/ego_data",
+            VEHICLE_CLOUD[1]: VEHICLE_CLOUD[1],
+            "/vehicles/vehicle00/drivers/rear/pointcloud": "/rear",
+        },
+    ),
+    "station00/edge": (
+        STATION,
+        "edge",
+        "",
+        {"/stations/station00/drivers/lidar/pointcloud": STATION_CLOUD[1], "/status": "/status"},
+    ),
+    "station00_edge": (STATION, "cloud", "cloud", {"/status": "/stations/status"}),
+    "vehicle01/edge": (
+        "vehicle01",
+        "edge",
+        "",
+        {"/vehicles/vehicle01/ego_data": "/vehicles/vehicle01/ego_data"},
+    ),
+}
+"""Source, target, broker and topics of each connection."""
+
+
+def ego(vehicle: str) -> tuple[str, str]:
+    """Return a vehicle's usual ego data, as (source, topic)."""
+    return vehicle, f"/vehicles/{vehicle}/ego_data"
+
+
+def application(
+    id_: str,
+    who: Sequence[str],
+    ego_data: Sequence[tuple[str, str]] = (),
+    clouds: Sequence[tuple[str, str]] = (),
+    node: str | None = None,
+) -> Item:
+    """Return one application of a goal."""
+    return {
+        "header": {"id": id_, "node_id": APPLICATIONS[id_] if node is None else node},
+        "type": 1,
+        "object_detection_fusion_app": {
+            "requester_ids": list(who),
+            "ego_data_topics": [_topic(topic) for topic in ego_data],
+            "pointcloud_topics": [_topic(topic) for topic in clouds],
+        },
+    }
+
+
+def _topic(topic: tuple[str, str]) -> dict[str, str]:
+    return {"source_node_id": topic[0], "topic_name": topic[1]}
+
+
+def connection(id_: str, who: Sequence[str], topics: Sequence[str] | None = None) -> Item:
+    """Return one connection of a goal, with some of its topics or all."""
+    source, target, broker, known = CONNECTIONS[id_]
+    names = list(known if topics is None else topics)
+    return {
+        "id": id_,
+        "type": 1,
+        "broker_node_id": broker,
+        "requester_ids": list(who),
+        "source_node_id": source,
+        "target_node_id": target,
+        "source_topics": names,
+        "target_topics": [known[name] for name in names],
+    }
+
+
+def goal(
+    id_: str, apps: Sequence[Item] = (), connections: Sequence[Item] = (), *, shutdown: bool = False
+) -> Goal:
+    """Return a whole goal."""
+    return {
+        "id": id_,
+        "shutdown": shutdown,
+        "apps": list(apps),
+        "connections": list(connections),
+    }
+
+
+def shutdown_of(joined: Goal) -> Goal:
+    """Return the goal that takes back what another asked for: the same lists."""
+    return {**deepcopy(joined), "shutdown": True}
+
+
+class Maker:
+    """Makes requests by chance.
+
+    What a calm maker asks for never contradicts itself, so that all of it can stand at once.
+    """
+
+    def __init__(self, random: Random, *, calm: bool = False) -> None:
+        self._random = random
+        self.calm = calm
+        self.joined: list[Goal] = []
+
+    def sequence(self, length: int) -> list[Goal]:
+        """Return requests of every sort, in any order."""
+        return [self.any() for _ in range(length)]
+
+    def any(self) -> Goal:
+        """Return a request: joining, joining again, or leaving in one of many ways."""
+        if not self.joined or self._random.randrange(2) == 0:
+            return self.join()
+        if self._odds(6):
+            return self.again(self._pick(self.joined))
+        if self._odds(30):
+            return goal(self._pick(REQUESTS), shutdown=True)
+        return self.leave()
+
+    def join(self, request: str | None = None, who: Sequence[str] | None = None) -> Goal:
+        """Return a request for one to four subjects, mostly in the name of the same requesters."""
+        random = self._random
+        people = list(who) if who is not None else self._people()
+        apps = [self._application(people) for _ in range(random.randrange(3))]
+        connections = [
+            self._connection(people) for _ in range(random.randrange(0 if apps else 1, 3))
+        ]
+        made = goal(self._pick(REQUESTS) if request is None else request, apps, connections)
+        if not self.calm:
+            self._disturb(made)
+        self.joined.append(made)
+        return made
+
+    def again(self, joined: Goal) -> Goal:
+        """Return the same demand in other words: orders changed, names listed twice."""
+        made = deepcopy(joined)
+        for item in made["apps"]:
+            body = item["object_detection_fusion_app"]
+            for field in ("requester_ids", "ego_data_topics", "pointcloud_topics"):
+                body[field] = self._repeated(body[field])
+        for item in made["connections"]:
+            item["requester_ids"] = self._repeated(item["requester_ids"])
+            pairs = list(zip(item["source_topics"], item["target_topics"], strict=False))
+            if len(item["source_topics"]) == len(item["target_topics"]):
+                pairs = self._repeated(pairs)
+                item["source_topics"] = [source for source, _ in pairs]
+                item["target_topics"] = [target for _, target in pairs]
+        return made
+
+    def leave(self) -> Goal:
+        """Return a shutdown of something that was asked for, whole or in part, well or badly."""
+        place = self._random.randrange(len(self.joined))
+        made = shutdown_of(self.joined[place])
+        if not self._odds(3):  # else it may be sent again
+            del self.joined[place]
+        for kind in ("apps", "connections"):
+            if len(made["apps"]) + len(made["connections"]) > 1 and self._odds(3):
+                made[kind] = made[kind][:1]
+        if self._odds(4):
+            made["id"] = self._pick(REQUESTS)
+        if self._odds(5):
+            self._ask_others(made)
+        for app in made["apps"]:
+            self._leave_application(app)
+        for item in made["connections"]:
+            self._leave_connection(item)
+        if self.joined and self._odds(8):
+            more = self._pick(self.joined)
+            made["apps"] += deepcopy(more["apps"])
+            made["connections"] += deepcopy(more["connections"])
+        return made
+
+    # Parts
+
+    def _application(self, who: Sequence[str]) -> Item:
+        id_ = self._pick(sorted(APPLICATIONS))
+        vehicles = [name for name in who if name in VEHICLES]
+        topics = [ego(name) for name in vehicles if not self._odds(5)]
+        clouds = [cloud for cloud in CLOUDS if self._odds(3)]
+        return application(id_, who, topics, clouds if topics or clouds else [STATION_CLOUD])
+
+    def _connection(self, who: Sequence[str]) -> Item:
+        id_ = self._pick(sorted(CONNECTIONS))
+        names = list(CONNECTIONS[id_][3])
+        some = [name for name in names if self._odds(2)] or names[:1]
+        return connection(id_, who, some)
+
+    def _people(self) -> list[str]:
+        first = self._pick(PARTIES)
+        if self._odds(4):
+            return [first]
+        if self._odds(4):
+            return self._random.sample(PARTIES, 3)
+        return [first, STATION if first != STATION else self._pick(VEHICLES)]
+
+    def _disturb(self, made: Goal) -> None:
+        """Make something contradict others, or make no sense, now and then."""
+        for app in made["apps"]:
+            self._disturb_application(app)
+        for item in made["connections"]:
+            self._disturb_connection(item)
+        if self._odds(20):
+            made["apps"] += deepcopy(made["apps"])
+        if self._odds(20):
+            made["connections"] += deepcopy(made["connections"])
+        if self._odds(60):
+            made["apps"], made["connections"] = [], []
+
+    def _disturb_application(self, app: Item) -> None:
+        body = app["object_detection_fusion_app"]
+        if self._odds(16):
+            app["header"]["node_id"] = self._pick(["cloud", "edge", "nowhere"])
+        if self._odds(20):
+            body["requester_ids"] = self._people() if self._odds(2) else []
+        if self._odds(40):
+            app["type"] = 2
+        if self._odds(40):
+            body["ego_data_topics"], body["pointcloud_topics"] = [], []
+        for topic in (*body["ego_data_topics"], *body["pointcloud_topics"]):
+            if self._odds(15):
+                topic["topic_name"] = topic["topic_name"].lstrip("/")
+            if self._odds(60):
+                topic["source_node_id"] = self._pick(["vehicle03", "nowhere"])
+
+    def _disturb_connection(self, item: Item) -> None:
+        self._disturb_ends(item)
+        if self._odds(20):
+            item["target_topics"][0] = "/elsewhere"
+        if self._odds(24):
+            item["requester_ids"] = self._people() if self._odds(2) else []
+        if self._odds(40):
+            item["target_topics"] = item["target_topics"][1:]
+        if self._odds(40):
+            item["source_topics"], item["target_topics"] = [], []
+
+    def _disturb_ends(self, item: Item) -> None:
+        if self._odds(12):
+            item["broker_node_id"] = self._pick(["", "cloud", "edge", "vehicle00"])
+        if self._odds(24):
+            item["target_node_id"] = self._pick(["cloud", "edge", "vehicle03", "nowhere"])
+        if self._odds(24):
+            item["source_node_id"] = self._pick(["vehicle02", "neverland"])
+        if self._odds(40):
+            item["type"] = self._pick([0, 2, 7])
+
+    def _ask_others(self, made: Goal) -> None:
+        """Ask in the name of fewer or other requesters."""
+        people = self._people()
+        for item in [app["object_detection_fusion_app"] for app in made["apps"]]:
+            item["requester_ids"] = item["requester_ids"][:1] if self._odds(2) else people
+        for item in made["connections"]:
+            item["requester_ids"] = item["requester_ids"][:1] if self._odds(2) else people
+
+    def _leave_application(self, app: Item) -> None:
+        body = app["object_detection_fusion_app"]
+        for field in ("ego_data_topics", "pointcloud_topics"):
+            if self._odds(4):
+                body[field] = body[field][:1]
+            elif self._odds(4):
+                body[field] = []
+        if self._odds(8):
+            body["pointcloud_topics"] = [*body["pointcloud_topics"], _topic(self._pick(CLOUDS))]
+        if self._odds(10):
+            app["header"]["node_id"] = self._pick(["", "cloud", "edge", "nowhere"])
+        if self._odds(20):
+            app["type"] = self._pick([0, 2])
+
+    def _leave_connection(self, item: Item) -> None:
+        if self._odds(4):
+            keep = self._random.randrange(2)
+            item["source_topics"] = item["source_topics"][:keep]
+            item["target_topics"] = item["target_topics"][:keep]
+        if self._odds(10):
+            item["target_node_id"] = self._pick(["", "cloud", "vehicle03", "nowhere"])
+        if self._odds(10):
+            item["source_node_id"] = self._pick(["", "vehicle02", "neverland"])
+        if self._odds(10):
+            item["broker_node_id"] = self._pick(["", "cloud", "nowhere"])
+        if self._odds(10):
+            item["type"] = self._pick([0, 2, 7])
+        if self._odds(10) and item["target_topics"]:
+            item["target_topics"][0] = "/elsewhere"
+        if self._odds(10):
+            item["source_topics"] = [*item["source_topics"], "/never/asked"]
+            item["target_topics"] = [*item["target_topics"], "/never/asked"]
+
+    # Chance
+
+    def _repeated(self, items: list[T]) -> list[T]:
+        shuffled = self._random.sample(items, len(items))
+        return [*shuffled, *shuffled[:1]]
+
+    def _pick(self, items: Sequence[T]) -> T:
+        return items[self._random.randrange(len(items))]
+
+    def _odds(self, against: int) -> bool:
+        return self._random.randrange(against) == against - 1
+
+
+def summary(made: Goal) -> dict[str, Any]:
+    """Return a goal as short as a reader of a failed test wants it."""
+    return {key: value for key, value in made.items() if value not in ([], False)}

@@ -1,0 +1,69 @@
+"""The model itself, against the table of the paper's experiment (design §9)."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from model.books import Books
+from model.goals import SKELETON
+
+EXPERIMENT = Path(__file__).resolve().parents[2] / "examples" / "experiment"
+STATION_CLOUD = "station00 /stations/station00/pointcloud"
+VEHICLE_CLOUD = "vehicle00 /vehicles/vehicle00/drivers/lidar/pointcloud"
+
+STEPS = (
+    ("1-vehicle00-joins", "S 0", "S 0", ""),
+    ("2-vehicle01-joins", "S 0 1", "S 0", "1"),
+    ("3-vehicle03-joins", "S 0 1 3", "S 0", "1 3"),
+    ("4-vehicle02-joins", "S 0 1 2 3", "S 0", "1 2 3"),
+    ("5-vehicle00-leaves", "S 1 2 3", "", "1 2 3"),
+    ("6-vehicle01-leaves", "S 2 3", "", "2 3"),
+    ("7-vehicle02-leaves", "S 3", "", "3"),
+    ("8-vehicle03-leaves", "", "", ""),
+)
+"""File; who requests what the station feeds, what vehicle 0 feeds; which others are connected."""
+
+
+def people(text: str) -> list[str]:
+    return ["station00" if one == "S" else f"vehicle0{one}" for one in text.split()]
+
+
+def requesters(entry: dict[str, Any] | None) -> list[str]:
+    return entry["requesters"] if entry else []
+
+
+def test_the_model_gives_the_papers_table() -> None:
+    books = Books(SKELETON)
+    for name, by_station, by_vehicle, others in STEPS:
+        result = books.take(yaml.safe_load((EXPERIMENT / f"{name}.yaml").read_text()))
+        assert result.outcome == ("booked" if "joins" in name else "released")
+        services, connections = books.services(), books.connection_view()
+
+        station = services.get(("object-detection", "edge", STATION_CLOUD))
+        vehicle = services.get(("object-detection", "edge", VEHICLE_CLOUD))
+        fusion = services.get(("object-fusion", "edge", "edge/object_detection_fusion"))
+        assert requesters(station) == requesters(fusion) == people(by_station)
+        assert requesters(connections.get("station00/edge")) == people(by_station)
+        assert requesters(vehicle) == requesters(connections.get("vehicle00/edge"))
+        assert requesters(vehicle) == people(by_vehicle)
+        for one in "123":
+            expected = people(f"S {one}") if one in others else []
+            assert requesters(connections.get(f"vehicle0{one}/edge")) == expected
+        if fusion:
+            present = ["0"] * bool(by_vehicle) + others.split()
+            inputs = fusion["inputs"]
+            assert inputs["ego_data"] == [f"/vehicles/vehicle0{one}/ego_data" for one in present]
+            clouds = [STATION_CLOUD] + [VEHICLE_CLOUD] * bool(by_vehicle)
+            assert inputs["object_list"] == clouds
+    assert not books.demands()
+
+
+def test_the_model_refuses_what_nobody_holds() -> None:
+    request = yaml.safe_load((EXPERIMENT / "5-vehicle00-leaves.yaml").read_text())
+    assert Books(SKELETON).take(request).outcome == "refused"

@@ -1,0 +1,243 @@
+"""What an appdef's values template can get wrong: the message names the template and the line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from asking import Books, configuration, perception, skeleton
+
+from generator.catalog.catalog import load
+from generator.decision import State, rehearse
+from generator.errors import InvalidInput
+from generator.ledger.ledger import Ledger
+
+TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
+CHART = "appdefs/object-detection-fusion/charts/object-detection"
+TOPIC = "/vehicles/vehicle00/drivers/lidar/pointcloud"
+LAST = skeleton()[TEMPLATE].count("\n") + 1
+"""The line that a text appended to the template stands on."""
+
+
+def faults(template: str) -> list[str]:
+    """Return the faults that a demand gets which needs the template."""
+    books = Books({TEMPLATE: template})
+    before = dict(books.files)
+    with pytest.raises(InvalidInput) as invalid:
+        books.send(perception())
+    assert books.files == before
+    return [str(found) for found in invalid.value.faults]
+
+
+def appended(text: str) -> list[str]:
+    """Return the faults of the template with a line appended."""
+    return faults(skeleton()[TEMPLATE] + text)
+
+
+APPENDED: dict[str, tuple[str, str]] = {
+    "a statement without end": (
+        "{% if %}\n",
+        "Expected an expression, got 'end of statement block'",
+    ),
+    "an expression without end": (
+        "x: {{ release \n",
+        "unexpected end of template, expected 'end of print statement'.",
+    ),
+    "a block that is never closed": (
+        "{% if true %}\n",
+        "Unexpected end of template. Jinja was looking for the following tags: 'elif' or 'else' or "
+        "'endif'. The innermost block that needs to be closed is 'if'.",
+    ),
+    "a tag that does not exist": (
+        "{% fro x in y %}\n",
+        "Encountered unknown tag 'fro'.",
+    ),
+    "a filter that does not exist": ("x: {{ release | nope }}\n", "No filter named 'nope'."),
+    "a name that does not exist": ("x: {{ nope }}\n", "'nope' is undefined"),
+    "a name below one that does not exist": ("x: {{ nope.x }}\n", "'nope' is undefined"),
+    "a field that does not exist": (
+        "x: {{ node.nope }}\n",
+        "'dict object' has no attribute 'nope'",
+    ),
+    "a name that does not exist, in a condition": (
+        "{% if nope %}{% endif %}\n",
+        "'nope' is undefined",
+    ),
+    "a name that does not exist, in a loop": (
+        "{% for x in nope %}{% endfor %}\n",
+        "'nope' is undefined",
+    ),
+    "a way to Python's classes": (
+        "x: {{ ''.__class__.__mro__ }}\n",
+        "access to attribute '__class__' of 'str' object is unsafe.",
+    ),
+    "a way to Python's classes by filter": (
+        "x: {{ '' | attr('__class__') }}\n",
+        "access to attribute '__class__' of 'str' object is unsafe.",
+    ),
+    "a way to Python's classes by subscript": (
+        "x: {{ ''['__class__'] }}\n",
+        "access to attribute '__class__' of 'str' object is unsafe.",
+    ),
+    "a way to Python's classes by format": (
+        "x: {{ '{0.__class__}'.format(1) }}\n",
+        "access to attribute '__class__' of 'int' object is unsafe.",
+    ),
+    "a way to Python's classes by format_map": (
+        "x: {{ '{a.__class__}'.format_map({'a': 1}) }}\n",
+        "access to attribute '__class__' of 'int' object is unsafe.",
+    ),
+    "a way to a shell by a global": (
+        "x: {{ cycler.__init__.__globals__.os.popen('id').read() }}\n",
+        "access to attribute '__init__' of 'type' object is unsafe.",
+    ),
+    "a way to a shell by an undefined name": (
+        "x: {{ nope.__init__.__globals__ }}\n",
+        "access to attribute '__init__' of 'StrictUndefined' object is unsafe.",
+    ),
+    "a change of what it is given": (
+        "{% set x = node.update({'id': 'other'}) %}\n",
+        "access to attribute 'update' of 'dict' object is unsafe.",
+    ),
+    "a loop without end": (
+        "{% for i in range(1000000000) %}{% endfor %}\n",
+        "Range too big. The sandbox blocks ranges larger than MAX_RANGE (100000).",
+    ),
+    "a division by nothing": ("x: {{ 1 / 0 }}\n", "division by zero"),
+    "a value that YAML has no word for": (
+        "x: {{ inputs.point_cloud | map(attribute='topic') }}\n",
+        "a template may write text, numbers, lists and mappings, not <class 'generator'>",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", APPENDED)
+def test_a_mistake_is_told_with_template_and_line(name: str) -> None:
+    text, message = APPENDED[name]
+    assert appended(text) == [f"{TEMPLATE}: line {LAST}: {message}; mend the template"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{% macro a() %}{{ a() }}{% endmacro %}{{ a() }}\n",
+        "{% include '" + TEMPLATE + "' %}\n",
+        "{% extends '" + TEMPLATE + "' %}\n",
+        "{% import '" + TEMPLATE + "' as x %}\n",
+        "x: {{ 'a' * 10 ** 10 }}\n",
+        "x: {{ 10 ** 10 ** 3 }}\n",
+        "x: {{ [1] * 10 ** 10 }}\n",
+        "x: {{ self }}\n",
+        "x: {{ cycler }}\n",
+        "x: {{ release | int('x') / 0 }}\n",
+        "x: {{ joiner() }}\n",
+        "{{ caller() }}\n",
+        "{% set x = [1][5] %}{{ x }}\n",
+    ],
+    ids=lambda text: repr(text[:30]),
+)
+def test_whatever_a_template_does_it_is_told_as_the_templates_fault(text: str) -> None:
+    (found, *_) = appended(text)
+    assert found.startswith(f"{TEMPLATE}: ")
+
+
+def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
+    for name in ("other.yaml.j2", "../../../../etc/passwd", "/etc/passwd", "demandops.yaml"):
+        (found,) = appended("{% include '" + name + "' %}\n")
+        assert found.startswith(f"{TEMPLATE}: line {LAST}: ")
+        assert "root:" not in found
+        assert not found.startswith(f"{TEMPLATE}: line {LAST}: {name}; "), "says not what is wrong"
+
+
+class TestValues:
+    """What a template gives is parsed and held against the chart's schema."""
+
+    def test_a_value_that_the_chart_does_not_have(self) -> None:
+        assert appended("extra: 5\n") == [
+            f"{TEMPLATE}: values: Additional properties are not allowed ('extra' was unexpected); "
+            f"mend the template or {CHART}"
+        ]
+
+    def test_every_value_that_does_not_fit(self) -> None:
+        text = skeleton()[TEMPLATE].replace("replicas: {{ replicas }}", "replicas: many")
+        text = text.replace("hostNetwork: {{ node.host_network }}", "hostNetwork: maybe")
+        mend = f"mend the template or {CHART}"
+        assert sorted(faults(text)) == [
+            f'{TEMPLATE}: values.hostNetwork: "maybe" is not of type "boolean"; {mend}',
+            f'{TEMPLATE}: values.replicas: "many" is not of type "integer"; {mend}',
+        ]
+
+    def test_a_value_that_is_missing(self) -> None:
+        text = skeleton()[TEMPLATE].replace("{{ source_topic }}", "null")
+        assert faults(text) == [
+            f'{TEMPLATE}: values.detection: "pointCloudTopic" is a required property; mend the '
+            f"template or {CHART}"
+        ]
+
+    def test_text_glued_to_a_value_does_not_become_another_value(self) -> None:
+        """Everything is written as JSON, so the quotes show, and the schema finds them."""
+        text = skeleton()[TEMPLATE].replace("{{ source_topic }}", "/prefix{{ source_topic }}")
+        (found,) = faults(text)
+        assert found.startswith(
+            rf'{TEMPLATE}: values.detection.pointCloudTopic: "/prefix\"{TOPIC}\"'
+        )
+
+    def test_a_value_in_quotes_is_no_yaml(self) -> None:
+        text = skeleton()[TEMPLATE].replace("{{ source_topic }}", '"{{ source_topic }}"')
+        (found,) = faults(text)
+        assert found.startswith(f"{TEMPLATE}: line ")
+        assert found.endswith(
+            " of what is rendered: not valid YAML: did not find expected key; mend the template"
+        )
+
+    def test_a_key_twice(self) -> None:
+        (found,) = appended("hostNetwork: true\n")
+        assert "not valid YAML: the key 'hostNetwork' stands twice" in found
+
+    @pytest.mark.parametrize("text", ["", "- a\n", "true\n", "{# nothing #}", "~\n"])
+    def test_no_mapping(self, text: str) -> None:
+        assert faults(text) == [f"{TEMPLATE}: must give a mapping of Helm values"]
+
+    @pytest.mark.parametrize("key", ["5", "~", "true", "1.5"])
+    def test_a_key_that_is_no_text(self, key: str) -> None:
+        (found, *_) = appended(f"podLabels: {{{key}: x}}\n")
+        assert found.startswith(f"{TEMPLATE}: ")
+
+    def test_two_documents(self) -> None:
+        (found,) = appended("---\na: b\n")
+        assert found.startswith(f"{TEMPLATE}: ")
+
+    @pytest.mark.parametrize("end", ["\\n", "\\n\\n", "\\n\\n\\n", "", " \\n"])
+    def test_a_text_of_several_lines_stays_as_it_is(self, end: str) -> None:
+        books = Books({TEMPLATE: skeleton()[TEMPLATE] + f'podAnnotations: {{a: "x\\ny{end}"}}\n'})
+        books.send(perception())
+        release = books.objects("HelmRelease")["od-edge-vehicle00"]
+        text = f"x\\ny{end}".replace("\\n", "\n")
+        assert release["spec"]["values"]["podAnnotations"] == {"a": text}
+
+
+class TestBeforeTheFirstDemand:
+    """``demandops check`` renders every service once, for nobody."""
+
+    def rehearsal(self, changed: dict[str, str | None]) -> list[str]:
+        with pytest.raises(InvalidInput) as invalid:
+            rehearse(State.of(load(configuration(changed)), Ledger()))
+        return [str(found) for found in invalid.value.faults]
+
+    def test_a_template_that_nobody_has_demanded_is_checked(self) -> None:
+        text = skeleton()[TEMPLATE] + "x: {{ nope }}\n"
+        assert self.rehearsal({TEMPLATE: text}) == [
+            f"{TEMPLATE}: line {LAST}: 'nope' is undefined; mend the template"
+        ]
+
+    def test_all_templates_are_checked_together(self) -> None:
+        other = TEMPLATE.replace("detection.yaml", "fusion.yaml")
+        change = {path: skeleton()[path] + "x: {{ nope }}\n" for path in (TEMPLATE, other)}
+        assert [found.split(": ")[0] for found in self.rehearsal(dict(change))] == [TEMPLATE, other]
+
+    def test_what_is_laid_down_passes(self) -> None:
+        rehearse(State.of(load(configuration()), Ledger()))
+
+
+def test_no_sandbox_escape_left_a_trace() -> None:
+    assert not Path("/tmp/demandops-pwned").exists()

@@ -1,0 +1,152 @@
+"""Whatever comes as a goal: it is decided, or refused with faults, and nothing else happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from unicodedata import category
+
+import yaml
+from asking import APP, CLOUD, FAST, NOW, Books, application, connection, goal
+from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import strategies as st
+
+from generator.decision import Decision, decide
+from generator.demand import wire
+from generator.errors import Fault, InvalidInput, Refused
+from generator.staterepo import message
+
+FEW = settings(
+    max_examples=100,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    phases=(Phase.explicit, Phase.generate, Phase.shrink),
+    suppress_health_check=[HealthCheck.too_slow],
+)
+
+TEXT = st.text(max_size=12) | st.sampled_from(
+    ["", "edge", "vehicle00", APP, CLOUD[0], "/a", "..", "~", "\\", "\ud800", "a" * 1100, "{{ x }}"]
+)
+SCALAR: st.SearchStrategy[Any] = (
+    st.none() | st.booleans() | st.integers() | st.floats() | TEXT | st.binary(max_size=3)
+)
+UNSEEN = {"Cc", "Cs", "Zl", "Zp"}
+"""What moves a terminal's cursor, or breaks a line for some programs only."""
+
+KEY = st.sampled_from(
+    [*wire.WireGoal.model_fields, *wire.WireApplication.model_fields, *wire.WireBody.model_fields,
+     *wire.WireConnection.model_fields, *wire.WireHeader.model_fields, *wire.WireTopic.model_fields]
+) | TEXT  # fmt: skip
+
+
+def _nested(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    return st.lists(inner, max_size=4) | st.dictionaries(KEY | SCALAR, inner, max_size=5)
+
+
+ANYTHING = st.recursive(SCALAR, _nested, max_leaves=25)
+
+
+def outcome(goal: object) -> Decision | tuple[Fault, ...]:
+    books = Books()
+    before = repr(goal)
+    try:
+        return decide(books.state, goal, NOW, books.files.get)
+    except Refused as refused:
+        return refused.faults
+    finally:
+        assert repr(goal) == before, "the goal itself was changed"
+
+
+def assert_told(faults: tuple[Fault, ...]) -> None:
+    assert faults, "a refusal gives a reason"
+    assert len(set(faults)) == len(faults), "a reason is given once"
+    for found in faults:
+        assert found.message
+        assert found.code
+        assert not UNSEEN & set(map(category, str(found))), repr(found)
+        assert not found.field.startswith("applications"), "the wire says apps"
+
+
+@FEW
+@given(ANYTHING)
+def test_whatever_comes_is_refused_with_a_reason(data: Any) -> None:
+    found = outcome(data)
+    assert isinstance(found, tuple), "what is made up here demands nothing"
+    assert_told(found)
+
+
+@FEW
+@given(ANYTHING)
+def test_the_form_is_judged_alike_with_and_without_a_catalog(data: Any) -> None:
+    request, faults = wire.parse(data, lambda number: None)
+    assert set(wire.form_faults(data)) <= set(faults)
+    assert request is not None or faults
+
+
+def goals(text: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    """Return goals of the right form, whose texts are made up."""
+    topics = st.lists(st.tuples(text, text), max_size=2)
+    apps = st.lists(
+        st.builds(
+            application,
+            text,
+            node=text,
+            who=st.lists(text, max_size=2),
+            ego=topics,
+            clouds=topics,
+            type=st.integers(0, 2),
+        ),
+        max_size=2,
+    )
+    connections = st.lists(
+        st.builds(
+            connection,
+            text,
+            who=st.lists(text, max_size=2),
+            ends=st.tuples(text, text),
+            topics=st.lists(text, max_size=2),
+            targets=st.lists(text, max_size=2),
+            broker=text,
+            type=st.integers(0, 3),
+        ),
+        max_size=2,
+    )
+    make: Callable[..., Any] = goal
+    return st.builds(make, apps, connections, id=text, shutdown=st.booleans())
+
+
+@FEW
+@given(goals(TEXT))
+def test_a_goal_of_the_right_form_is_decided_or_refused(data: Any) -> None:
+    found = outcome(data)
+    if isinstance(found, tuple):
+        assert_told(found)
+
+
+ID = st.text(min_size=1, max_size=30)
+
+
+@FEW
+@given(ID, ID, ID)
+@example("\\", "\\", "\\")
+@example(".", "<>", " ")
+@example("Operation: x", "Request-Id: y", "#")
+@example("\u00a0", "\u200b", "\ufeff")
+def test_any_id_is_refused_or_booked_rendered_committed_and_released(
+    id: str, who: str, request: str
+) -> None:
+    asked = goal([application(id, who=[who])], [connection(id, who=[who])], id=request)
+    books = Books()
+    try:
+        decision = books.send(asked)
+    except InvalidInput as refused:
+        assert isinstance(refused, Refused)
+        assert_told(refused.faults)
+        return
+    for text in books.rendered().values():
+        assert all(isinstance(item, dict) for item in yaml.load_all(text, Loader=FAST))
+    assert message.author(decision, NOW).name
+    assert f"\nRequester: {who}\n" in message.of_decision(decision, "operation", NOW)
+    books.send(asked | {"shutdown": True})
+    assert books.rendered() == {}

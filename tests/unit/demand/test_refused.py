@@ -1,0 +1,463 @@
+"""What a demand must not say, and the message that it gets: each names the wire's own field."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from asking import (
+    APP,
+    BODY,
+    CLOUD,
+    EGO,
+    ROS_NAMES,
+    Books,
+    Goal,
+    application,
+    brokers,
+    connection,
+    goal,
+    perception,
+)
+
+NODES = "cloud, edge, station00, vehicle00, vehicle01, vehicle02, vehicle03"
+TYPES = "known: 0 (ROS), 1 (MQTT), 2 (ZENOH)"
+C0 = "connections[0]"
+
+
+REFUSED: dict[str, tuple[Goal, list[str]]] = {
+    "an application type that no definition has": (
+        goal([application(type=9)]),
+        ["apps[0].type: 9 names no application definition; known: 1 (object-detection-fusion)"],
+    ),
+    "an application without a type": (
+        goal([{key: value for key, value in application().items() if key != "type"}]),
+        ["apps[0].type: 0 names no application definition; known: 1 (object-detection-fusion)"],
+    ),
+    "a connection type that does not exist": (
+        goal([], [connection(type=3)]),
+        [f"{C0}.type: 3 is no connection type; {TYPES}"],
+    ),
+    "a ROS connection, which this version cannot carry": (
+        goal([], [connection(type=0)]),
+        [f"{C0}.type: 0 (ROS) is not carried by this version; use 1 (MQTT)"],
+    ),
+    "a Zenoh connection, which this version cannot carry": (
+        goal([], [connection(type=2)]),
+        [f"{C0}.type: 2 (ZENOH) is not carried by this version; use 1 (MQTT)"],
+    ),
+    "a misspelt node": (
+        goal([application(node="egde")]),
+        ["apps[0].header.node_id: 'egde' is not in inventory/nodes.yaml; did you mean 'edge'?"],
+    ),
+    "a node unlike any other": (
+        goal([], [connection(ends=("vehicle00", "Mars"))]),
+        [f"{C0}.target_node_id: 'Mars' is not in inventory/nodes.yaml; known: {NODES}"],
+    ),
+    "an unknown source of a connection": (
+        goal([], [connection(ends=("vehicle9", "edge"))]),
+        [
+            f"{C0}.source_node_id: 'vehicle9' is not in inventory/nodes.yaml; did you mean "
+            "'vehicle03'?"
+        ],
+    ),
+    "an unknown source of a topic": (
+        goal([application(clouds=[CLOUD, ("/points", "Mars")])]),
+        [
+            f"{BODY}.pointcloud_topics[1].source_node_id: 'Mars' is not in inventory/nodes.yaml; "
+            f"known: {NODES}"
+        ],
+    ),
+    "a broker on a node that has none": (
+        goal([], [connection(broker="vehicle00")]),
+        [f"{C0}.broker_node_id: no broker runs on 'vehicle00'; name one of: cloud, edge"],
+    ),
+    "an open broker, with several and none at either end": (
+        goal([], [connection(broker="", ends=("vehicle00", "vehicle01"))]),
+        [
+            f"{C0}.broker_node_id: is open, and no broker runs on 'vehicle01' or 'vehicle00'; "
+            "name one of: cloud, edge"
+        ],
+    ),
+    "nobody for whom it is asked": (
+        goal([application(who=[])], [connection(who=[])]),
+        [
+            f"{BODY}.requester_ids: is empty; say for whom this is asked",
+            f"{C0}.requester_ids: is empty; say for whom this is asked",
+        ],
+    ),
+    "a requester without a name": (
+        goal([application(who=["vehicle00", ""])]),
+        [f"{BODY}.requester_ids[1]: is empty; give an id"],
+    ),
+    "a join with a connection without topics": (
+        goal([], [connection(topics=[])]),
+        [f"{C0}.source_topics: is empty; a connection carries at least one topic, list it"],
+    ),
+    "fewer target topics than source topics": (
+        goal([], [connection(topics=["/a", "/b"], targets=["/c"])]),
+        [
+            f"{C0}.target_topics: has 1 names for 2 in source_topics; source topic i goes to "
+            "target topic i, so list as many of each"
+        ],
+    ),
+    "more target topics than source topics": (
+        goal([], [connection(topics=["/a"], targets=["/b", "/c"])]),
+        [
+            f"{C0}.target_topics: has 2 names for 1 in source_topics; source topic i goes to "
+            "target topic i, so list as many of each"
+        ],
+    ),
+    "one source topic with two targets": (
+        goal([], [connection(topics=["/a", "/a"], targets=["/b", "/c"])]),
+        [
+            f"{C0}.target_topics[1]: '/a' goes to '/b' and to '/c'; one source topic has one "
+            "target, use a second connection"
+        ],
+    ),
+    "a topic that would feed itself": (
+        goal([], [connection(ends=("edge", "edge"), topics=["/a"])]),
+        [
+            f"{C0}.target_topics[0]: '/a' would feed itself, for source and target are both "
+            "'edge'; name another target node or topic"
+        ],
+    ),
+    "ids that climb out of a folder": (
+        goal([application("../../clusters")], [connection("a/../b")], id=".."),
+        [
+            "id: '..' holds '..'; choose an id without it",
+            "apps[0].header.id: '../../clusters' holds '..'; choose an id without it",
+            f"{C0}.id: 'a/../b' holds '..'; choose an id without it",
+        ],
+    ),
+    "control characters in ids": (
+        goal(
+            [application("line\nbreak", who=["nul\0"])],
+            [connection("bell\a", who=["escape\x1b[31m"])],
+            id="tab\tin",
+        ),
+        [
+            r"id: 'tab\tin' holds the control character U+0009; choose an id without it",
+            r"apps[0].header.id: 'line\nbreak' holds the control character U+000A; choose an id "
+            "without it",
+            rf"{BODY}.requester_ids[0]: 'nul\x00' holds the control character U+0000; choose an "
+            "id without it",
+            rf"{C0}.id: 'bell\x07' holds the control character U+0007; choose an id without it",
+            rf"{C0}.requester_ids[0]: 'escape\x1b[31m' holds the control character U+001B; choose "
+            "an id without it",
+        ],
+    ),
+    "ids with white space around them": (
+        goal([application(" a", who=["b\u3000"])], [connection(" ")], id="c\n"),
+        [
+            r"id: 'c\n' starts or ends with white space; take it away",
+            "apps[0].header.id: ' a' starts or ends with white space; take it away",
+            rf"{BODY}.requester_ids[0]: 'b\u3000' starts or ends with white space; take it away",
+            f"{C0}.id: ' ' starts or ends with white space; take it away",
+        ],
+    ),
+    "line separators that only some programs see": (
+        goal([application("a\u0085b", who=["a\u2028b", "a\u2029b"])]),
+        [
+            r"apps[0].header.id: 'a\x85b' holds the control character U+0085; choose an id "
+            "without it",
+            rf"{BODY}.requester_ids[0]: 'a\u2028b' holds the control character U+2028; choose an "
+            "id without it",
+            rf"{BODY}.requester_ids[1]: 'a\u2029b' holds the control character U+2029; choose an "
+            "id without it",
+        ],
+    ),
+    "text that shows in another order than it is": (
+        goal([application("vehicle\u202e00")]),
+        [
+            r"apps[0].header.id: 'vehicle\u202e00' holds the control character U+202E; choose an "
+            "id without it"
+        ],
+    ),
+    "half of a character": (
+        goal([application("vehicle\ud800")]),
+        [
+            r"apps[0].header.id: 'vehicle\ud800' holds the control character U+D800; choose an id "
+            "without it"
+        ],
+    ),
+    "ids longer than any name": (
+        goal([application("x" * 1025)], [connection("y" * 1025)]),
+        [
+            "apps[0].header.id: has 1025 characters; at most 1024 are taken",
+            f"{C0}.id: has 1025 characters; at most 1024 are taken",
+        ],
+    ),
+    "ids that are missing": (
+        goal([application("", node="")], [connection("", ends=("", ""))]),
+        [
+            "apps[0].header.id: is empty; give an id",
+            "apps[0].header.node_id: is empty; give an id",
+            f"{C0}.id: is empty; give an id",
+            f"{C0}.source_node_id: is empty; give an id",
+            f"{C0}.target_node_id: is empty; give an id",
+        ],
+    ),
+    "a private topic": (
+        goal([application(clouds=[("~/points", "vehicle00")])]),
+        [
+            f"{BODY}.pointcloud_topics[0].topic_name: '~/points' is private to a node; give the "
+            "full name, starting with '/'"
+        ],
+    ),
+    "a topic longer than ROS takes": (
+        goal([], [connection(topics=["/" + "a" * 247], targets=["/a"])]),
+        [f"{C0}.source_topics[0]: has 248 characters; ROS 2 takes at most 247"],
+    ),
+    "a topic without a name": (
+        goal([application(clouds=[("", "vehicle00")])]),
+        [f"{BODY}.pointcloud_topics[0].topic_name: is empty; give a topic name"],
+    ),
+    "a shutdown of which nothing is held": (
+        goal([application()], [connection()], shutdown=True),
+        ["apps[0].header.id: nothing that the shutdown lists is held; claims that come near: none"],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_demand_is_refused_with_the_field_and_the_remedy(name: str) -> None:
+    asked, expected = REFUSED[name]
+    books = Books()
+    assert books.faults(asked) == expected
+    assert books.send(perception()).outcome == "booked", "the next demand works"
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "/a b", "/a\tb", "/a\nb", "/a'b", '/a"b', "/a$(touch /tmp/x)b", "/a`id`", "/{{ 7 * 7 }}",
+        "/{% raw %}", "/a;b", "/a&b", "/a|b", "/a//b", "/a/", "/", "/1a", "/a/1b", "/a-b", "/a.b",
+        "/a+b", "/#", "/ü", "/a\0", "/a\u200bb", "/é", "/a\\b", "/{node}", "/*",
+    ],
+)  # fmt: skip
+def test_a_topic_name_that_ros_forbids_is_refused_wherever_it_stands(topic: str) -> None:
+    shown = topic if topic.isprintable() else topic.encode("unicode_escape").decode()
+    asked = goal(
+        [application(ego=[(topic, "vehicle00")], clouds=[(topic, "vehicle00")])],
+        [connection(topics=[topic], targets=["/fine"]), connection("2", targets=[topic])],
+    )
+    assert Books().faults(asked) == [
+        f"{field}: '{shown}' {ROS_NAMES}"
+        for field in (
+            f"{BODY}.ego_data_topics[0].topic_name",
+            f"{BODY}.pointcloud_topics[0].topic_name",
+            "connections[0].source_topics[0]",
+            "connections[1].target_topics[0]",
+        )
+    ]
+
+
+def test_an_application_without_inputs_is_refused_in_the_words_of_the_wire() -> None:
+    (found,) = Books().faults(goal([application(clouds=[])]))
+    field, _, message = found.partition(": ")
+    assert message == "is empty; list at least one topic of ego_data or point_cloud"
+    assert field.startswith("apps[0]."), f"the message has no field {field!r}"
+
+
+def test_without_any_broker_the_file_to_mend_is_told() -> None:
+    (found,) = Books(brokers()).faults(goal([], [connection(broker="")]))
+    field, _, message = found.partition(": ")
+    assert field == "connections[0].broker_node_id"
+    assert "name one of" not in message
+    assert "inventory/brokers.yaml" in message
+
+
+def test_a_request_for_nothing_is_refused() -> None:
+    (found,) = Books().faults(goal())
+    assert "the request lists no application and no connection; list what " in found
+
+
+def test_a_node_in_no_access_domain_is_refused() -> None:
+    path = "policy/access-domains.yaml"
+    text = "apiVersion: demandops/v1\nkind: AccessDomains\ndomains:\n  - {name: a, namespace: a, "
+    books = Books({path: text + 'nodes: ["vehicle*", "station*"]}\n'})
+    remedy = "a platform engineer adds it to policy/access-domains.yaml"
+    assert books.faults(perception()) == [
+        f"apps[0].header.node_id: 'edge' is in no access domain; {remedy}",
+        f"connections[0].target_node_id: 'edge' is in no access domain; {remedy}",
+    ]
+
+
+class TestContradictions:
+    """What stands is kept, and named."""
+
+    @pytest.fixture
+    def books(self) -> Books:
+        books = Books()
+        books.send(perception())
+        return books
+
+    def test_another_node_for_a_claimed_application(self, books: Books) -> None:
+        assert books.faults(goal([application(node="cloud", who=["vehicle01"])])) == [
+            f"apps[0].header.node_id: 'cloud' contradicts what stands: '{APP}'"
+            " is held by vehicle00 on 'edge'; ask for that node, or wait until it is released"
+        ]
+
+    def test_another_node_for_an_application_that_the_same_demand_claimed(
+        self, books: Books
+    ) -> None:
+        assert len(books.faults(goal([application(node="cloud")]))) == 1
+
+    @pytest.mark.parametrize(
+        ("changed", "field", "wanted", "stands"),
+        [
+            ({"ends": ("vehicle01", "edge")}, "source_node_id", "vehicle01", "source 'vehicle00'"),
+            ({"ends": ("vehicle00", "cloud")}, "target_node_id", "cloud", "target 'edge'"),
+            ({"broker": "cloud"}, "broker_node_id", "cloud", "broker 'edge'"),
+        ],
+    )
+    def test_other_ends_or_another_broker_of_a_claimed_connection(
+        self, books: Books, changed: dict[str, Any], field: str, wanted: str, stands: str
+    ) -> None:
+        assert books.faults(goal([], [connection(who=["vehicle01"], **changed)])) == [
+            f"connections[0].{field}: '{wanted}' contradicts what stands: 'vehicle00/edge' is held "
+            f"by vehicle00 with {stands}; use the same, or another connection id"
+        ]
+
+    def test_another_target_for_a_topic_that_is_carried(self, books: Books) -> None:
+        asked = connection(who=["vehicle01"], topics=["/new", CLOUD[0]], targets=["/new", "/other"])
+        assert books.faults(goal([], [asked])) == [
+            f"connections[0].target_topics[1]: '{CLOUD[0]}' goes to '{CLOUD[0]}' already: "
+            "'vehicle00/edge' is held by vehicle00; one source topic has one target, use a second "
+            "connection"
+        ]
+
+    def test_every_contradiction_of_a_request_is_told(self, books: Books) -> None:
+        asked = goal([application(node="cloud")], [connection(broker="cloud")])
+        assert [found.split(":")[0] for found in books.faults(asked)] == [
+            "apps[0].header.node_id",
+            "connections[0].broker_node_id",
+        ]
+
+    def test_two_nodes_for_one_application_in_one_request(self) -> None:
+        asked = goal([application(), application(node="cloud")])
+        assert [found.split(":")[0] for found in Books().faults(asked)] == [
+            "apps[1].header.node_id"
+        ]
+
+    def test_an_application_that_a_vehicle_holds_is_not_left_half_booked(
+        self, books: Books
+    ) -> None:
+        asked = goal(
+            [application("new", who=["vehicle01"])],
+            [connection(who=["vehicle01"], broker="cloud")],
+        )
+        books.faults(asked)
+        assert books.books()["services"].keys() == {
+            "od-edge-vehicle00",
+            "of-edge-object-detection-fusion-cf7e0180a8bb",
+        }
+
+
+class TestShutdowns:
+    """A shutdown releases what is held, nothing else, and never by guess."""
+
+    def test_a_typo_shows_with_the_claims_that_come_near(self) -> None:
+        books = Books()
+        books.send(perception())
+        assert books.faults(goal([application(who=["vehicle01"])], shutdown=True)) == [
+            "apps[0].header.id: nothing that the shutdown lists is held; claims that come near: "
+            "application 'edge/object_detection_fusion' for vehicle00 (request 'request')"
+        ]
+
+    def test_a_misspelt_id_shows_what_the_requester_holds(self) -> None:
+        books = Books()
+        books.send(perception())
+        assert books.faults(goal([application("edge/fusion")], shutdown=True)) == [
+            "apps[0].header.id: nothing that the shutdown lists is held; claims that come near: "
+            "application 'edge/object_detection_fusion' for vehicle00; "
+            "connection 'vehicle00/edge' for vehicle00"
+        ]
+
+    def test_a_shutdown_sent_again_does_no_harm(self) -> None:
+        books = Books()
+        books.send(perception())
+        who = ["vehicle01"]
+        books.send(goal([application("other", who=who)], [connection(who=who)], id="other"))
+        assert books.send(perception(shutdown=True)).outcome == "released"
+        standing = books.books()
+        books.faults(perception(shutdown=True))
+        assert books.books() == standing
+
+    def test_what_was_not_held_is_named_and_the_rest_released(self) -> None:
+        books = Books()
+        books.send(perception())
+        asked = goal(
+            [application(), application("nothing")],
+            [connection(topics=[CLOUD[0], "/never"])],
+            shutdown=True,
+        )
+        decision = books.send(asked)
+        assert decision.outcome == "released"
+        assert decision.changes.not_held == (
+            "application 'nothing' for vehicle00",
+            "connection 'vehicle00/edge': topic /never",
+        )
+        assert books.books() == {"services": {}, "connections": {}}
+
+    def test_an_unknown_requester_on_shutdown_leaves_nothing_half_booked(self) -> None:
+        books = Books()
+        books.send(perception())
+        asked = goal([application(who=["nobody"])], [connection(who=["nobody"])], shutdown=True)
+        assert len(books.faults(asked)) == 1
+        assert books.books()["connections"]["vehicle00/edge"]["requesters"] == ["vehicle00"]
+
+    def test_which_of_several_claims_is_meant_is_not_guessed(self) -> None:
+        books = Books()
+        for id in ("one", "two"):
+            books.send(goal([application(who=["vehicle00", id])], id=id))
+        asked = goal([application()], id="three", shutdown=True)
+        assert len(books.faults(asked)) == 1
+
+    def test_a_shutdown_by_one_of_the_requesters_releases_the_only_claim_that_has_it(self) -> None:
+        books = Books()
+        books.send(goal([application(who=["vehicle00", "station00"])]))
+        asked = goal([application(who=["station00"])], shutdown=True)
+        assert books.send(asked).outcome == "released"
+        assert books.books()["services"] == {}
+
+
+def test_every_fault_of_a_request_is_told_at_once() -> None:
+    asked = goal(
+        [application("..", node="Mars", who=[], ego=[("/a b", "Mars")], type=7)],
+        [connection("", who=[""], ends=("egde", "edge"), topics=["/a"], targets=[], type=5)],
+        id="a\nb",
+    )
+    assert sorted(Books().faults(asked)) == sorted(
+        [
+            r"id: 'a\nb' holds the control character U+000A; choose an id without it",
+            "apps[0].header.id: '..' holds '..'; choose an id without it",
+            f"apps[0].header.node_id: 'Mars' is not in inventory/nodes.yaml; known: {NODES}",
+            f"{BODY}.requester_ids: is empty; say for whom this is asked",
+            f"{BODY}.ego_data_topics[0].topic_name: '/a b' {ROS_NAMES}",
+            f"{BODY}.ego_data_topics[0].source_node_id: 'Mars' is not in inventory/nodes.yaml; "
+            f"known: {NODES}",
+            "apps[0].type: 7 names no application definition; known: 1 (object-detection-fusion)",
+            f"{C0}.id: is empty; give an id",
+            f"{C0}.requester_ids[0]: is empty; give an id",
+            f"{C0}.source_node_id: 'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",
+            f"{C0}.target_topics: has 0 names for 1 in source_topics; source topic i goes to "
+            "target topic i, so list as many of each",
+            f"{C0}.type: 5 is no connection type; {TYPES}",
+        ]
+    )
+
+
+def test_faults_are_in_the_order_of_the_request() -> None:
+    asked = goal([application(who=[]), application("..")], [connection(who=[])], id="\n")
+    fields = [found.split(": ")[0] for found in Books().faults(asked)]
+    assert fields == ["id", f"{BODY}.requester_ids", "apps[1].header.id", f"{C0}.requester_ids"]
+
+
+def test_a_warning_and_no_refusal_for_an_input_that_no_connection_carries() -> None:
+    asked = goal([application(APP, ego=[EGO])], [connection()])
+    assert Books().send(asked).warnings == (
+        "application 'edge/object_detection_fusion': no connection carries ego_data "
+        "/vehicles/vehicle00/ego_data of 'vehicle00' to 'edge'",
+    )

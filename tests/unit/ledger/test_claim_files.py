@@ -1,0 +1,159 @@
+"""A claim's file says all of the claim, whatever its ids are made of."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta, timezone
+from types import MappingProxyType
+
+from hypothesis import given
+from hypothesis import strategies as st
+from trying import examples
+
+from generator.demand.claim import (
+    ApplicationClaim,
+    Claim,
+    ClaimKey,
+    ConnectionClaim,
+    Subject,
+    SubjectKind,
+    demand_id,
+)
+from generator.demand.request import ConnectionType, InputTopic, id_problem
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger
+
+TRICKY = [
+    *("null", "~", "yes", "on", "1", "1e3", "0x1f", "1_000", "12:30:45", "2026-01-31", ".inf"),
+    *("- a", "? a", "a: b", "#", "a #b", "'", '"', "\\n", "{a}", "[a]", "&a", "*a", "!a", "%a"),
+    *(
+        "@",
+        " a",
+        "a ",
+        "---",
+        "...",
+        "é",
+        "e\u0301",
+        "\ufeffa",
+        "\u00a0",
+        "😀",
+        "a" * 1024,
+        "<<",
+        "=",
+    ),
+]
+ids = st.one_of(st.sampled_from(TRICKY), st.text(min_size=1, max_size=20)).filter(
+    lambda text: not id_problem(text)
+)
+topics = st.from_regex(r"(/[a-zA-Z_][a-zA-Z0-9_]{0,6}){1,3}", fullmatch=True)
+moments = st.datetimes(datetime(2000, 1, 1), datetime(2100, 1, 1), timezones=st.just(timezone.utc))
+people = st.lists(ids, min_size=1, max_size=4, unique=True).map(lambda who: tuple(sorted(who)))
+inputs = st.lists(st.builds(InputTopic, topics, ids, st.just("") | ids), min_size=1, max_size=4)
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | ids,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(ids, inner, max_size=3),
+    max_leaves=6,
+)
+
+
+def by_place(found: list[InputTopic]) -> tuple[InputTopic, ...]:
+    """Return the topics as a claim holds them: each place once, sorted."""
+    return tuple(sorted({(item.topic, item.source): item for item in found}.values()))
+
+
+@st.composite
+def application_claims(draw: st.DrawFn) -> ApplicationClaim:
+    request, who = draw(st.just("") | ids), draw(people)
+    return ApplicationClaim(
+        application=draw(ids),
+        demand=demand_id(request, who),
+        request=request,
+        requesters=who,
+        booked=draw(moments),
+        appdef="object-detection-fusion",
+        node=draw(ids),
+        inputs=MappingProxyType(
+            {
+                role: by_place(draw(inputs))
+                for role in ("ego_data", "point_cloud", "radar")
+                if draw(st.booleans())
+            }
+        ),
+        parameters=MappingProxyType(draw(st.dictionaries(ids, values, max_size=3))),
+    )
+
+
+@st.composite
+def connection_claims(draw: st.DrawFn) -> ConnectionClaim:
+    request, who = draw(st.just("") | ids), draw(people)
+    return ConnectionClaim(
+        connection=draw(ids),
+        demand=demand_id(request, who),
+        request=request,
+        requesters=who,
+        booked=draw(moments),
+        type=draw(st.sampled_from(ConnectionType)),
+        source=draw(ids),
+        target=draw(ids),
+        broker=draw(st.just("") | ids),
+        topics=MappingProxyType(
+            dict(sorted(draw(st.dictionaries(topics, topics, min_size=1)).items()))
+        ),
+    )
+
+
+claims = application_claims() | connection_claims()
+
+
+@examples(80)
+@given(claims)
+def test_every_claim_survives_its_file(claim: Claim) -> None:
+    path, text = ledger_format.path_of(claim.key), ledger_format.write(claim)
+
+    read = ledger_format.read(text, path)
+
+    assert read == claim
+    assert ledger_format.write(read) == text
+    assert ledger_format.kind_of(path) is claim.subject.kind
+    assert path.isascii()
+    assert all(0 < len(part) <= 100 for part in path.split("/"))
+
+
+@examples(30)
+@given(claims)
+def test_a_claim_that_is_booked_and_dropped_leaves_an_empty_ledger(claim: Claim) -> None:
+    ledger = Ledger().replace(claim.key, claim)
+
+    assert list(ledger) == [claim]
+    assert ledger.replace(claim.key, None) == Ledger()
+
+
+@examples(30)
+@given(st.dictionaries(st.tuples(st.sampled_from(SubjectKind), ids, ids), st.none(), min_size=2))
+def test_two_claims_never_share_a_file(keys: dict[tuple[SubjectKind, str, str], None]) -> None:
+    paths = {
+        ledger_format.path_of(ClaimKey(Subject(kind, subject), demand)).lower()
+        for kind, subject, demand in keys
+    }
+    assert len(paths) == len(keys)
+
+
+@examples(100)
+@given(moments, st.integers(-12, 14))
+def test_a_time_is_the_same_moment_in_any_zone(moment: datetime, hours: int) -> None:
+    here = moment.astimezone(timezone(timedelta(hours=hours)))
+    claim = ConnectionClaim(
+        connection="a",
+        demand="b",
+        request="",
+        requesters=("c",),
+        booked=here,
+        type=ConnectionType.MQTT,
+        source="d",
+        target="e",
+        broker="",
+        topics=MappingProxyType({"/a": "/b"}),
+    )
+
+    read = ledger_format.read(ledger_format.write(claim), ledger_format.path_of(claim.key))
+
+    assert read.booked == moment

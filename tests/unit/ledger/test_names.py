@@ -1,0 +1,264 @@
+"""Two different ids never give one name, and every name is one that Kubernetes and ROS 2 take."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from types import MappingProxyType
+
+from hypothesis import given
+from hypothesis import strategies as st
+from inmemory import Repo
+from model.goals import goal
+from trying import examples, told
+
+from generator.catalog.inventory import Node
+from generator.decision import Decision
+from generator.demand.request import id_problem
+from generator.plan import naming
+
+DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
+ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+ROS_NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+LONGEST_NAME, LONGEST_TOPIC = 53, 247
+
+Subject = tuple[str, ...]
+"""A prefix and what the name is for."""
+
+close = st.text("ab0-_/.A", min_size=1, max_size=5)
+words = st.sampled_from(["edge", "vehicle00", "vehicle_00", "vehicle/00", "Vehicle00", "a", "b"])
+hashed = st.builds(
+    "{}{}{}".format,
+    st.sampled_from(["", "a", "edge", "edge/a"]),
+    st.sampled_from(["-", "_", "/", ""]),
+    st.text("0123456789abcdef", min_size=12, max_size=12),
+)
+long = st.builds(
+    lambda filler, end: filler * (300 // len(filler)) + end,
+    st.sampled_from(["a", "ab-", "a/", "x_", "ü"]),
+    st.sampled_from(["", "a", "b", "-", "_a"]),
+)
+anything = st.text(min_size=1, max_size=12)
+ids = st.one_of(words, close, hashed, long, anything).filter(lambda text: not id_problem(text))
+topics = st.from_regex(r"(/[ab_][a0_]{0,3}){1,3}", fullmatch=True) | st.builds(
+    lambda part, count: f"/{part}" * count, st.sampled_from(["a", "b_0", "a_"]), st.integers(50, 60)
+)
+sides = st.sampled_from(["source", "target"])
+
+subjects: st.SearchStrategy[Subject] = st.one_of(
+    st.tuples(st.just("od"), ids, ids),
+    st.tuples(st.just("od"), ids, ids, topics),
+    st.tuples(st.just("of"), ids),
+    st.tuples(st.just("mqtt"), ids, sides),
+)
+
+
+def rivals(subject: Subject, name: str) -> Iterator[Subject]:
+    """Yield other subjects that a plain name would read just like ``name``."""
+    prefix, rest = subject[0], name.removeprefix(f"{subject[0]}-")
+    yield ("of", rest)
+    yield ("mqtt", rest.removesuffix("-source").removesuffix("-target") or "x", "source")
+    pieces = rest.split("-")
+    for cut in range(1, len(pieces)):
+        first, second = "-".join(pieces[:cut]), "-".join(pieces[cut:])
+        if prefix == "od":
+            yield ("od", first, second)
+        elif second in ("source", "target"):
+            yield ("mqtt", first, second)
+    for ids_ in (subject[1:], tuple(rest.split("-"))):
+        for old, new in (("_", "-"), ("/", "-"), ("-", "_"), ("/", "_")):
+            other = tuple(part.replace(old, new) for part in ids_)
+            if prefix == "od" and len(other) in (2, 3):
+                yield (prefix, *other)
+    yield (prefix, subject[1].lower(), *subject[2:])
+    yield (prefix, subject[1].upper(), *subject[2:])
+    yield (prefix, subject[1][:-1] or "x", *subject[2:])
+
+
+def named_apart(found: set[Subject], name_of: Callable[[Subject], str]) -> dict[str, Subject]:
+    """Return the subjects by name, having seen that none share one."""
+    names: dict[str, Subject] = {}
+    for subject in sorted(found):
+        other = names.setdefault(name_of(subject), subject)
+        assert other == subject, f"{other} and {subject} are both {name_of(subject)}"
+    return names
+
+
+def kubernetes_name(subject: Subject) -> str:
+    return naming.object_name(*subject)
+
+
+@examples(60)
+@given(st.lists(subjects, min_size=1, max_size=12))
+def test_different_subjects_have_different_names_that_kubernetes_takes(
+    drawn: list[Subject],
+) -> None:
+    found = set(drawn)
+    for _ in range(2):  # rivals of the rivals' names too
+        found |= {
+            rival for subject in list(found) for rival in rivals(subject, kubernetes_name(subject))
+        }
+        if len(found) > 150:
+            break
+    names = named_apart(found, kubernetes_name)
+    for name, subject in names.items():
+        assert DNS_1123.fullmatch(name), subject
+        assert len(name) <= LONGEST_NAME, subject
+    ros_names = {naming.ros_name(name) for name in names}
+    assert len(ros_names) == len(names)
+    assert all(ROS_NODE.fullmatch(name) for name in ros_names)
+
+
+def topic_instance(subject: Subject) -> str:
+    return naming.topic_part(*subject)
+
+
+@examples(80)
+@given(st.lists(st.one_of(st.tuples(ids), st.tuples(ids, topics)), min_size=1, max_size=12))
+def test_different_subjects_have_different_derived_topics_that_ros_takes(
+    drawn: list[Subject],
+) -> None:
+    found = set(drawn)
+    found |= {(topic_instance(subject),) for subject in drawn}
+    found |= {(subject[0].replace(old, "_"), *subject[1:]) for subject in drawn for old in "/-."}
+    for instance in named_apart(found, topic_instance):
+        for suffix in ("_local_objectlist", "_global_trajectories"):
+            topic = f"/{instance}{suffix}"
+            assert ROS_TOPIC.fullmatch(topic), topic
+            assert len(topic) <= LONGEST_TOPIC
+
+
+@examples(30)
+@given(
+    st.lists(ids, min_size=2, max_size=4, unique=True),
+    st.lists(ids, min_size=1, max_size=4, unique=True),
+    st.lists(ids, min_size=1, max_size=4, unique=True),
+    st.lists(topics, min_size=1, max_size=3, unique=True),
+)
+def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
+    nodes: list[str], applications: list[str], connections: list[str], clouds: list[str]
+) -> None:
+    repo = with_nodes(nodes)
+    asked = [(node, cloud) for node in nodes for cloud in [usual_cloud(nodes, node), *clouds]]
+    request = told(
+        [
+            goal(
+                "",
+                [
+                    {
+                        "header": {"id": id_, "node_id": nodes[place % len(nodes)]},
+                        "type": 1,
+                        "object_detection_fusion_app": {
+                            "requester_ids": ["somebody"],
+                            "pointcloud_topics": [
+                                {"source_node_id": node, "topic_name": cloud}
+                                for node, cloud in asked
+                            ],
+                        },
+                    }
+                    for place, id_ in enumerate(applications)
+                ],
+                [
+                    {
+                        "id": id_,
+                        "type": 1,
+                        "broker_node_id": "edge",
+                        "requester_ids": ["somebody"],
+                        "source_node_id": nodes[0],
+                        "target_node_id": nodes[1],
+                        "source_topics": ["/a"],
+                        "target_topics": ["/b"],
+                    }
+                    for id_ in connections
+                ],
+            )
+        ]
+    )[0]
+
+    taken = repo.take(request)
+
+    assert isinstance(taken, Decision), taken
+    places = {nodes[place % len(nodes)] for place in range(len(applications))}
+    releases = len(places) * len(asked) + len(applications) + 2 * len(connections)
+    assert len(taken.releases) == len({release.name for release in taken.releases}) == releases
+    manifests = [
+        text for path, text in taken.files.items() if text and path.startswith("clusters/")
+    ]
+    assert len(manifests) == releases
+    lowered = [path.lower() for path in taken.files]
+    assert len(set(lowered)) == len(lowered), "a file system without case would mix them up"
+    assert all(len(part) <= 255 for path in taken.files for part in path.split("/"))
+    for node in places:
+        produced = [
+            topic
+            for text in manifests
+            if f"demandops/node: {quoted(node)}" in text
+            for topic in re.findall(r"(?:objectList|fusedObjectLists)Topic: (\S+)", text)
+        ]
+        assert len(set(produced)) == len(produced)
+        assert all(ROS_TOPIC.fullmatch(topic) for topic in produced)
+    shutdown = repo.take({**request, "shutdown": True})
+    assert isinstance(shutdown, Decision), shutdown
+    assert repo.files == with_nodes(nodes).files
+
+
+def test_the_watcher_of_one_application_is_not_named_like_the_fusion_of_another() -> None:
+    repo = Repo()
+    item = {
+        "requester_ids": ["somebody"],
+        "ego_data_topics": [{"source_node_id": "vehicle00", "topic_name": "/ego"}],
+    }
+    repo.take(
+        goal(
+            "",
+            [
+                {
+                    "header": {"id": id_, "node_id": "edge"},
+                    "type": 1,
+                    "object_detection_fusion_app": item,
+                }
+                for id_ in ("x", "x-watcher")
+            ],
+        )
+    )
+
+    texts = repo.below("clusters").values()
+    names = [name for text in texts for name in re.findall(r"nodeName: (\S+)", text)]
+
+    assert len(names) == 4
+    assert len(set(names)) == 4, names
+
+
+def usual_cloud(nodes: list[str], node: str) -> str:
+    return f"/usual/cloud{nodes.index(node)}"
+
+
+def with_nodes(nodes: list[str]) -> Repo:
+    """Return a new repo whose inventory lists further nodes, with any ids."""
+    repo = Repo()
+    catalog = repo.state.catalog
+    (domain,) = catalog.domains.values()
+    more = {
+        id_: Node(
+            id=id_,
+            type="vehicle",
+            cluster="c-its",
+            selector={"any": "label"},
+            topics={"point_cloud": usual_cloud(nodes, id_)},
+        )
+        for id_ in nodes
+    }
+    catalog = replace(
+        catalog,
+        nodes=MappingProxyType({**catalog.nodes, **more}),
+        domain_of=MappingProxyType({**catalog.domain_of, **dict.fromkeys(more, domain)}),
+    )
+    repo.state = replace(repo.state, catalog=catalog)
+    return repo
+
+
+def quoted(text: str) -> str:
+    """Return a text as the templates write it."""
+    return json.dumps(text, ensure_ascii=False)

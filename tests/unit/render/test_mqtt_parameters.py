@@ -1,0 +1,189 @@
+"""What mqtt_client reads: its parameters as ika-rwth-aachen/mqtt_client v2.5 names them."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+import yaml
+from asking import Books, brokers, connection, goal
+
+TOPIC_KEYS = {
+    "ros2mqtt": {"mqtt_topic", "primitive", "json", "ros_type", "inject_timestamp", "advanced"},
+    "mqtt2ros": {"ros_topic", "ros_type", "primitive", "json", "advanced"},
+}
+LISTS = {"ros2mqtt": "ros_topics", "mqtt2ros": "mqtt_topics"}
+
+
+def ends(books: Books) -> dict[str, dict[str, Any]]:
+    """Return the parameters of each client by its client id."""
+    found = {}
+    for name, config in books.objects("ConfigMap").items():
+        whole = yaml.safe_load(config["data"]["params.yaml"])
+        assert whole.keys() == {"/**/*"}
+        assert whole["/**/*"].keys() == {"ros__parameters"}
+        found[name] = whole["/**/*"]["ros__parameters"]
+    return found
+
+
+def carried(books: Books) -> dict[str, dict[tuple[str, str], str]]:
+    """Follow each message as two clients would: connection → (ROS in, MQTT) → ROS out."""
+    deployments = books.objects("Deployment")
+    ways: dict[str, dict[str, dict[str, str]]] = {}
+    for name, parameters in ends(books).items():
+        id = deployments[name]["metadata"]["annotations"]["demandops/connection"]
+        for way, bridge in parameters["bridge"].items():
+            listed = bridge[LISTS[way]]
+            assert listed == sorted(set(listed))
+            assert bridge.keys() == {LISTS[way], *listed}
+            field = "mqtt_topic" if way == "ros2mqtt" else "ros_topic"
+            for topic in listed:
+                assert bridge[topic].keys() <= TOPIC_KEYS[way]
+                ways.setdefault(id, {}).setdefault(way, {})[topic] = bridge[topic][field]
+    return {
+        id: {(source, mqtt): sides["mqtt2ros"][mqtt] for source, mqtt in sides["ros2mqtt"].items()}
+        for id, sides in ways.items()
+    }
+
+
+def pairs(books: Books, id: str) -> dict[str, str]:
+    return {source: target for (source, _), target in carried(books)[id].items()}
+
+
+def test_the_parameters_of_both_ends_are_exactly_these() -> None:
+    books = Books(brokers("edge"))
+    books.send(
+        goal([], [connection("c", topics=["/b/points", "/a"], targets=["/x", "/y"], broker="")])
+    )
+    broker = {"host": "broker-edge", "port": 1883}
+    assert ends(books) == {
+        "mqtt-c-source": {
+            "broker": broker,
+            "client": {"id": "mqtt-c-source"},
+            "bridge": {
+                "ros2mqtt": {
+                    "ros_topics": ["/a", "/b/points"],
+                    "/a": {"mqtt_topic": "mqtt-c/a"},
+                    "/b/points": {"mqtt_topic": "mqtt-c/b/points"},
+                }
+            },
+        },
+        "mqtt-c-target": {
+            "broker": broker,
+            "client": {"id": "mqtt-c-target"},
+            "bridge": {
+                "mqtt2ros": {
+                    "mqtt_topics": ["mqtt-c/a", "mqtt-c/b/points"],
+                    "mqtt-c/a": {"ros_topic": "/y"},
+                    "mqtt-c/b/points": {"ros_topic": "/x"},
+                }
+            },
+        },
+    }
+
+
+def test_source_topic_i_arrives_as_target_topic_i() -> None:
+    books = Books()
+    topics = [f"/source/{letter}" for letter in "dacb"]
+    targets = [f"/target/t{number}" for number in range(4)]
+    books.send(goal([], [connection("c", topics=topics, targets=targets)]))
+    assert pairs(books, "c") == dict(zip(topics, targets, strict=True))
+
+
+def test_two_source_topics_may_arrive_as_one() -> None:
+    books = Books()
+    books.send(goal([], [connection("c", topics=["/a", "/b"], targets=["/c", "/c"])]))
+    assert pairs(books, "c") == {"/a": "/c", "/b": "/c"}
+
+
+def test_topics_are_united_over_the_claims_and_parted_again() -> None:
+    books = Books()
+    books.send(goal([], [connection("c", topics=["/b", "/a"], targets=["/y", "/x"])], id="1"))
+    alone = books.rendered()
+    books.send(goal([], [connection("c", topics=["/a", "/c"], targets=["/x", "/z"])], id="2"))
+    assert pairs(books, "c") == {"/a": "/x", "/b": "/y", "/c": "/z"}
+    books.send(goal([], [connection("c", topics=["/c"], targets=["/z"])], id="2", shutdown=True))
+    assert pairs(books, "c") == {"/a": "/x", "/b": "/y"}
+    assert books.rendered() == alone
+    books.send(goal([], [connection("c", topics=[])], id="1", shutdown=True))
+    assert pairs(books, "c") == {"/a": "/x"}
+    books.send(goal([], [connection("c", topics=[])], id="2", shutdown=True))
+    assert books.rendered() == {}
+
+
+def test_two_connections_with_one_topic_name_share_no_mqtt_topic() -> None:
+    books = Books()
+    for id in ("c", "c/d", "c_d", "C"):
+        books.send(goal([], [connection(id, topics=["/d", "/c/d"])], id=id))
+    mqtt = [topic for ways in carried(books).values() for _, topic in ways]
+    assert len(mqtt) == len(set(mqtt)) == 8
+
+
+def test_no_mqtt_topic_holds_a_wildcard_or_a_dollar() -> None:
+    books = Books()
+    for id in ("+", "#", "$SYS/x", "a/+/b", "a\u00a0b", "/", "//"):
+        books.send(goal([], [connection(id)], id=id))
+    for ways in carried(books).values():
+        for _, mqtt in ways:
+            assert re.fullmatch(r"[a-z0-9-]+(/[A-Za-z0-9_]+)+", mqtt), mqtt
+
+
+def test_every_end_has_a_client_id_of_its_own_and_that_of_its_deployment() -> None:
+    books = Books()
+    for id in ("c", "c-source", "c/source", "C"):
+        books.send(goal([], [connection(id)], id=id))
+    found = ends(books)
+    assert len(found) == 8
+    assert all(parameters["client"]["id"] == name for name, parameters in found.items())
+    assert found.keys() == books.objects("Deployment").keys()
+
+
+def test_both_ends_meet_at_one_broker() -> None:
+    books = Books()
+    books.send(goal([], [connection("c", broker="", ends=("vehicle00", "edge"))]))
+    (host,) = {parameters["broker"]["host"] for parameters in ends(books).values()}
+    (port,) = {parameters["broker"]["port"] for parameters in ends(books).values()}
+    assert (host, port) == ("service-mqtt-broker-edge", 1993)
+
+
+def test_the_client_is_started_by_the_launch_file_that_v2_4_kept() -> None:
+    books = Books()
+    books.send(goal([], [connection("c")]))
+    for name, deployment in books.objects("Deployment").items():
+        (container,) = deployment["spec"]["template"]["spec"]["containers"]
+        assert "command" not in container
+        assert container["args"] == [
+            "ros2",
+            "launch",
+            "mqtt_client",
+            "standalone.launch.xml",
+            f"node_name:={name.replace('-', '_')}",
+            "params_file:=/config/params.yaml",
+        ]
+        (volume,) = (
+            item
+            for item in deployment["spec"]["template"]["spec"]["volumes"]
+            if "configMap" in item
+        )
+        (mount,) = (item for item in container["volumeMounts"] if item["name"] == volume["name"])
+        assert (volume["configMap"]["name"], mount["mountPath"]) == (name, "/config")
+
+
+def test_new_topics_restart_both_ends_and_nothing_else_does() -> None:
+    books = Books()
+    books.send(goal([], [connection("c", topics=["/a"])], id="1"))
+    templates = {n: d["spec"]["template"] for n, d in books.objects("Deployment").items()}
+    books.send(goal([], [connection("c", topics=["/a"], who=["vehicle01"])], id="2"))
+    assert templates == {n: d["spec"]["template"] for n, d in books.objects("Deployment").items()}
+    books.send(goal([], [connection("c", topics=["/b"])], id="3"))
+    for name, deployment in books.objects("Deployment").items():
+        assert deployment["spec"]["template"] != templates[name]
+
+
+@pytest.mark.parametrize("count", [1, 2, 50])
+def test_every_topic_is_listed_once(count: int) -> None:
+    books = Books()
+    topics = [f"/t{number}" for number in range(count)]
+    books.send(goal([], [connection("c", topics=[*topics, *topics])]))
+    assert sorted(pairs(books, "c")) == sorted(topics)

@@ -1,0 +1,224 @@
+"""Which addresses are URLs, which are refused, and that no secret shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from generator.errors import StateRepoError
+from generator.staterepo import remote
+from generator.staterepo.remote import connect, is_url, without_secrets
+
+URLS = [
+    "https://example.org/state.git",
+    "http://127.0.0.1:8080/state.git",
+    "ssh://git@example.org:2222/state.git",
+    "git://example.org/state.git",
+    "file:///srv/state.git",
+    "git+ssh://git@example.org/state.git",
+    "git@example.org:team/state.git",
+    "git@example.org:/srv/state.git",
+    "user.name@host-1:state.git",
+    "example.org:team/state.git",
+    "example.org:/srv/state.git",
+    "git@[::1]:state.git",
+]
+FOLDERS = [
+    "state.git",
+    "./state.git",
+    "../state.git",
+    "/srv/state.git",
+    "~/state.git",
+    "folder/with@sign:and/colon",
+    "./host:path",
+    "a b/state.git",
+    "",
+]
+
+
+@pytest.mark.parametrize("address", URLS)
+def test_what_git_clones_over_a_network_is_a_url(address: str) -> None:
+    assert is_url(address)
+
+
+@pytest.mark.parametrize("address", FOLDERS)
+def test_what_names_a_folder_is_no_url(address: str) -> None:
+    assert not is_url(address)
+
+
+def test_a_folder_that_exists_wins_over_what_its_name_looks_like(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert is_url("host:path")
+    (tmp_path / "host:path").mkdir()
+    assert not is_url("host:path")
+
+
+@pytest.mark.parametrize(
+    ("address", "scheme"),
+    [
+        ("ext://sh", "ext"),
+        ("ftp://example.org/state.git", "ftp"),
+        ("javascript://x", "javascript"),
+        ("s3://bucket/state.git", "s3"),
+    ],
+)
+def test_other_schemes_are_refused_by_name(tmp_path: Path, address: str, scheme: str) -> None:
+    with pytest.raises(StateRepoError) as error:
+        connect(address, tmp_path)
+    assert str(error.value) == (
+        f"'{scheme}://' is no way to reach a state repo; use https, ssh, git or file"
+    )
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["ext::sh -c touch% evil", "ext::sh -c touch% evil% ://", "testgit::x:y"],
+)
+def test_a_remote_helper_that_runs_commands_is_never_asked(tmp_path: Path, address: str) -> None:
+    with pytest.raises(StateRepoError, match="is no way to reach a state repo"):
+        connect(address, tmp_path / "data")
+    assert not (tmp_path / "data").exists(), "refused before anything is made"
+
+
+@pytest.mark.parametrize("address", ["-oProxyCommand=touch@x:y", "--upload-pack=touch@x:y", "-x:y"])
+def test_an_address_that_looks_like_an_option_is_refused(tmp_path: Path, address: str) -> None:
+    with pytest.raises(StateRepoError):
+        connect(address, tmp_path / "data")
+
+
+HIDDEN = (
+    "the state repo's address holds a password, which process lists would show; leave it out and "
+    "give it to git by a credential helper, ~/.netrc or an SSH key"
+)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "https://user:secret@example.org/state.git",
+        "https://:secret@example.org/state.git",
+        "https://user:sec@ret@example.org/state.git",
+        "http://user:secret@127.0.0.1/state.git",
+        "ssh://git:secret@example.org/state.git",
+    ],
+)
+def test_a_password_in_the_address_is_refused_and_not_repeated(
+    tmp_path: Path, address: str
+) -> None:
+    with pytest.raises(StateRepoError) as error:
+        connect(address, tmp_path)
+    assert str(error.value) == HIDDEN
+
+
+@pytest.mark.parametrize(
+    "address", ["HTTPS://user:secret@example.org/x.git", "https://user:se/cret@example.org/x.git"]
+)
+def test_an_address_that_is_mistyped_does_not_show_its_password_either(
+    tmp_path: Path, address: str
+) -> None:
+    with pytest.raises(StateRepoError) as error:
+        connect(address, tmp_path / "data")
+    assert "cret" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("https://user:secret@example.org/x", "https://example.org/x"),
+        ("https://token@example.org/x", "https://example.org/x"),
+        ("https://user:sec@ret@example.org/x", "https://example.org/x"),
+        ("https://example.org/a@b", "https://example.org/a@b"),
+        (
+            "fatal: unable to access 'https://token@example.org/x/': 403",
+            "fatal: unable to access 'https://example.org/x/': 403",
+        ),
+        ("https://a@one.org and https://b:c@two.org", "https://one.org and https://two.org"),
+        ("git@example.org:x", "git@example.org:x"),
+    ],
+)
+def test_secrets_are_taken_out_of_whatever_is_shown(text: str, wanted: str) -> None:
+    assert without_secrets(text) == wanted
+
+
+def test_neither_address_nor_error_shows_a_token(tmp_path: Path) -> None:
+    with pytest.raises(remote.RemoteAway) as error:
+        connect("http://token-s3cr3t@127.0.0.1:9/state.git", tmp_path / "data")
+    assert "s3cr3t" not in str(error.value)
+    assert str(error.value).startswith("http://127.0.0.1:9/state.git cannot be fetched: ")
+
+
+def test_the_clone_keeps_its_address_for_its_owner_alone(tmp_path: Path) -> None:
+    source = _bare_with_main(tmp_path / "state.git")
+    connect(source.as_uri(), tmp_path / "data")
+    config = tmp_path / "data" / "clone.git" / "config"
+    assert source.as_uri() in config.read_text()
+    assert config.stat().st_mode & 0o077 == 0
+
+
+def test_a_line_break_in_an_address_sets_nothing_in_the_clones_configuration(
+    tmp_path: Path,
+) -> None:
+    source = _bare_with_main(tmp_path / "state.git")
+    address = f"{source.as_uri()}\n[core]\n\tsshCommand = touch evil"
+    with pytest.raises((StateRepoError, ValueError)):
+        connect(address, tmp_path / "data")
+    configs = [path.read_text() for path in (tmp_path / "data").rglob("config")]
+    assert not any("sshCommand" in line for text in configs for line in text.splitlines()[1:])
+
+
+def test_a_folder_that_is_not_there_is_told_with_the_remedy(tmp_path: Path) -> None:
+    with pytest.raises(StateRepoError) as error:
+        connect(str(tmp_path / "nothing.git"), tmp_path / "data")
+    assert str(error.value) == (
+        f"{tmp_path}/nothing.git does not exist; make a state repo with `demandops init "
+        f"{tmp_path}/nothing.git --bare`"
+    )
+
+
+def test_a_folder_that_is_no_repository_is_told_with_the_remedy(tmp_path: Path) -> None:
+    with pytest.raises(StateRepoError) as error:
+        connect(str(tmp_path), tmp_path / "data")
+    assert str(error.value) == (
+        f"{tmp_path} is no Git repository; make one with `demandops init {tmp_path} --bare`"
+    )
+
+
+def test_a_repository_without_main_is_told_with_the_remedy(tmp_path: Path) -> None:
+    import pygit2
+
+    empty = tmp_path / "empty.git"
+    pygit2.init_repository(str(empty), bare=True)
+    with pytest.raises(StateRepoError, match="has no branch 'main'"):
+        connect(str(empty), tmp_path / "data")
+    with pytest.raises(StateRepoError) as error:
+        connect(empty.as_uri(), tmp_path / "data")
+    assert str(error.value) == (
+        f"{empty.as_uri()} has no branch 'main'; push one made by `demandops init DIR`"
+    )
+
+
+def test_a_checked_out_main_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    import pygit2
+
+    work = tmp_path / "work"
+    repo = pygit2.init_repository(str(work), initial_head="main")
+    who = pygit2.Signature("x", "x@example.org", 0, 0)
+    repo.create_commit("refs/heads/main", who, who, "x", repo.TreeBuilder().write(), [])
+    with pytest.raises(StateRepoError) as error:
+        connect(str(work), tmp_path / "data")
+    assert str(error.value) == (
+        f"{work} has 'main' checked out, and its files would fall behind the commits; use a bare "
+        f"clone: git clone --bare {work} {work}.git"
+    )
+
+
+def _bare_with_main(path: Path) -> Path:
+    import pygit2
+
+    repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
+    who = pygit2.Signature("x", "x@example.org", 0, 0)
+    repo.create_commit("refs/heads/main", who, who, "x", repo.TreeBuilder().write(), [])
+    return path

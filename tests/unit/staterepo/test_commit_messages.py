@@ -1,0 +1,270 @@
+"""The messages that a reader of `git log` gets, word for word."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pygit2
+import pytest
+
+from generator.catalog.identifiers import id_problem
+from generator.errors import fault
+from generator.render.changeset import ReleaseChange
+from generator.staterepo import history, message
+from generator.staterepo import tree as trees
+
+CONNECTION = {
+    "id": "station00/edge",
+    "type": 1,
+    "requester_ids": ["vehicle00"],
+    "source_node_id": "station00",
+    "target_node_id": "edge",
+    "source_topics": ["/stations/station00/pointcloud"],
+    "target_topics": ["/stations/station00/pointcloud"],
+}
+
+
+def test_a_join_says_what_starts_for_whom_and_what_is_missing(desk: Any) -> None:
+    text = message.of_decision(desk.join("vehicle00", "station00"), "op-1", desk.now)
+    assert text == (
+        "Join edge/fusion\n"
+        "\n"
+        "Why: request 'intersection', received 2026-03-01 12:00:07 UTC, asks for 1 application in "
+        "the name of vehicle00, station00.\n"
+        "\n"
+        "Desired state:\n"
+        "  + od-edge-station00 (object-detection on edge for station00)\n"
+        "  + of-edge-fusion-c9b035cdedb8 (object-fusion on edge for edge/fusion)\n"
+        "\n"
+        "Warnings:\n"
+        "  application 'edge/fusion': no connection carries point_cloud "
+        "/stations/station00/pointcloud of 'station00' to 'edge'\n"
+        "\n"
+        "Operation: join\n"
+        "Operation-Id: op-1\n"
+        "Demand-Id: 9f1703487a827065fafb\n"
+        "Requester: vehicle00\n"
+        "Requester: station00\n"
+        "Application: edge/fusion\n"
+        "Request-Id: intersection\n"
+        "Render-Version: 1\n"
+    )
+
+
+def test_a_further_requester_changes_nothing_that_runs(desk: Any) -> None:
+    desk.join("vehicle00")
+    desk.decide({"id": "link", "connections": [CONNECTION]})
+    text = message.of_decision(desk.join("vehicle01"), "op-2", desk.now)
+    assert text == (
+        "Join edge/fusion\n"
+        "\n"
+        "Why: request 'intersection', received 2026-03-01 12:00:07 UTC, asks for 1 application in "
+        "the name of vehicle01.\n"
+        "\n"
+        "Desired state: unchanged; what is asked runs already, or still for others.\n"
+        "\n"
+        "Operation: join\n"
+        "Operation-Id: op-2\n"
+        "Demand-Id: 5a9efb7eac4d9f70597d\n"
+        "Requester: vehicle01\n"
+        "Application: edge/fusion\n"
+        "Request-Id: intersection\n"
+        "Render-Version: 1\n"
+    )
+
+
+def test_a_further_topic_says_what_of_a_release_changes(desk: Any) -> None:
+    desk.join("vehicle00")
+    lines = message.of_decision(
+        desk.join("vehicle00", cloud="/stations/station00/rear"), "op-2", desk.now
+    ).split("\n")
+    start = lines.index("Desired state:")
+    assert lines[start : lines.index("", start)] == [
+        "Desired state:",
+        "  + od-edge-station00-stations-station00-rea-88c9acf629c3 (object-detection on edge for "
+        "station00)",
+        "  ~ of-edge-fusion-c9b035cdedb8 (object-fusion on edge for edge/fusion)",
+        "      + object_list /station00_stations_station00_rear_1e54632c63c0_local_objectlist",
+    ]
+
+
+def test_a_release_says_what_stops_and_what_was_not_held(desk: Any) -> None:
+    desk.join("vehicle00")
+    goal = {
+        "id": "intersection",
+        "shutdown": True,
+        "apps": [
+            {
+                "header": {"id": "edge/fusion", "node_id": "edge"},
+                "type": 1,
+                "object_detection_fusion_app": {"requester_ids": ["vehicle00"]},
+            }
+        ],
+        "connections": [CONNECTION],
+    }
+    text = message.of_decision(desk.decide(goal), "op-3", desk.now)
+    assert text == (
+        "Release edge/fusion\n"
+        "\n"
+        "Why: request 'intersection', received 2026-03-01 12:00:07 UTC, gives up 1 application in "
+        "the name of vehicle00.\n"
+        "\n"
+        "Desired state:\n"
+        "  - od-edge-station00 (object-detection on edge for station00)\n"
+        "  - of-edge-fusion-c9b035cdedb8 (object-fusion on edge for edge/fusion)\n"
+        "\n"
+        "Listed, but not held:\n"
+        "  connection 'station00/edge' for vehicle00\n"
+        "\n"
+        "Operation: shutdown\n"
+        "Operation-Id: op-3\n"
+        "Demand-Id: 4175c26d59874079147c\n"
+        "Requester: vehicle00\n"
+        "Application: edge/fusion\n"
+        "Request-Id: intersection\n"
+        "Render-Version: 1\n"
+    )
+
+
+def test_following_people_says_what_changed_and_what_was_not_taken_in() -> None:
+    releases = [ReleaseChange("of-edge", "change", "object-fusion on edge", ("- replicas 1",))]
+    problems = [fault("nodes[0].id", "stands twice; remove one").within("inventory/nodes.yaml")]
+    assert message.of_follow(releases, "c" * 40, "b" * 40, problems) == (
+        "Carry out changes made in the state repo\n"
+        "\n"
+        "Why: commits up to cccccccccccc changed what is configured or booked.\n"
+        "\n"
+        "Desired state:\n"
+        "  ~ of-edge (object-fusion on edge)\n"
+        "      - replicas 1\n"
+        "\n"
+        "Not taken in, for it is not valid:\n"
+        "  inventory/nodes.yaml: nodes[0].id: stands twice; remove one\n"
+        "\n"
+        "Operation: follow\n"
+        f"Follows: {'c' * 40}\n"
+        f"Since: {'b' * 40}\n"
+        "Render-Version: 1\n"
+    )
+
+
+def test_a_subject_line_stays_short_however_long_the_ids(desk: Any) -> None:
+    decision = desk.join("vehicle00", application="edge/" + "fusion" * 40)
+    subject = message.of_decision(decision, "op-1", desk.now).split("\n")[0]
+    assert subject == "Join edge/" + ("fusion" * 40)[:79] + "…"
+    assert len(subject) == 90
+
+
+# ---- authors ----
+
+NASTY = [
+    "<script>",
+    "Ada <ada@example.org>",
+    ">",
+    "<>",
+    ".",
+    ". . .",
+    ",",
+    ";:,.",
+    "'",
+    '"',
+    "\\",
+    "\\\\",
+    '"\\\'"',
+    "-",
+    "--author=x",
+    "#1",
+    "日本 電気",
+    "Ωμέγα",
+    "🚗🚙",
+    "e\u0301",
+    "\u00e9",
+    "\u200bx",
+    "\u00ad",
+    "a\u00a0b",
+    "x" * 300,
+    "ü" * 300,
+    "🚗" * 300,
+    "a, b",
+    "Requester: somebody else",
+    "key: value",
+    "(cherry picked from commit 12ab)",
+    "---",
+    "diff --git a/x b/x",
+    "%H",
+    "$(touch /tmp/x)",
+    "{{ 7 * 7 }}",
+    "station00/a b",
+    "vehicle_00",
+    "Signed-off-by",
+    "a  b",
+    "%(trailers)",
+]
+
+
+def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly(
+    desk: Any, repo: pygit2.Repository
+) -> None:
+    tree = trees.write(repo, None, {"f": "x"})
+    failed, parents = [], list[pygit2.Oid]()
+    commits = {}
+    for name in NASTY:
+        assert id_problem(name) == "", name
+        decision = desk.join(name)
+        text = message.of_decision(decision, "op-1", desk.now)
+        try:
+            who = message.author(decision, desk.now)
+            committer = message.generator_signature(desk.now)
+            commit = repo.create_commit(None, who, committer, text, tree, parents)
+        except Exception as error:
+            failed.append(f"{name!r}: {error!r}")
+            continue
+        parents = [commit]
+        commits[name] = str(commit)
+        assert who.email.endswith("@demandops.invalid")
+        assert who.name.strip()
+        assert len(who.name) <= 200
+        assert history.entry_of(repo[commit].peel(pygit2.Commit)).trailers["Requester"] == [name]
+    repo.references.create("refs/heads/main", parents[0])
+    fsck = _git(repo, "fsck", "--strict", "--no-dangling")
+    read_back = {
+        name: _git(repo, "log", "-1", "--format=%(trailers:key=Requester,valueonly)", commit)
+        for name, commit in commits.items()
+    }
+    assert read_back == {name: f"{name}\n\n" for name in commits}
+    assert fsck == ""
+    assert failed == []
+
+
+@pytest.mark.parametrize(
+    ("names", "wanted"),
+    [
+        (("vehicle00", "station00"), "vehicle00, station00"),
+        (("Ada <ada@example.org>",), "Ada (ada@example.org)"),
+        (("x" * 300,), "x" * 199 + "…"),
+        ((".",), "unnamed"),
+        (("\\",), "unnamed"),
+        (("'quoted'",), "quoted"),
+    ],
+)
+def test_the_author_is_the_requesters_as_listed(
+    desk: Any, names: tuple[str, ...], wanted: str
+) -> None:
+    decision = desk.join(*names)
+    who = message.author(decision, desk.now)
+    assert who.name == wanted
+    demand = decision.changes.claims[0].key.demand
+    assert who.email == f"{demand}@demandops.invalid"
+    assert (who.time, who.offset) == (int(desk.now.timestamp()), 0)
+
+
+def _git(repo: pygit2.Repository, *args: str) -> str:
+    done = subprocess.run(
+        ["git", "-C", str(Path(repo.path)), *args],
+        capture_output=True,
+        check=False,
+        env={"PATH": "/usr/bin:/bin", "GIT_CONFIG_GLOBAL": "/dev/null"},
+    )
+    return (done.stdout + done.stderr).decode()

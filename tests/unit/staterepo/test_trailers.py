@@ -1,0 +1,128 @@
+"""What the generator reads out of a commit message is what plain git reads out of it."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pygit2
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from generator.catalog.identifiers import id_problem
+from generator.staterepo import history, message
+from generator.staterepo.history import operations_since, trailers_of
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("Subject\n\nKey: value\n", {"Key": ["value"]}),
+        ("Subject\n\nBody.\n\nA: 1\nB: 2\nA: 3\n", {"A": ["1", "3"], "B": ["2"]}),
+        ("Subject\n\nBody.\n\nA: 1", {"A": ["1"]}),
+        ("Subject\n\nBody.\n\nA: 1\n\n\n", {"A": ["1"]}),
+        ("Subject\n\nA: 1\n\nBody.\n", {}),
+        ("Key: value\n", {}),
+        ("Subject\nKey: value\n", {}),
+        ("Subject\n\nSome text: with a colon\n", {}),
+        ("Subject\n\nA: 1\nno colon\n", {}),
+        ("Subject\n\nA: 1: 2\n", {"A": ["1: 2"]}),
+        ("Subject\n\nSee https://example.org/: there\n", {}),
+        ("Subject\r\n\r\nA: 1\r\n", {}),
+        ("", {}),
+        ("\n\n\n", {}),
+        ('Revert "Join x"\n\nThis reverts commit 1234.\n', {}),
+    ],
+)
+def test_trailers_are_the_last_paragraph_if_it_holds_nothing_else(
+    text: str, wanted: dict[str, list[str]]
+) -> None:
+    assert trailers_of(text) == wanted
+
+
+def test_a_commit_that_a_person_picked_is_not_taken_for_the_generators() -> None:
+    text = "Join x\n\nOperation: join\nRender-Version: 1\n(cherry picked from commit 12ab)\n"
+    assert trailers_of(text) == {}
+
+
+IDS = st.text(
+    st.characters(exclude_categories=["Cs", "Cc", "Zl", "Zp"]), min_size=1, max_size=60
+).filter(lambda text: not id_problem(text))
+
+
+@given(names=st.lists(IDS, min_size=1, max_size=3, unique=True), request=IDS, application=IDS)
+@settings(
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+def test_every_id_is_read_back_by_git_and_by_us_as_it_was(
+    desk: Any, repo: pygit2.Repository, names: list[str], request: str, application: str
+) -> None:
+    decision = type(desk)().join(*names, id=request, application=application)
+    text = message.of_decision(decision, "op-1", desk.now)
+    who = message.author(decision, desk.now)
+    tree = repo.TreeBuilder().write()
+    commit = repo.create_commit(None, who, who, text, tree, [])
+    ours = history.entry_of(repo[commit].peel(pygit2.Commit)).trailers
+    assert ours["Requester"] == names
+    assert ours["Request-Id"] == [request]
+    assert ours["Application"] == [application]
+    for key, values in ours.items():
+        assert _by_git(Path(repo.path), str(commit), key) == values
+
+
+def _by_git(repo: Path, commit: str, key: str) -> Sequence[str]:
+    shown = subprocess.run(
+        [
+            *("git", "-C", str(repo), "log", "-1", "--encoding=UTF-8"),
+            f"--format=%(trailers:key={key},valueonly)",
+            commit,
+        ],
+        capture_output=True,
+        check=True,
+    )
+    return shown.stdout.decode().removesuffix("\n\n").split("\n")
+
+
+# ---- which demands arrived ----
+
+
+def _commit(repo: pygit2.Repository, operation: str, *parents: pygit2.Oid) -> pygit2.Oid:
+    who = pygit2.Signature("x", "x@example.org", 0, 0)
+    text = f"Join\n\nOperation-Id: {operation}\nRender-Version: 1\n" if operation else "By hand\n"
+    return repo.create_commit(None, who, who, text, repo.TreeBuilder().write(), list(parents))
+
+
+def test_operations_that_arrived_after_a_commit_are_found_and_no_others(
+    repo: pygit2.Repository,
+) -> None:
+    def found(tip: pygit2.Oid, base: str) -> dict[str, str]:
+        return {name: a.commit for name, a in operations_since(repo, tip, base).items()}
+
+    first = _commit(repo, "op-1")
+    second = _commit(repo, "op-2", first)
+    person = _commit(repo, "", second)
+    third = _commit(repo, "op-3", person)
+    assert found(third, str(first)) == {"op-2": str(second), "op-3": str(third)}
+    assert found(third, str(third)) == {}
+    everything = {"op-1": str(first), "op-2": str(second), "op-3": str(third)}
+    assert found(third, "") == everything, "where it is not known, all is read"
+    assert found(third, "0" * 40) == everything
+    assert found(third, "no commit") == everything
+    beside = _commit(repo, "op-9", first)
+    assert found(third, str(beside)) == everything, "not on this line"
+
+
+def test_the_newest_commit_of_the_generator_is_found_behind_those_of_people(
+    repo: pygit2.Repository,
+) -> None:
+    first = _commit(repo, "op-1")
+    person = _commit(repo, "", first)
+    assert history.last_generated(repo, _commit(repo, "", person)) == first
+    merge = _commit(repo, "", person, _commit(repo, "op-2", first))
+    assert history.last_generated(repo, merge) == first, "along the first parents"
+    assert history.last_generated(repo, _commit(repo, "")) is None

@@ -1,0 +1,194 @@
+"""`trees.write` and `trees.differences` against a dict that stands for a file tree."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import pygit2
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from generator.staterepo import tree as trees
+
+Files = dict[str, str]
+
+NAMES = st.sampled_from(["a", "b", "a.b", "a-b", "é", "A b"])
+PATHS = st.lists(NAMES, min_size=1, max_size=4).map("/".join)
+TEXTS = st.sampled_from(["", "x", "x\n", "ü{{ y }}\n"])
+
+
+def _without_conflict(paths: set[str], path: str) -> bool:
+    """Tell whether ``path`` can be a file beside ``paths``."""
+    return not any(o.startswith(f"{path}/") or path.startswith(f"{o}/") for o in paths - {path})
+
+
+@st.composite
+def file_trees(draw: st.DrawFn) -> Files:
+    files: Files = {}
+    for path, text in draw(st.dictionaries(PATHS, TEXTS, max_size=8)).items():
+        if _without_conflict(set(files), path):
+            files[path] = text
+    return files
+
+
+@st.composite
+def changes(draw: st.DrawFn, files: Files) -> dict[str, str | None]:
+    """Some removals (of files or of nothing) and some texts that can stand beside each other."""
+    known = st.sampled_from(sorted(files)) if files else PATHS
+    removed = draw(st.lists(known | PATHS, max_size=4))
+    made: dict[str, str | None] = {
+        path: None for path in removed if not any(file.startswith(f"{path}/") for file in files)
+    }
+    for path, text in draw(st.lists(st.tuples(known | PATHS, TEXTS), max_size=5)):
+        if _without_conflict({p for p, t in made.items() if t is not None}, path):
+            made[path] = text
+    order = draw(st.permutations(sorted(made)))
+    return {path: made[path] for path in order}
+
+
+def changed(files: Files, change: Mapping[str, str | None]) -> Files:
+    """The model: what is removed goes first, then a text takes the place of what is in its way."""
+    after = {path: text for path, text in files.items() if change.get(path, text) is not None}
+    for path, text in change.items():
+        if text is None:
+            continue
+        after = {known: t for known, t in after.items() if _without_conflict({known}, path)}
+        after[path] = text
+    return after
+
+
+@contextmanager
+def scratch() -> Iterator[pygit2.Repository]:
+    with tempfile.TemporaryDirectory() as folder:
+        pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)
+        try:
+            yield pygit2.init_repository(folder, bare=True)
+        finally:
+            pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
+
+
+def read(repo: pygit2.Repository, tree: pygit2.Oid) -> Files:
+    found = repo[tree]
+    assert isinstance(found, pygit2.Tree)
+    return {path: _text(repo, blob) for path, blob in trees.entries(found)}
+
+
+def _text(repo: pygit2.Repository, blob: pygit2.Oid) -> str:
+    found = repo[blob]
+    assert isinstance(found, pygit2.Blob)
+    return found.data.decode()
+
+
+def lay(repo: pygit2.Repository, files: Files) -> pygit2.Tree:
+    """Write a tree through an index, which is Git's own way."""
+    index = pygit2.Index()
+    for path, text in files.items():
+        blob = repo.create_blob(text.encode())
+        index.add(pygit2.IndexEntry(path, blob, pygit2.enums.FileMode.BLOB))
+    tree = repo[index.write_tree(repo)]
+    assert isinstance(tree, pygit2.Tree)
+    return tree
+
+
+RELAXED = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@given(data=st.data())
+@RELAXED
+def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.DataObject) -> None:
+    files = data.draw(file_trees(), "files")
+    change = data.draw(changes(files), "change")
+    with scratch() as repo:
+        made = trees.write(repo, lay(repo, files), change)
+        wanted = changed(files, change)
+        assert read(repo, made) == wanted
+        assert made == lay(repo, wanted).id, "same files, other tree: an empty folder or a mode"
+
+
+@given(data=st.data())
+@RELAXED
+def test_writing_onto_nothing_gives_the_files_alone(data: st.DataObject) -> None:
+    change = data.draw(changes({}), "change")
+    with scratch() as repo:
+        assert read(repo, trees.write(repo, None, change)) == changed({}, change)
+
+
+@given(before=file_trees(), after=file_trees())
+@RELAXED
+def test_differences_tell_just_what_differs_and_rebuild_the_one_from_the_other(
+    before: Files, after: Files
+) -> None:
+    with scratch() as repo:
+        old, new = lay(repo, before), lay(repo, after)
+        told = list(trees.differences(repo, old, new, ""))
+        paths = {path for path in {*before, *after} if before.get(path) != after.get(path)}
+        # a folder that takes a file's place is told as the file's end and its own files
+        assert {path for path, _ in told} == paths
+        assert len(told) == len(paths)
+        for path, blob in told:
+            assert (_text(repo, blob) if blob else None) == after.get(path)
+
+
+@pytest.mark.parametrize(
+    ("files", "change", "wanted"),
+    [
+        ({"a": "1"}, {"a/b": "2"}, {"a/b": "2"}),
+        ({"a": "1"}, {"a": None, "a/b": "2"}, {"a/b": "2"}),
+        ({"a": "1"}, {"a/b": "2", "a": None}, {"a/b": "2"}),
+        ({"a/b": "1", "a/c": "2"}, {"a": "3"}, {"a": "3"}),
+        ({"a/b": "1"}, {"a": "3", "a/b": None}, {"a": "3"}),
+        ({"a/b": "1"}, {"a/b": None, "a": "3"}, {"a": "3"}),
+        ({"a": "1", "c": "2"}, {"a/b": None}, {"a": "1", "c": "2"}),
+        ({"a/b/c/d": "1", "e": "2"}, {"a/b/c/d": None}, {"e": "2"}),
+        ({"a/b": "1"}, {"x/y/z": None}, {"a/b": "1"}),
+        ({"a": "1"}, {}, {"a": "1"}),
+    ],
+    ids=[
+        "a folder takes a file's place",
+        "a folder takes a removed file's place",
+        "in either order",
+        "a file takes a folder's place",
+        "a file takes the place of a folder whose files are removed",
+        "in either order, too",
+        "removing below a file removes nothing",
+        "empty folders go, all the way up",
+        "removing what is not there",
+        "no change",
+    ],
+)
+def test_files_and_folders_take_each_others_place(
+    repo: pygit2.Repository, files: Files, change: dict[str, str | None], wanted: Files
+) -> None:
+    made = trees.write(repo, lay(repo, files), change)
+    assert read(repo, made) == wanted
+    assert made == lay(repo, wanted).id
+
+
+def test_a_change_rewrites_only_the_folders_on_its_way(repo: pygit2.Repository) -> None:
+    base = lay(repo, {f"{top}/{n}": "x" for top in "abc" for n in range(3)})
+    made = repo[trees.write(repo, base, {"b/1": "y"})].peel(pygit2.Tree)
+    assert [made[name].id == base[name].id for name in "abc"] == [True, False, True]
+
+
+def test_bytes_that_are_no_text_show_instead_of_stopping(repo: pygit2.Repository) -> None:
+    builder = repo.TreeBuilder()
+    builder.insert("f", repo.create_blob(b"caf\xe9"), pygit2.enums.FileMode.BLOB)
+    tree = repo[builder.write()].peel(pygit2.Tree)
+    assert trees.read_text(tree, "f") == "caf\ufffd"
+    assert trees.texts(tree, ("f", "nothing")) == {"f": "caf\ufffd"}
+    assert trees.read_text(tree, "nothing/there") is None
+
+
+def test_a_submodule_and_a_link_are_no_files_of_ours(repo: pygit2.Repository) -> None:
+    builder = repo.TreeBuilder()
+    builder.insert("sub", pygit2.Oid(hex="1" * 40), pygit2.enums.FileMode.COMMIT)
+    builder.insert("f", repo.create_blob(b"x"), pygit2.enums.FileMode.BLOB)
+    inner = builder.write()
+    builder = repo.TreeBuilder()
+    builder.insert("top", inner, pygit2.enums.FileMode.TREE)
+    tree = repo[builder.write()].peel(pygit2.Tree)
+    assert trees.texts(tree, ("top",)) == {"top/f": "x"}
+    assert [path for path, _ in trees.differences(repo, None, tree, "")] == ["top/f"]
