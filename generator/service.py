@@ -377,6 +377,7 @@ class Generator:
                 return Withdrawn(_TAKEN_BACK)
             return self._commit(line, ticket, decision)
         except InvalidInput as error:
+            line.note(ticket.operation, "Refused")
             return error
         except Exception as error:  # one demand that the program cannot handle stops no other
             log.exception("a fault of the generator, at demand %s", ticket.operation)
@@ -395,7 +396,7 @@ class Generator:
             self._tell(ticket, "committed", f"committed {commit}")
         else:
             commit = str(line.head.commit)
-            line.note_unchanged(ticket.operation)
+            line.note(ticket.operation, "Unchanged")
         return Receipt(
             operation=ticket.operation,
             request_id=decision.request.id,
@@ -416,10 +417,15 @@ class Generator:
             found |= history.operations_since(self._repository.objects, start.commit, base)
         return found
 
-    def _published_before(self, ticket: Ticket, arrival: history.Arrival) -> Receipt:
+    def _published_before(
+        self, ticket: Ticket, arrival: history.Arrival
+    ) -> Receipt | DemandOpsError:
+        if arrival.outcome == "refused":
+            message = "was refused when the connection was cut; send it again to hear why"
+            return Refused([fault("", message, code="refused")])
         goal = ticket.goal if isinstance(ticket.goal, dict) else {}
         outcome: Outcome = "released" if goal.get("shutdown") else "booked"
-        if not arrival.changed:
+        if arrival.outcome == "unchanged":
             outcome = "unchanged"
         return Receipt(ticket.operation, str(goal.get("id", "")), outcome, arrival.commit)
 

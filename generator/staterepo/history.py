@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from typing import Literal
 
 import pygit2
 from pygit2 import Commit, Oid, Repository
@@ -71,12 +72,19 @@ def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> It
         yield entry_of(commit)
 
 
+_OUTCOMES: dict[str, Literal["changed", "unchanged", "refused"]] = {
+    "Operation-Id": "changed",
+    "Unchanged-Operation-Id": "unchanged",
+    "Refused-Operation-Id": "refused",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """Where a demand is found in history, and whether it changed anything."""
+    """Where a demand is found in history, and what came of it."""
 
     commit: str
-    changed: bool
+    outcome: Literal["changed", "unchanged", "refused"]
 
 
 def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Arrival]:
@@ -93,9 +101,9 @@ def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Arrival
         return {}
     found = {}
     for entry in walk(repo, tip, until):
-        for key, changed in (("Operation-Id", True), ("Unchanged-Operation-Id", False)):
+        for key, outcome in _OUTCOMES.items():
             for operation in entry.trailers.get(key, ()):
-                found[operation] = Arrival(entry.commit, changed)
+                found[operation] = Arrival(entry.commit, outcome)
     return found
 
 

@@ -47,9 +47,9 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 
 
 def of_decision(
-    decision: Decision, operation: str, received: datetime, unchanged: Iterable[str] = ()
+    decision: Decision, operation: str, received: datetime, settled: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of a demand's commit; ``unchanged`` were judged just before it."""
+    """Return the message of a demand's commit; ``settled``: demands just before it, as trailers."""
     request = decision.request
     joining = request.operation is Operation.JOIN
     subjects = decision.changes.subjects()
@@ -70,7 +70,7 @@ def of_decision(
     trailers = [
         ("Operation", request.operation.value),
         ("Operation-Id", operation),
-        *(("Unchanged-Operation-Id", other) for other in unchanged),
+        *settled,
         *(("Demand-Id", demand) for demand in dict.fromkeys(c.key.demand for c in claims)),
         *(("Requester", requester) for requester in request.requesters()),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),

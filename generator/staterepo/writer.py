@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
+from typing import Literal
 
 import pygit2
 from pygit2 import Oid, Signature
@@ -35,7 +36,7 @@ class Line:
         self._repository = repository
         self._objects = repository.objects
         self._tree = snapshots.commit_of(self._objects, start.commit).tree
-        self._unchanged: list[str] = []
+        self._settled: list[tuple[str, str]] = []
         self.start = start
         self.head = start
 
@@ -45,20 +46,20 @@ class Line:
 
     def commit(self, decision: Decision, operation: str, received: datetime, now: datetime) -> str:
         """Commit one demand on top of the line and return the commit's id."""
-        text = message.of_decision(decision, operation, received, self._unchanged)
-        self._unchanged = []
+        text = message.of_decision(decision, operation, received, self._settled)
+        self._settled = []
         made = self._write(decision.files, text, message.author(decision, received), now)
         keys = [change.key for change in decision.changes.claims]
         self.head = self.head.after(made, decision.state, keys)
         return str(made)
 
-    def note_unchanged(self, operation: str) -> None:
+    def note(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
         """Have the next commit name a demand that changed nothing, if there is a next one.
 
         Should the process die before it answers, that demand must not be judged again behind a
         release that came after it.
         """
-        self._unchanged.append(operation)
+        self._settled.append((f"{outcome}-Operation-Id", operation))
 
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
         """Commit what people's changes ask of the rendered files, if anything.
