@@ -61,10 +61,12 @@ class Floor:
         return time.perf_counter() - start
 
 
-def measure(folder: Path, releases: int, progress: Progress) -> dict[str, float]:
+def measure(
+    folder: Path, releases: int, edges_per_cluster: int, progress: Progress
+) -> dict[str, float]:
     """Return the figures for one size, in milliseconds."""
     task = progress.add_task(f"{releases} releases: laying down the fleet", total=None)
-    laid = fleet.lay_down(folder / "state-repo.git", releases)
+    laid = fleet.lay_down(folder / "state-repo.git", releases, edges_per_cluster)
     progress.update(task, description=f"{releases} releases: reading the ledger")
     start = time.perf_counter()
     generator = Generator(str(laid.path), data=folder / "data")
@@ -139,6 +141,9 @@ def main() -> int:
     parser.add_argument(
         "--sizes", type=int, nargs="+", default=SIZES, help="releases to measure at"
     )
+    parser.add_argument(
+        "--edges-per-cluster", type=int, default=10, help="how crowded the clusters are"
+    )
     parser.add_argument("--output", type=Path, default=Path("build/bench.json"))
     args = parser.parse_args()
     out = Console(highlight=False)
@@ -148,7 +153,7 @@ def main() -> int:
         for releases in args.sizes:
             folder = Path(tempfile.mkdtemp(prefix="bench-", dir=args.output.parent))
             try:
-                rows.append(measure(folder, releases, progress))
+                rows.append(measure(folder, releases, args.edges_per_cluster, progress))
             finally:
                 shutil.rmtree(folder, ignore_errors=True)
     table = Table(title="From submit to durable commit (milliseconds)")

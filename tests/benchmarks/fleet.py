@@ -1,7 +1,8 @@
 """A fleet of any size, laid down at once: what the benchmarks measure on.
 
-Edges with ten vehicles each; every vehicle has a connection (two releases) and a detection on its
-edge, every edge a fusion. Nodes, claims and rendered files are what the generator itself writes.
+Regions, each a cluster, of ten edges with ten vehicles each; every vehicle has a connection (two
+releases) and a detection on its edge, every edge a fusion. Nodes, claims and rendered files are
+what the generator itself writes.
 """
 
 from __future__ import annotations
@@ -68,23 +69,36 @@ def goal(edge: str, vehicle: str, *, shutdown: bool = False) -> dict[str, Any]:
     }
 
 
-def _nodes(edges: int) -> str:
+def _region(number: int, edges_per_cluster: int) -> str:
+    return f"region{number // edges_per_cluster:04d}"
+
+
+def _nodes(edges: int, edges_per_cluster: int) -> str:
     nodes: list[dict[str, str]] = [
-        {"id": "cloud", "type": "cloud", "cluster": "c-its"},
+        {"id": "cloud", "type": "cloud", "cluster": _region(0, edges_per_cluster)},
     ]
     for number in range(edges):
         edge = edge_id(number)
-        nodes.append({"id": edge, "type": "edge", "cluster": "c-its"})
+        region = _region(number, edges_per_cluster)
+        nodes.append({"id": edge, "type": "edge", "cluster": region})
         names = [f"v{number:05d}x{i}" for i in range(VEHICLES_PER_EDGE)] + [f"{SPARE}{number:05d}"]
-        nodes += [{"id": name, "type": "vehicle", "cluster": "c-its"} for name in names]
+        nodes += [{"id": name, "type": "vehicle", "cluster": region} for name in names]
     return yamlio.dump({"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": nodes})
 
 
-def lay_down(path: Path, releases: int) -> Fleet:
-    """Make a bare state repo with about ``releases`` releases running."""
+def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
+    """Make a bare state repo with about ``releases`` releases running, by regions."""
     edges = max(1, round(releases / RELEASES_PER_EDGE))
     files = layout.files()
-    files["inventory/nodes.yaml"] = _nodes(edges)
+    files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster)
+    regions = sorted({_region(number, edges_per_cluster) for number in range(edges)})
+    files["inventory/clusters.yaml"] = yamlio.dump(
+        {
+            "apiVersion": "demandops/v1",
+            "kind": "Clusters",
+            "clusters": [{"name": region} for region in regions],
+        }
+    )
     files["inventory/brokers.yaml"] = yamlio.dump(
         {
             "apiVersion": "demandops/v1",
