@@ -232,6 +232,8 @@ class Generator:
     def _end(self, timeout: float, finished: Future[bool]) -> None:
         self._worker.join(timeout)
         self._giving_up.set()
+        if self._worker.is_alive():
+            self._repository.give_up()
         self._worker.join()
         left = len(self._slot.outbox.pending)
         self._slot.close()

@@ -130,6 +130,7 @@ def verify(revisions: str | None, state_repo: str, output: str) -> None:
                     "summary": verdict.summary,
                     "holds": verdict.holds,
                     "skipped": verdict.skipped or None,
+                    "fault": verdict.fault or None,
                     "differing": list(verdict.differing),
                 }
                 for verdict in verdicts
@@ -141,6 +142,8 @@ def verify(revisions: str | None, state_repo: str, output: str) -> None:
             word = "skipped" if verdict.skipped else "holds" if verdict.holds else "DIFFERS"
             note = f" ({verdict.skipped})" if verdict.skipped else ""
             out.print(f"{verdict.commit[:10]} {word}{note}  {verdict.summary}")
+            if verdict.fault:
+                out.print(f"    its books cannot be rendered any more: {verdict.fault}")
             for path in verdict.differing:
                 out.print(f"    {path}")
         skipped = sum(bool(verdict.skipped) for verdict in verdicts)

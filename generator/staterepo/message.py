@@ -82,7 +82,11 @@ def of_decision(
 
 
 def of_follow(
-    releases: Iterable[ReleaseChange], cause: str, since: str, problems: Iterable[Fault]
+    releases: Iterable[ReleaseChange],
+    cause: str,
+    since: str,
+    problems: Iterable[Fault],
+    more: Iterable[tuple[str, str]] = (),
 ) -> str:
     """Return the message of a commit that carries out what people changed in the state repo."""
     problems = list(problems)
@@ -99,6 +103,7 @@ def of_follow(
         ("Operation", "follow"),
         ("Follows", cause),
         ("Since", since),
+        *more,
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"

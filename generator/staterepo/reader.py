@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pygit2 import Commit
@@ -30,6 +30,7 @@ class Verdict:
     summary: str
     holds: bool
     skipped: str = ""
+    fault: str = ""
     differing: tuple[str, ...] = ()
 
 
@@ -105,12 +106,27 @@ class Reader:
                 f"rendered by version {version}, this is version {RENDER_VERSION}",
             )
         try:
-            snapshot = snapshots.load(self._repository.objects, commit.id)
-            differing = _differing(rendered(snapshot.state), commit)
+            snapshot = self._in_force_at(commit, entry.one("In-Force"))
         except InvalidInput as error:
             why = f"a person's file was not valid then: {error.faults[0]}"
             return Verdict(entry.commit, entry.summary, True, why)
+        try:
+            wanted = rendered(snapshot.state)
+        except InvalidInput as error:  # the generator did render it then, so it must now
+            return Verdict(entry.commit, entry.summary, False, fault=str(error.faults[0]))
+        differing = _differing(wanted, commit)
         return Verdict(entry.commit, entry.summary, not differing, differing=differing)
+
+    def _in_force_at(self, commit: Commit, sound: str) -> Snapshot:
+        """Return what the generator went by at one of its commits.
+
+        ``sound`` is the commit whose configuration was in force, where people had broken theirs.
+        """
+        if not sound:
+            return snapshots.load(self._repository.objects, commit.id)
+        snapshot = snapshots.load(self._repository.objects, sound)
+        later = snapshots.advance(self._repository.objects, snapshot, commit.id).snapshot
+        return replace(later, state=replace(snapshot.state, ledger=later.state.ledger))
 
 
 def _differing(wanted: dict[str, str], commit: Commit) -> tuple[str, ...]:

@@ -7,8 +7,11 @@ succeeds only on top of what was there: never a forced push, never a merge of te
 from __future__ import annotations
 
 import logging
+import os
 import re
 import shutil
+import signal
+import subprocess
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -81,6 +84,9 @@ class StateRepository(ABC):
         Raises:
             RemoteAway, PushDenied: where it could not be published for another reason.
         """
+
+    def give_up(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
+        """End what is under way with a remote; nothing where there is none."""
 
     def tidy(self) -> None:
         """Let git pack loose objects, if there are many; it does so in a process of its own."""
@@ -169,6 +175,8 @@ class ClonedRepository(StateRepository):
         self.address = without_secrets(url)
         self._url = url
         self._folder = folder
+        self._given_up = False
+        self._talking: subprocess.Popen[bytes] | None = None
         for lock in folder.rglob("*.lock"):  # the folder is ours alone: a killed process left it
             lock.unlink(missing_ok=True)
         if not self._is_sound():
@@ -196,14 +204,15 @@ class ClonedRepository(StateRepository):
         with git.Repo.init(partial, bare=True) as repo:
             with repo.config_writer() as config:
                 config.set_value('remote "origin"', "url", self._url)
-                config.set_value('remote "origin"', "fetch", f"+{_MAIN}:{_REMOTE_MAIN}")
             partial.joinpath("config").chmod(0o600)
             self._fetch(repo)
         partial.rename(self._folder)
 
     def _fetch(self, repo: git.Repo) -> None:
         try:
-            _git(repo, "fetch", "--no-tags", "--quiet", "origin")
+            # told here, not configured: a push that outlives a killed generator moves nothing here
+            spec = f"+{_MAIN}:{_REMOTE_MAIN}"
+            self._talk(repo, "fetch", "--no-tags", "--quiet", "origin", spec)
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
             if "couldn't find remote ref" in text:
@@ -227,7 +236,9 @@ class ClonedRepository(StateRepository):
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Push ``commit``; the remote takes it only on top of what it has."""
         try:
-            _git(self._git, "push", "--porcelain", "--quiet", "origin", f"{commit}:{_MAIN}")
+            lease = f"--force-with-lease={_MAIN}:{expected}"  # forces nothing: commit is on top
+            spec = f"{commit}:{_MAIN}"
+            self._talk(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
         except git.GitCommandError as error:
             text = without_secrets(f"{error.stdout}\n{error.stderr}")
             tip = self.refresh()
@@ -238,6 +249,38 @@ class ClonedRepository(StateRepository):
             raise self._why_not(text) from None
         self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         return True
+
+    def _talk(self, repo: git.Repo, *command: str) -> None:
+        if self._given_up:
+            raise RemoteAway(f"{self.address} was given up")
+        with repo.git.custom_environment(**_ENVIRONMENT):
+            guard = repo.git.execute(  # kept: it ends the process when it goes
+                [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
+                as_process=True,
+                start_new_session=True,
+            )
+        process = guard.proc
+        assert process is not None  # noqa: S101 - it was started just now
+        self._talking = process
+        if self._given_up:  # between the first look and now
+            self.give_up()
+        try:
+            out, err = process.communicate(timeout=_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            out, err = process.communicate()
+        finally:
+            self._talking = None
+        if process.returncode:
+            raise git.GitCommandError(list(command), process.returncode, err, out)
+
+    def give_up(self) -> None:
+        """End what git is waiting for, and start nothing more."""
+        self._given_up = True
+        process = self._talking
+        if process is not None:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGTERM)
 
     def _why_not(self, text: str) -> StateRepoError:
         """Tell a push that can be tried again from one that is denied."""

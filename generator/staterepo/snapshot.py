@@ -34,13 +34,15 @@ class Snapshot:
     """A commit and what it says.
 
     ``keys`` finds the claim behind a ledger file, so that a removed file is understood.
-    ``problems`` are files that are not valid and whose last valid version is in force.
+    ``problems`` are files that are not valid and whose last valid version is in force; ``sound`` is
+    the newest commit without any.
     """
 
     commit: Oid
     state: State
     keys: HashTrieMap[str, ClaimKey]
     problems: tuple[Fault, ...] = ()
+    sound: Oid | None = None
 
     def after(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
         """Return the snapshot of a commit of our own, whose state is known already."""
@@ -51,7 +53,8 @@ class Snapshot:
                 keys = keys.insert(path, key)
             elif path in keys:
                 keys = keys.remove(path)
-        return replace(self, commit=commit, state=state, keys=keys)
+        sound = self.sound if self.problems else commit
+        return replace(self, commit=commit, state=state, keys=keys, sound=sound)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +98,7 @@ def load(
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
     if faults:
         raise InvalidInput(faults)
-    return Snapshot(commit.id, State.of(catalog, ledger), keys)
+    return Snapshot(commit.id, State.of(catalog, ledger), keys, sound=commit.id)
 
 
 def load_last_valid(
@@ -118,7 +121,9 @@ def load_last_valid(
         claim = _last_valid_claim(commit, path)
         if claim is not None:
             ledger, keys = ledger.replace(claim.key, claim), keys.insert(path, claim.key)
-    return Snapshot(commit.id, State.of(catalog, ledger), keys, (*problems, *faults))
+    problems += faults
+    sound = None if problems else commit.id
+    return Snapshot(commit.id, State.of(catalog, ledger), keys, tuple(problems), sound)
 
 
 def refuse_newer(tree: Tree) -> None:
@@ -275,7 +280,9 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     ]
     state = replace(state, ledger=ledger)
     return Advance(
-        Snapshot(to, state, keys, tuple(problems)), tuple(dict.fromkeys(subjects)), catalog_changed
+        Snapshot(to, state, keys, tuple(problems), snapshot.sound if problems else to),
+        tuple(dict.fromkeys(subjects)),
+        catalog_changed,
     )
 
 

@@ -46,7 +46,9 @@ class Line:
 
     def commit(self, decision: Decision, operation: str, received: datetime, now: datetime) -> str:
         """Commit one demand on top of the line and return the commit's id."""
-        text = message.of_decision(decision, operation, received, self._settled)
+        text = message.of_decision(
+            decision, operation, received, [*self._settled, *_in_force(self.head)]
+        )
         self._settled = []
         made = self._write(decision.files, text, message.author(decision, received), now)
         keys = [change.key for change in decision.changes.claims]
@@ -79,10 +81,15 @@ class Line:
                 advance = replace(advance, catalog_changed=False)
         if not advance.catalog_changed:
             state, change = self._carried_out(state, before, advance.subjects, problems)
-        self.head = replace(snapshot, state=state, problems=tuple(problems))
+        sound = before.sound if problems else snapshot.commit
+        self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
         if change.files:
             text = message.of_follow(
-                change.releases, str(snapshot.commit), str(before.commit), problems
+                change.releases,
+                str(snapshot.commit),
+                str(before.commit),
+                problems,
+                _in_force(self.head),
             )
             made = self._write(change.files, text, message.generator_signature(now), now)
             self.head = self.head.after(made, state, ())
@@ -148,6 +155,11 @@ class Line:
         return self._repository.publish(self.start.commit, self.head.commit)
 
 
+def _in_force(snapshot: Snapshot) -> list[tuple[str, str]]:
+    """Return the trailer that names whose configuration is in force, where it is another's."""
+    return [("In-Force", str(snapshot.sound))] if snapshot.problems and snapshot.sound else []
+
+
 def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
     """Load the books at the generator's last commit.
 
@@ -161,4 +173,6 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
     tip = repository.tip()
     snapshots.refuse_newer(snapshots.commit_of(repository.objects, tip).tree)
     base = history.last_generated(repository.objects, tip)
-    return snapshots.load_last_valid(repository.objects, base or tip, progress)
+    base = base or tip
+    told = history.entry_of(snapshots.commit_of(repository.objects, base)).one("In-Force")
+    return snapshots.load_last_valid(repository.objects, told or base, progress)

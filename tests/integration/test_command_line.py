@@ -556,6 +556,7 @@ class TestVerify:
             "summary": "Forged",
             "holds": False,
             "skipped": None,
+            "fault": None,
             "differing": [path],
         }
 

@@ -249,6 +249,32 @@ def test_a_node_taken_away_is_gone_for_new_demands_once_it_is_released(
             rig.book(generator, goal(1))
 
 
+@pytest.mark.parametrize("restarted", [False, True], ids=["running", "restarted"])
+def test_what_an_inventory_changed_is_carried_out_once_nothing_stands_in_its_way(
+    address: str, bare: Path, person: Person, restarted: bool
+) -> None:
+    """A broker moves in the same push that takes away a node in use, which is released later."""
+    nodes = rig.git(bare, "show", f"main:{NODES}") + "\n"
+    brokers = rig.git(bare, "show", f"main:{BROKERS}") + "\n"
+    start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
+    both = {
+        NODES: nodes[:start] + nodes[end:],
+        BROKERS: brokers.replace("service-mqtt-broker-edge", "broker-of-the-edge"),
+    }
+    released: list[rig.Goal] = [leave(1), goal(3)]
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1), goal(2))
+        person.change(both, "vehicle01 is sold, the broker moves")
+        rig.book(generator, goal(6), *([] if restarted else released))
+    if restarted:
+        with rig.running(address) as generator:
+            rig.book(generator, *released)
+    command = ["grep", "-l", "service-mqtt-broker-edge", "main", "--", "clusters"]
+    standing = rig.git(bare, *command, check=False).splitlines()
+    assert standing == [], "these are still told the old broker"
+    rig.assert_sound(bare)
+
+
 def test_a_generated_file_that_a_person_edited_is_put_right_with_the_next_commit(
     address: str, bare: Path, person: Person
 ) -> None:
@@ -281,6 +307,18 @@ def test_the_remote_is_never_force_pushed_and_nothing_is_merged(
     for older, newer in pairwise(moves):
         rig.git(bare, "merge-base", "--is-ancestor", older, newer)
     assert _kinds(bare) == ["join", *["person", "join"] * 3]
+    rig.assert_sound(bare)
+
+
+def test_a_person_who_takes_commits_back_has_the_last_word(address: str, bare: Path) -> None:
+    """Reset to an older commit, and a demand that was judged on the newer one goes on top of it."""
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        older = rig.tip(bare)
+        rig.book(generator, goal(2))
+        rig.git(bare, "update-ref", "refs/heads/main", older)
+        rig.book(generator, goal(3))
+    assert rig.books(bare) == rig.books_after([goal(1), goal(3)])
     rig.assert_sound(bare)
 
 

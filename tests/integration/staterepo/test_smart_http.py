@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from git_over_http import Server, serving
 from staterepo_rig import Gate, goal, leave
 
 from generator.errors import StateRepoError
+from generator.service import Generator
 
 
 @pytest.fixture
@@ -145,6 +147,29 @@ def test_a_server_that_forbids_the_push_is_told_and_not_asked_for_ever(
         server.faults.no_pushes = 0
         assert rig.book(generator, goal(2))[0].outcome == "booked"
     assert rig.books(bare) == rig.books_after([goal(2)])
+
+
+@pytest.mark.limit(20)
+def test_closing_does_not_wait_for_a_server_that_never_answers(
+    http: str, server: Server, bare: Path
+) -> None:
+    generator = Generator(http)
+    rig.book(generator, goal(1))
+    server.faults.hang = threading.Event()
+    try:
+        generator.submit(goal(2), "op-2")
+        time.sleep(0.3)
+        stopped = generator.stop(timeout=0.5)
+        try:
+            published = stopped.result(8)
+        except TimeoutError:
+            pytest.fail("8 s after close(timeout=0.5) the generator still waits for the server")
+    finally:
+        server.faults.hang.set()
+        server.faults.hang = None
+    assert published is False
+    assert rig.restart(http) is True
+    assert rig.operations(bare)[-1] == "op-2"
 
 
 def test_two_generators_push_over_http_at_once(
