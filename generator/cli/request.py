@@ -134,7 +134,7 @@ def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str
 
 def _book(documents: list[_Document], state_repo: str) -> list[dict[str, Any]]:
     with progress("reading the ledger") as tell:
-        generator = Generator(state_repo, progress=tell)
+        generator = Generator(state_repo, patient=False, progress=tell)
     try:
         tickets = [generator.submit(document.goal) for document in documents]
         rows = []

@@ -171,7 +171,7 @@ def _refuse_checked_out(path: Path) -> None:
 class ClonedRepository(StateRepository):
     """A bare clone of a remote; clone, fetch and push run git itself, with the user's set-up."""
 
-    def __init__(self, url: str, folder: Path, say: Say) -> None:
+    def __init__(self, url: str, folder: Path, say: Say, patient: bool) -> None:
         self.address = without_secrets(url)
         self._url = url
         self._folder = folder
@@ -183,7 +183,12 @@ class ClonedRepository(StateRepository):
             self._clone(say)
         self._git = git.Repo(folder)
         self.objects = Repository(str(folder))
-        self.refresh()
+        try:
+            self.refresh()
+        except RemoteAway as error:
+            if not patient:
+                raise
+            log.warning("%s; going on from what was fetched last", error)
 
     def _is_sound(self) -> bool:
         """Tell whether the clone of an earlier run can be used (a crash may have cut it off)."""
@@ -338,20 +343,23 @@ def _check_url(url: str) -> None:
         )
 
 
-def connect(address: str, folder: Path, say: Say = lambda text: None) -> StateRepository:
+def connect(
+    address: str, folder: Path, say: Say = lambda text: None, *, patient: bool = False
+) -> StateRepository:
     """Open the state repo at ``address``.
 
     Args:
         address: a folder with a bare repository, or any URL that git clones.
         folder: where the clone of a URL is kept.
         say: told about work that takes a while.
+        patient: whether a clone that is here already will do where its remote is away.
 
     Raises:
         StateRepoError: saying what is wrong with the address and how to mend it.
     """
     if is_url(address):
         _check_url(address)
-        return ClonedRepository(address, folder / "clone.git", say)
+        return ClonedRepository(address, folder / "clone.git", say, patient)
     path = Path(address).expanduser()
     if not path.is_dir():
         raise StateRepoError(

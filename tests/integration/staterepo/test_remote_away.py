@@ -73,6 +73,29 @@ def test_closing_while_the_remote_is_away_leaves_the_demands_to_the_next_start(
     rig.assert_sound(bare)
 
 
+def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    generator = Generator(url)
+    rig.book(generator, goal(0))
+    with away(bare):
+        left = generator.submit(goal(1), "op-1")
+        assert generator.close(timeout=0.3) is False
+        assert isinstance(left.future.exception(0), ShuttingDown)
+        with pytest.raises(StateRepoError, match="cannot be fetched"):
+            Generator(url, patient=False)
+        generator = Generator(url)
+        assert "going on from what was fetched last" in caplog.text
+        fresh = generator.submit(goal(2), "op-2")
+        rig.wait_until(lambda: "trying again" in caplog.text, "it goes on trying")
+        assert not fresh.future.done()
+    rig.receipt(fresh)
+    assert generator.close() is True
+    assert rig.operations(bare)[-2:] == ["op-1", "op-2"]
+    assert rig.books(bare) == rig.books_after(map(goal, range(3)))
+    rig.assert_sound(bare)
+
+
 def test_what_waits_in_the_outbox_is_judged_on_what_the_remote_has_become(
     url: str, bare: Path, tmp_path: Path
 ) -> None:

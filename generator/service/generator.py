@@ -1,0 +1,155 @@
+"""The generator: takes demands from any thread, and runs the one that settles them."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+
+from generator import settings
+from generator.catalog.catalog import Catalog
+from generator.errors import DemandOpsError, ShuttingDown, StateRepoError
+from generator.service.settling import Settler
+from generator.service.ticket import Listener, Ticket, handed_in
+from generator.service.waiting import Waiting
+from generator.staterepo import remote, writer
+from generator.staterepo.outbox import Slot
+from generator.staterepo.snapshot import Progress, Snapshot
+
+log = logging.getLogger("demandops")
+
+_STOP_TIMEOUT_S = 20.0
+
+
+class Generator:
+    """Takes demands from any thread and turns them into commits of one state repo."""
+
+    def __init__(
+        self,
+        state_repo: str,
+        *,
+        data: Path | None = None,
+        queue_limit: int = settings.QUEUE_LIMIT,
+        patient: bool = True,
+        progress: Progress = lambda done, total: None,
+        on_published: Callable[[Catalog], None] = lambda catalog: None,
+    ) -> None:
+        """Open the state repo and start the worker; what an earlier run left over comes first.
+
+        Args:
+            state_repo: a folder with a bare repository, or a URL that git clones.
+            data: where outbox and clone are kept; by default :func:`settings.data_home`.
+            queue_limit: how many demands may wait.
+            patient: whether to start while the remote is away, from what was fetched last.
+            progress: told (files read, files in all) while the ledger is loaded.
+            on_published: called in the worker thread after every push, with the catalog in force;
+                must return at once.
+
+        Raises:
+            StateRepoError, InvalidInput: where the state repo cannot be used.
+        """
+        self._slot = Slot(data or settings.data_home(state_repo))
+        try:
+            repository = remote.connect(state_repo, self._slot.folder, log.info, patient=patient)
+            snapshot = writer.first_snapshot(repository, progress)
+        except BaseException:
+            self._slot.close()
+            raise
+        self.given_address = state_repo
+        self.address = repository.address
+        self.queue_limit = queue_limit
+        self._waiting = Waiting(self._slot.outbox, queue_limit)
+        self._settler = Settler(repository, snapshot, self._waiting, on_published)
+        self._finished: Future[bool] | None = None
+        self._stop_lock = threading.Lock()
+        for operation in self._waiting.operations:
+            log.info("taking up demand %s from the outbox", operation)
+        self._worker = threading.Thread(target=self._run, name="demandops-writer", daemon=True)
+        self._worker.start()
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The newest published state; safe to read from any thread."""
+        return self._settler.snapshot
+
+    def submit(
+        self,
+        goal: object,
+        operation: str | None = None,
+        listener: Listener = lambda stage, text: None,
+    ) -> Ticket:
+        """Hand in a demand; returns at once.
+
+        Args:
+            goal: the reference's action goal as plain data (:mod:`generator.demand.wire`).
+            operation: a unique id for this hand-in; one is made where it is left out.
+            listener: told each stage, from the worker thread.
+
+        Returns:
+            A ticket whose future gives the :class:`Receipt`, or raises ``Refused`` with every
+            fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``.
+
+        Raises:
+            ShuttingDown, QueueFull: where the demand is not taken at all.
+        """
+        ticket = handed_in(goal, operation, listener)
+        if not ticket.future.done():
+            ticket.base = str(self.snapshot.commit)
+            self._waiting.add(ticket)
+        return ticket
+
+    def withdraw(self, operation: str) -> bool:
+        """Take a demand back. False once it is committed, or was never known."""
+        return self._waiting.withdraw(operation)
+
+    def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
+        """Refuse further demands, finish what is in hand and stop; returns at once.
+
+        Args:
+            timeout: seconds to wait for a remote that is away; then what is left stays in the
+                outbox for the next start, and its futures raise ``ShuttingDown``.
+
+        Returns:
+            A future that tells, when all has ended, whether everything was published.
+        """
+        with self._stop_lock:
+            if self._finished is not None:
+                return self._finished
+            self._finished = finished = Future[bool]()
+        self._waiting.close()
+        threading.Thread(
+            target=self._end, args=(timeout, finished), name="demandops-stop", daemon=True
+        ).start()
+        return finished
+
+    def _end(self, timeout: float, finished: Future[bool]) -> None:
+        self._worker.join(timeout)
+        if self._worker.is_alive():
+            self._settler.give_up()
+        self._worker.join()
+        left = self._waiting.unpublished
+        self._slot.close()
+        finished.set_result(not left)
+
+    def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
+        """Stop and wait for the end; return whether everything was published."""
+        return self.stop(timeout).result()
+
+    def _run(self) -> None:
+        """Settle what comes until all is settled and no more is taken; in the worker thread."""
+        while self._waiting.wait(timeout=None):
+            batch: list[Ticket] = []
+            try:
+                self._settler.settle(batch)
+                self._settler.catch_up()
+                self._settler.tidy()
+            except ShuttingDown as error:
+                self._waiting.fail(batch, error, keep=True)
+            except DemandOpsError as error:
+                self._waiting.fail(batch, error)
+            except Exception as error:
+                log.exception("a fault of the generator")
+                told = StateRepoError(f"a fault of the generator: {error!r}; its log says more")
+                self._waiting.fail(batch, told)

@@ -1,0 +1,224 @@
+"""Settling: a batch of demands is judged, committed and published, however often the remote moves.
+
+Belongs to one thread, the only one that writes to the state repo.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import threading
+from collections.abc import Callable
+from datetime import datetime, timezone
+from typing import TypeAlias
+
+from generator.catalog.catalog import Catalog
+from generator.decision import Decision, Outcome, decide
+from generator.errors import (
+    DemandOpsError,
+    InvalidInput,
+    Refused,
+    ShuttingDown,
+    StateRepoError,
+    Withdrawn,
+    fault,
+)
+from generator.service.ticket import Receipt, Ticket
+from generator.service.waiting import TAKEN_BACK, Waiting
+from generator.staterepo import history, writer
+from generator.staterepo import snapshot as snapshots
+from generator.staterepo.remote import PushDenied, RemoteAway, StateRepository
+from generator.staterepo.snapshot import Snapshot
+
+log = logging.getLogger("demandops")
+
+_FIRST_PAUSE_S = 0.05
+_LONGEST_PAUSE_S = 10.0
+_BATCH_LIMIT_EMBEDDED = 20
+_BATCH_LIMIT_REMOTE = 200
+"""Demands that are published together: a push costs some 50 ms, moving a branch less than one."""
+_TIDY_EVERY = 300
+
+_Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError]
+
+
+class Settler:
+    """Turns batches of demands into published commits.
+
+    ``snapshot`` is the newest published state; it may be read from any thread.
+    """
+
+    def __init__(
+        self,
+        repository: StateRepository,
+        snapshot: Snapshot,
+        waiting: Waiting,
+        on_published: Callable[[Catalog], None],
+    ) -> None:
+        self.snapshot = snapshot
+        self._repository = repository
+        self._waiting = waiting
+        self._on_published = on_published
+        self._since_tidy = 0
+        self._giving_up = threading.Event()
+        embedded = repository.always_current
+        self._batch_limit = _BATCH_LIMIT_EMBEDDED if embedded else _BATCH_LIMIT_REMOTE
+
+    def give_up(self) -> None:
+        """Stop waiting for a remote that is away; from any thread."""
+        self._giving_up.set()
+        self._repository.give_up()
+
+    def settle(self, batch: list[Ticket]) -> None:
+        """Take up what waits into ``batch``, bring it to an end, and empty the batch.
+
+        Raises:
+            ShuttingDown: where it was given up; the demands are still in the batch.
+            DemandOpsError: where the state repo cannot be used; likewise.
+        """
+        pause = _FIRST_PAUSE_S
+        verdict_is_current = self._repository.always_current
+        while True:
+            self._waiting.take_up(batch, self._batch_limit)
+            self._waiting.dismiss_withdrawn(batch)
+            try:
+                line = self._line()
+                arrived = self._arrived(line.start, batch)
+                results = [(ticket, self._judge(line, ticket, arrived)) for ticket in batch]
+                nothing_to_push = line.head.commit == line.start.commit
+                if nothing_to_push and not verdict_is_current:
+                    # only a push would have shown that the remote has moved
+                    tip = self._repository.refresh()
+                    verdict_is_current = True
+                    if tip != line.start.commit:
+                        continue
+                if self._publish(line, results):
+                    self._waiting.answer(results)
+                    batch.clear()
+                    return
+                log.info("the state repo has moved; judging %d demands again", len(batch))
+                _doubt(batch, line.start)
+                self._repository.refresh()
+                pause = min(pause, 1.0)
+            except RemoteAway as error:
+                _doubt(batch, self.snapshot)
+                log.warning("%s; trying again in %.1f s", error, pause)
+            if self._giving_up.wait(pause * random.uniform(0.5, 1.0)):  # noqa: S311 - no secret
+                raise ShuttingDown(
+                    "the remote is away; the demand stays in the outbox for the next start"
+                )
+            pause = min(pause * 2, _LONGEST_PAUSE_S)
+
+    def catch_up(self) -> None:
+        """Try again what people changed and could not be carried out: a release may allow it."""
+        if self.snapshot.problems:
+            line = self._line()
+            if line.publish():
+                self.snapshot = line.head
+
+    def tidy(self) -> None:
+        """Every few hundred commits: a demand leaves some twenty loose objects behind."""
+        if self._since_tidy >= _TIDY_EVERY:
+            self._since_tidy = 0
+            self._repository.tidy()
+
+    def _publish(self, line: writer.Line, results: list[_Result]) -> bool:
+        """Publish a line; what the remote denies becomes the answer of all that is in it."""
+        try:
+            published = line.publish()
+        except PushDenied as error:
+            results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
+            return True
+        if not published:
+            return False
+        self.snapshot = line.head
+        if line.head.commit != line.start.commit:
+            self._on_published(line.head.state.catalog)
+            self._since_tidy += len(results)
+        return True
+
+    def _line(self) -> writer.Line:
+        """Start a line on the newest tip that is known, people's changes taken in."""
+        tip = self._repository.tip()
+        before = self.snapshot
+        if tip == before.commit and not before.problems:
+            return writer.Line(self._repository, before)
+        advance = snapshots.advance(self._repository.objects, before, tip)
+        line = writer.Line(self._repository, advance.snapshot)
+        line.follow(advance, before, _now())
+        for found in line.head.problems:
+            log.error("%s (its last valid version stays in force)", found)
+        return line
+
+    def _judge(
+        self, line: writer.Line, ticket: Ticket, arrived: dict[str, history.Arrival]
+    ) -> Receipt | DemandOpsError:
+        if ticket.state == "withdrawn":
+            return Withdrawn(TAKEN_BACK)
+        if ticket.operation in arrived:
+            return _published_before(ticket, arrived[ticket.operation])
+        try:
+            decision = decide(
+                line.head.state,
+                ticket.goal,
+                ticket.received,
+                line.read,
+                lambda stage: ticket.tell(stage, stage),
+            )
+            if not self._waiting.hold(ticket):
+                return Withdrawn(TAKEN_BACK)
+            return _commit(line, ticket, decision)
+        except InvalidInput as error:
+            line.note(ticket.operation, "Refused")
+            return error
+        except Exception as error:  # one demand that the program cannot handle stops no other
+            log.exception("a fault of the generator, at demand %s", ticket.operation)
+            return StateRepoError(f"a fault of the generator: {error!r}; its log says more")
+
+    def _arrived(self, start: Snapshot, batch: list[Ticket]) -> dict[str, history.Arrival]:
+        """Return operation id → arrival of demands that were published although nobody was told.
+
+        The connection may have been cut, or the process killed, after the remote took the push.
+        """
+        bases = {ticket.base for ticket in batch if ticket.maybe_published}
+        found: dict[str, history.Arrival] = {}
+        for base in bases:
+            found |= history.operations_since(self._repository.objects, start.commit, base)
+        return found
+
+
+def _commit(line: writer.Line, ticket: Ticket, decision: Decision) -> Receipt:
+    if decision.files:
+        commit = line.commit(decision, ticket.operation, ticket.received, _now())
+        ticket.tell("committed", f"committed {commit}")
+    else:
+        commit = str(line.head.commit)
+        line.note(ticket.operation, "Unchanged")
+    return Receipt(
+        operation=ticket.operation,
+        request_id=decision.request.id,
+        outcome=decision.outcome,
+        commit=commit,
+        warnings=decision.warnings,
+        not_held=decision.changes.not_held,
+    )
+
+
+def _published_before(ticket: Ticket, arrival: history.Arrival) -> Receipt | DemandOpsError:
+    if arrival.outcome == "refused":
+        message = "was refused when the connection was cut; send it again to hear why"
+        return Refused([fault("", message, code="refused")])
+    goal = ticket.goal if isinstance(ticket.goal, dict) else {}
+    outcome: Outcome = "released" if goal.get("shutdown") else "booked"
+    if arrival.outcome == "unchanged":
+        outcome = "unchanged"
+    return Receipt(ticket.operation, str(goal.get("id", "")), outcome, arrival.commit)
+
+
+def _doubt(batch: list[Ticket], start: Snapshot) -> None:
+    for ticket in batch:
+        ticket.doubt(str(start.commit))
+
+
+def _now() -> datetime:
+    return datetime.now(timezone.utc)

@@ -1,0 +1,133 @@
+"""The demands that wait to be settled: handed in from any thread, taken up by one.
+
+Every state of a ticket changes under one lock, so a demand is taken back before it is committed or
+not at all. What is taken up is in the outbox before anything is done with it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterable
+from contextlib import suppress
+
+from generator.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
+from generator.service.ticket import Receipt, Ticket, left_over
+from generator.staterepo.outbox import Outbox
+
+TAKEN_BACK = "the demand was taken back before it was committed"
+
+
+class Waiting:
+    """A bounded queue over an outbox."""
+
+    def __init__(self, outbox: Outbox, limit: int) -> None:
+        self._outbox = outbox
+        self._limit = limit
+        self._changed = threading.Condition()
+        self._queue = deque(left_over(entry) for entry in outbox.pending.values())
+        self._tickets = {ticket.operation: ticket for ticket in self._queue}
+        self._closed = False
+
+    @property
+    def operations(self) -> tuple[str, ...]:
+        """The demands that have no answer yet."""
+        with self._changed:
+            return tuple(self._tickets)
+
+    @property
+    def unpublished(self) -> int:
+        """How many demands the outbox holds."""
+        return len(self._outbox.pending)
+
+    def add(self, ticket: Ticket) -> None:
+        """Put a demand in.
+
+        Raises:
+            ShuttingDown, QueueFull: where it is not taken.
+        """
+        with self._changed:
+            if self._closed:
+                raise ShuttingDown("the generator is shutting down; send the demand again later")
+            if len(self._queue) >= self._limit:
+                raise QueueFull(f"{self._limit} demands are waiting already; send it again later")
+            self._queue.append(ticket)
+            self._tickets[ticket.operation] = ticket
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Take no more."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait until something is there or ``timeout`` has passed; false once all is settled."""
+        with self._changed:
+            if not self._queue and not self._closed:
+                self._changed.wait(timeout)
+            return bool(self._queue) or not self._closed
+
+    def take_up(self, batch: list[Ticket], limit: int) -> None:
+        """Move what waits into the batch, up to ``limit`` in all, and journal it."""
+        with self._changed:  # held while journaling: a demand is taken back before it or after
+            room = limit - len(batch)
+            fresh = [self._queue.popleft() for _ in range(min(room, len(self._queue)))]
+            batch += fresh
+            self._outbox.append(
+                ticket.entry()
+                for ticket in fresh
+                if ticket.state == "waiting" and ticket.operation not in self._outbox.pending
+            )
+
+    def withdraw(self, operation: str) -> bool:
+        """Take a demand back. False once it is committed, or was never known."""
+        with self._changed:
+            ticket = self._tickets.get(operation)
+            if ticket is None or ticket.state != "waiting":
+                return ticket is not None and ticket.state == "withdrawn"
+            ticket.state = "withdrawn"
+            self._outbox.done([operation], durably=True)  # nor may a restart take it up
+        return True
+
+    def hold(self, ticket: Ticket) -> bool:
+        """Make a demand one that cannot be taken back any more; false where it was."""
+        with self._changed:
+            if ticket.state != "withdrawn":
+                ticket.state = "committed"
+            return ticket.state == "committed"
+
+    def dismiss_withdrawn(self, batch: list[Ticket]) -> None:
+        """Answer those that were taken back at once: the remote may be away for long."""
+        for ticket in [ticket for ticket in batch if ticket.state == "withdrawn"]:
+            batch.remove(ticket)
+            self._forget(ticket)
+            ticket.future.set_exception(Withdrawn(TAKEN_BACK))
+
+    def answer(self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]]) -> None:
+        """Tell each what came of it; the outbox forgets them."""
+        results = list(results)
+        with self._changed:
+            self._outbox.done(ticket.operation for ticket, _ in results)
+        for ticket, result in results:
+            self._forget(ticket)
+            if isinstance(result, Receipt):
+                ticket.tell("pushed", f"pushed {result.commit}")
+                ticket.future.set_result(result)
+            else:
+                ticket.future.set_exception(result)
+
+    def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
+        """Answer every demand of a batch with an error; ``keep`` leaves them in the outbox."""
+        batch = list(batch)
+        if not keep:
+            with self._changed, suppress(OSError):  # a full disk must not withhold the answer
+                self._outbox.done(ticket.operation for ticket in batch)
+        for ticket in batch:
+            self._forget(ticket)
+            ticket.future.set_exception(error)
+
+    def _forget(self, ticket: Ticket) -> None:
+        with self._changed:
+            ticket.state = "done"
+            self._tickets.pop(ticket.operation, None)
