@@ -1,7 +1,8 @@
 """Flux's source-, kustomize- and helm-controller as plain processes.
 
 They take the cluster from `KUBECONFIG` (they have no flag for it) and run as its administrator;
-what a release may do is limited by the service account it names, which they impersonate.
+what a release may do is limited by the service account it names, which they impersonate. They are
+locked down as docs/flux.md asks for: what names no account acts as its namespace's `default`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from .net import LOOPBACK, answers, free_port
 from .processes import Component
 
 NAMESPACE = "flux-system"
+LOCKED_DOWN = ("--no-cross-namespace-refs=true", "--default-service-account=default")
 CONTROLLERS = ("source-controller", "kustomize-controller", "helm-controller")
 
 
@@ -28,9 +30,9 @@ def components(
             f"--storage-addr={artifacts}",
             f"--storage-adv-addr={artifacts}",
         ],
-        "kustomize-controller": ["--no-remote-bases=true"],
+        "kustomize-controller": ["--no-remote-bases=true", *LOCKED_DOWN],
         # By default it waits up to ten minutes for running releases before it ends.
-        "helm-controller": ["--graceful-shutdown-timeout=5s"],
+        "helm-controller": ["--graceful-shutdown-timeout=5s", *LOCKED_DOWN],
     }
     return [
         _component(name, binaries[name], kubeconfig, [*extra[name], *own.get(name, [])])
