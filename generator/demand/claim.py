@@ -10,6 +10,7 @@ from datetime import datetime
 from enum import Enum
 from types import MappingProxyType
 
+from generator.demand.lease import Lease
 from generator.demand.request import ConnectionType, InputTopic
 
 
@@ -53,6 +54,8 @@ class ApplicationClaim:
     node: str
     inputs: Mapping[str, tuple[InputTopic, ...]]
     parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    version: str = ""
+    lease: Lease | None = None
 
     @property
     def subject(self) -> Subject:
@@ -83,6 +86,7 @@ class ConnectionClaim:
     target: str
     broker: str
     topics: Mapping[str, str]
+    lease: Lease | None = None
 
     @property
     def subject(self) -> Subject:

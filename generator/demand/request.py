@@ -12,14 +12,29 @@ from enum import Enum
 from types import MappingProxyType
 
 from generator.catalog.identifiers import id_problem, topic_problem
+from generator.demand.lease import LONGEST_S, Term
 from generator.errors import Fault, fault
 
 
 class Operation(Enum):
-    """What a request does to the ledger."""
+    """What a request does to the ledger.
+
+    The reference's goal joins and shuts down, adding to and taking from what its requesters hold.
+    Our own names its demand and puts (replaces), releases or renews it; ``EXPIRE`` is the
+    generator's, for a demand whose lease ran out.
+    """
 
     JOIN = "join"
     SHUTDOWN = "shutdown"
+    PUT = "put"
+    RELEASE = "release"
+    RENEW = "renew"
+    EXPIRE = "expire"
+
+    @property
+    def asks(self) -> bool:
+        """Tell whether something is asked for, rather than given up or kept."""
+        return self in (Operation.JOIN, Operation.PUT)
 
 
 class ConnectionType(Enum):
@@ -49,6 +64,10 @@ class ApplicationDemand:
     requesters: tuple[str, ...]
     inputs: Mapping[str, tuple[InputTopic, ...]]
     parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    version: str = ""
+    connect: int | None = None
+    """The connection type for inputs of other nodes that the request leaves out, if any."""
+    term: Term | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,30 +84,43 @@ class ConnectionDemand:
     topics: tuple[tuple[str, str], ...]
     broker: str
     requesters: tuple[str, ...]
+    term: Term | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class DemandRequest:
-    """A whole request: booked as a whole or refused as a whole."""
+    """A whole request: booked as a whole or refused as a whole.
+
+    ``demand`` is the demand's id where the request names it; the reference's does not, and there
+    it is made for each subject (:func:`generator.demand.claim.demand_id`). ``named_by`` says in
+    whose name a request speaks that lists no subject. ``lease_s`` is the lease that it asks for, in
+    seconds.
+    """
 
     id: str
     operation: Operation
     applications: tuple[ApplicationDemand, ...] = ()
     connections: tuple[ConnectionDemand, ...] = ()
+    demand: str = ""
+    named_by: tuple[str, ...] = ()
+    lease_s: int | None = None
 
     def requesters(self) -> tuple[str, ...]:
         """Return everybody in whose name something is asked, in the order listed, each once."""
         subjects: tuple[ApplicationDemand | ConnectionDemand, ...]
         subjects = (*self.applications, *self.connections)
-        return tuple(dict.fromkeys(who for subject in subjects for who in subject.requesters))
+        listed = (who for subject in subjects for who in subject.requesters)
+        return tuple(dict.fromkeys((*self.named_by, *listed)))
 
 
 def faults(request: DemandRequest) -> Iterator[Fault]:
     """Yield every fault of a request that shows without looking at catalog or ledger."""
-    joining = request.operation is Operation.JOIN
+    joining = request.operation.asks
     if request.id:
         yield from _id("id", request.id)
-    if not (request.applications or request.connections):
+    yield from _named(request)
+    listing = request.operation not in (Operation.RELEASE, Operation.RENEW)
+    if listing and not (request.applications or request.connections):
         yield fault(
             "id",
             "the request lists no application and no connection; list what it is for",
@@ -105,6 +137,24 @@ def faults(request: DemandRequest) -> Iterator[Fault]:
                 yield from _input(f"{where}.inputs.{role}[{position}]", topic, joining)
     for index, connection in enumerate(request.connections):
         yield from _connection(f"connections[{index}]", connection, joining)
+
+
+def _named(request: DemandRequest) -> Iterator[Fault]:
+    """Yield the faults of what only our own requests carry."""
+    if request.operation in (Operation.JOIN, Operation.SHUTDOWN):
+        return
+    yield from _id("demand", request.demand)
+    yield from _requesters("requesters", request.named_by)
+    if request.lease_s is not None and not 0 < request.lease_s <= LONGEST_S:
+        yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
+    if request.operation is Operation.RELEASE and request.lease_s is not None:
+        yield fault("lease", "says nothing in a release; leave it out")
+    if request.operation is not Operation.PUT and (request.applications or request.connections):
+        yield fault(
+            "applications" if request.applications else "connections",
+            f"a {request.operation.value} names its demand alone; put the demand with less to give "
+            "up a part of it",
+        )
 
 
 def _input(where: str, topic: InputTopic, joining: bool) -> Iterator[Fault]:

@@ -6,7 +6,8 @@ A :class:`Ledger` never changes: a new one costs what a request touches and not 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from typing import TypeAlias
 
 from rpds import HashTrieMap, HashTrieSet
@@ -51,17 +52,23 @@ class Changes:
         return tuple(dict.fromkeys(change.key.subject for change in self.claims))
 
 
+_ENDS = "ends"
+
+Entry: TypeAlias = "tuple[str, ...]"
+Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
+
+
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """All claims, with the two look-ups that planning needs.
+    """All claims, with an index for each question that a request asks.
 
-    ``takers``: (source node, topic) → applications that take that topic in.
-    ``carriers``: (target node, target topic) → connections that bring it there.
+    ``index`` maps what :func:`_entries` says of a claim to the claims of which it holds; ``minutes``
+    are those in which some lease ends, so that the next end is found without looking at all.
     """
 
     claims: HashTrieMap[Subject, Claims] = field(default_factory=HashTrieMap)
-    takers: HashTrieMap[tuple[str, str], HashTrieSet[str]] = field(default_factory=HashTrieMap)
-    carriers: HashTrieMap[tuple[str, str], HashTrieSet[str]] = field(default_factory=HashTrieMap)
+    index: Index = field(default_factory=HashTrieMap)
+    minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
 
     def of(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
@@ -84,11 +91,53 @@ class Ledger:
 
     def taking(self, source: str, topic: str) -> tuple[str, ...]:
         """Return the applications that take ``topic`` of ``source`` in, sorted."""
-        return tuple(sorted(self.takers.get((source, topic)) or ()))
+        return self._ids("takes", source, topic)
+
+    def bringing(self, target: str, topic: str) -> tuple[str, ...]:
+        """Return the connections that bring ``topic`` to the node ``target``, sorted."""
+        return self._ids("brings", target, topic)
 
     def carries(self, target: str, topic: str) -> bool:
         """Tell whether some connection brings ``topic`` to the node ``target``."""
-        return (target, topic) in self.carriers
+        return ("brings", target, topic) in self.index
+
+    def of_demand(self, demand: str) -> tuple[Claim, ...]:
+        """Return the claims of one demand, sorted by subject."""
+        return self._claims("demand", demand)
+
+    def of_requester(self, requester: str) -> tuple[Claim, ...]:
+        """Return the claims in a requester's name, sorted by subject and demand."""
+        return self._claims("requester", requester)
+
+    def at_node(self, node: str) -> tuple[str, ...]:
+        """Return the applications that run on a node or take a topic of it in, sorted."""
+        return self._ids("node", node)
+
+    def next_end(self) -> datetime | None:
+        """Return when the first lease ends, or nothing where there is none."""
+        if not self.minutes:
+            return None
+        first = self._claims(_ENDS, min(self.minutes))
+        return min(claim.lease.ends for claim in first if claim.lease)
+
+    def ended(self, now: datetime) -> tuple[Claim, ...]:
+        """Return the claims whose lease ended before ``now``, the first to end first."""
+        over = (minute for minute in self.minutes if minute <= _minute(now))
+        ended = [
+            (claim.lease.ends, claim)
+            for minute in over
+            for claim in self._claims(_ENDS, minute)
+            if claim.lease and claim.lease.ends < now
+        ]
+        return tuple(claim for _, claim in sorted(ended, key=lambda pair: pair[0]))
+
+    def _ids(self, *entry: str) -> tuple[str, ...]:
+        return tuple(sorted({key.subject.id for key in self.index.get(entry) or ()}))
+
+    def _claims(self, *entry: str) -> tuple[Claim, ...]:
+        keys = sorted(self.index.get(entry) or (), key=lambda key: (str(key.subject), key.demand))
+        found = (self.get(key) for key in keys)
+        return tuple(claim for claim in found if claim is not None)
 
     def get(self, key: ClaimKey) -> Claim | None:
         """Return one claim."""
@@ -97,30 +146,24 @@ class Ledger:
 
     def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
         """Return the ledger with the claim at ``key`` set, or gone where ``claim`` is nothing."""
-        before = self.claims.get(key.subject, HashTrieMap())
-        if claim is None:
-            if key.demand not in before:
-                return self
-            after = before.remove(key.demand)
-        else:
-            after = before.insert(key.demand, claim)
-        claims = (
-            self.claims.insert(key.subject, after) if after else self.claims.remove(key.subject)
-        )
-        old = before.get(key.demand)
-        if key.subject.kind is SubjectKind.APPLICATION:
-            takers = _reindex(
-                self.takers, key.subject.id, _taken([old]), _taken(after.values()), _taken([claim])
-            )
-            return replace(self, claims=claims, takers=takers)
-        carriers = _reindex(
-            self.carriers,
-            key.subject.id,
-            _brought([old]),
-            _brought(after.values()),
-            _brought([claim]),
-        )
-        return replace(self, claims=claims, carriers=carriers)
+        held = self.claims.get(key.subject, HashTrieMap())
+        old = held.get(key.demand)
+        if old == claim:
+            return self
+        held = held.insert(key.demand, claim) if claim else held.remove(key.demand)
+        claims = self.claims.insert(key.subject, held) if held else self.claims.remove(key.subject)
+        before, after = _entries(old), _entries(claim)
+        index, minutes = self.index, self.minutes
+        for entry in before - after:
+            rest = index[entry].remove(key)
+            index = index.insert(entry, rest) if rest else index.remove(entry)
+            if not rest and entry[0] == _ENDS:
+                minutes = minutes.remove(entry[1])
+        for entry in after - before:
+            index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
+            if entry[0] == _ENDS:
+                minutes = minutes.insert(entry[1])
+        return Ledger(claims, index, minutes)
 
     def restored(self, subject: Subject, other: Ledger) -> Ledger:
         """Return the ledger with the claims on ``subject`` as they are in ``other``."""
@@ -141,39 +184,26 @@ class Ledger:
         return sum(len(claims) for claims in self.claims.values())
 
 
-def _taken(claims: Iterable[Claim | None]) -> set[tuple[str, str]]:
-    return {
-        (topic.source, topic.topic)
-        for claim in claims
-        if isinstance(claim, ApplicationClaim)
-        for _, topic in claim.all_inputs()
-    }
+def _entries(claim: Claim | None) -> set[Entry]:
+    """Return what a claim is found by."""
+    if claim is None:
+        return set()
+    entries: set[Entry] = {("demand", claim.demand)}
+    entries |= {("requester", requester) for requester in claim.requesters}
+    if claim.lease is not None:
+        entries.add((_ENDS, _minute(claim.lease.ends)))
+    if isinstance(claim, ApplicationClaim):
+        entries.add(("node", claim.node))
+        for _, topic in claim.all_inputs():
+            entries |= {("takes", topic.source, topic.topic), ("node", topic.source)}
+    else:
+        entries |= {("brings", claim.target, topic) for topic in claim.topics.values()}
+    return entries
 
 
-def _brought(claims: Iterable[Claim | None]) -> set[tuple[str, str]]:
-    return {
-        (claim.target, topic)
-        for claim in claims
-        if isinstance(claim, ConnectionClaim)
-        for topic in claim.topics.values()
-    }
-
-
-def _reindex(
-    index: HashTrieMap[tuple[str, str], HashTrieSet[str]],
-    subject: str,
-    before: set[tuple[str, str]],
-    still: set[tuple[str, str]],
-    added: set[tuple[str, str]],
-) -> HashTrieMap[tuple[str, str], HashTrieSet[str]]:
-    for key in before - still:
-        rest = index[key].discard(subject)
-        index = index.insert(key, rest) if rest else index.remove(key)
-    for key in added:
-        known = index.get(key, HashTrieSet())
-        if subject not in known:
-            index = index.insert(key, known.insert(subject))
-    return index
+def _minute(moment: datetime) -> str:
+    """Return the minute of a moment, in UTC and so that texts sort as times do."""
+    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
 
 
 def differences(before: Ledger, after: Ledger, keys: Iterable[ClaimKey]) -> tuple[ClaimChange, ...]:

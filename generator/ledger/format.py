@@ -24,6 +24,7 @@ from generator.demand.claim import (
     ConnectionClaim,
     SubjectKind,
 )
+from generator.demand.lease import LONGEST_S, Lease
 from generator.demand.request import ConnectionType, InputTopic
 from generator.errors import InvalidInput, fault
 from generator.settings import LEDGER_API_VERSION
@@ -71,12 +72,22 @@ class _Topic(Frozen):
     type: str = ""
 
 
+class _Lease(Frozen):
+    seconds: int = Field(ge=1, le=LONGEST_S)
+    slack: int = Field(default=0, ge=0, le=LONGEST_S)
+    until: Timestamp
+
+    def lease(self) -> Lease:
+        return Lease(self.seconds, self.slack, _time(self.until))
+
+
 class _Claim(Frozen):
     apiVersion: Literal["demandops.ledger/v1"]
     demand: str = Field(min_length=1)
     request: str
     requesters: tuple[str, ...] = Field(min_length=1, strict=False)
     booked: Timestamp
+    lease: _Lease | None = None
 
 
 class _ApplicationFile(_Claim):
@@ -86,6 +97,7 @@ class _ApplicationFile(_Claim):
     node: str
     inputs: dict[str, list[_Topic]] = Field(default_factory=dict)
     parameters: dict[str, Any] = Field(default_factory=dict)
+    version: str = ""
 
 
 class _ConnectionFile(_Claim):
@@ -113,23 +125,31 @@ def write(claim: Claim) -> str:
         }
         if claim.parameters:
             tail["parameters"] = dict(sorted(claim.parameters.items()))
+        if claim.version:
+            tail["version"] = claim.version
     else:
         head |= {"kind": "ConnectionClaim", "connection": claim.connection}
         tail = {"type": claim.type.name.lower(), "source": claim.source, "target": claim.target}
         if claim.broker:
             tail["broker"] = claim.broker
         tail["topics"] = dict(claim.topics)
-    booked = claim.booked.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    if claim.lease is not None:
+        lease = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
+        tail["lease"] = lease | {"until": _written(claim.lease.until)}
     return yamlio.dump(
         {
             **head,
             "demand": claim.demand,
             "request": claim.request,
             "requesters": list(claim.requesters),
-            "booked": booked,
+            "booked": _written(claim.booked),
             **tail,
         }
     )
+
+
+def _written(moment: datetime) -> str:
+    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
 def _topic(topic: InputTopic) -> dict[str, str]:
@@ -199,6 +219,8 @@ def _application(file: _ApplicationFile) -> Claim:
         node=file.node,
         inputs=MappingProxyType({role: topics for role, topics in inputs.items() if topics}),
         parameters=MappingProxyType(file.parameters),
+        version=file.version,
+        lease=file.lease.lease() if file.lease else None,
     )
 
 
@@ -214,6 +236,7 @@ def _connection(file: _ConnectionFile) -> Claim:
         target=file.target,
         broker=file.broker,
         topics=MappingProxyType(dict(sorted(file.topics.items()))),
+        lease=file.lease.lease() if file.lease else None,
     )
 
 

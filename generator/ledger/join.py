@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import datetime
 from types import MappingProxyType
+from typing import TypeVar
 
 from generator.demand.claim import (
     ApplicationClaim,
@@ -16,6 +17,7 @@ from generator.demand.claim import (
     SubjectKind,
     demand_id,
 )
+from generator.demand.lease import renewed
 from generator.demand.request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -34,13 +36,13 @@ def join(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger,
     keys: list[ClaimKey] = []
     for index, app in enumerate(request.applications):
         standing = ledger.application(app.id)
-        faults += _application_conflicts(f"applications[{index}]", app, standing)
+        faults += application_conflicts(f"applications[{index}]", app, standing)
         claim: Claim = _joined_application(ledger, request.id, app, now)
         ledger = ledger.replace(claim.key, claim)
         keys.append(claim.key)
     for index, connection in enumerate(request.connections):
         held = ledger.connection(connection.id)
-        faults += _connection_conflicts(f"connections[{index}]", connection, held)
+        faults += connection_conflicts(f"connections[{index}]", connection, held)
         claim = _joined_connection(ledger, request.id, connection, now)
         ledger = ledger.replace(claim.key, claim)
         keys.append(claim.key)
@@ -49,9 +51,10 @@ def join(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger,
     return ledger, Changes(claims=differences(start, ledger, keys))
 
 
-def _application_conflicts(
+def application_conflicts(
     where: str, app: ApplicationDemand, standing: Iterable[ApplicationClaim]
 ) -> Iterator[Fault]:
+    """Yield what of a demanded application contradicts claims that stand on it."""
     for claim in standing:
         held = f"'{app.id}' is held by {', '.join(claim.requesters)}"
         if claim.node != app.node:
@@ -70,11 +73,20 @@ def _application_conflicts(
                 code="conflict",
             )
             return
+        if claim.version != app.version:
+            yield fault(
+                f"{where}.version",
+                f"'{app.version}' contradicts what stands: {held} in version '{claim.version}'; "
+                "ask for the same, or use another application id",
+                code="conflict",
+            )
+            return
 
 
-def _connection_conflicts(
+def connection_conflicts(
     where: str, asked: ConnectionDemand, standing: Iterable[ConnectionClaim]
 ) -> Iterator[Fault]:
+    """Yield what of a demanded connection contradicts claims that stand on it."""
     for claim in standing:
         held = f"'{asked.id}' is held by {', '.join(claim.requesters)}"
         for name, wanted, stands in (
@@ -111,7 +123,7 @@ def _joined_application(
     known = standing.inputs if isinstance(standing, ApplicationClaim) else {}
     old = standing.parameters if isinstance(standing, ApplicationClaim) else {}
     inputs = {
-        role: _united(known.get(role, ()), app.inputs.get(role, ()))
+        role: united(known.get(role, ()), app.inputs.get(role, ()))
         for role in sorted({*known, *app.inputs})
     }
     claim = ApplicationClaim(
@@ -124,11 +136,24 @@ def _joined_application(
         node=app.node,
         inputs=MappingProxyType({role: topics for role, topics in inputs.items() if topics}),
         parameters=MappingProxyType({**old, **app.parameters}),
+        version=app.version,
+        lease=renewed(standing.lease if standing else None, app.term, now),
     )
-    return claim if claim == standing else replace(claim, booked=now)
+    return touched(claim, standing, now)
 
 
-def _united(known: Iterable[InputTopic], asked: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
+AnyClaim = TypeVar("AnyClaim", ApplicationClaim, ConnectionClaim)
+
+
+def touched(claim: AnyClaim, standing: Claim | None, now: datetime) -> AnyClaim:
+    """Return a claim booked at ``now``, or as before where nothing but its lease differs."""
+    if standing is None:
+        return replace(claim, booked=now)
+    kept = replace(claim, booked=standing.booked)
+    return kept if replace(kept, lease=standing.lease) == standing else replace(claim, booked=now)
+
+
+def united(known: Iterable[InputTopic], asked: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
     """Unite topics by (topic, source); a type that is given later fills in one that was not."""
     types: dict[tuple[str, str], str] = {}
     for topic in (*known, *asked):
@@ -156,5 +181,6 @@ def _joined_connection(
         target=asked.target,
         broker=asked.broker or broker,
         topics=MappingProxyType(dict(sorted({**known, **dict(asked.topics)}.items()))),
+        lease=renewed(standing.lease if standing else None, asked.term, now),
     )
-    return claim if claim == standing else replace(claim, booked=now)
+    return touched(claim, standing, now)

@@ -1,4 +1,4 @@
-"""The ledger's one operation: :func:`apply` books a request or releases what it holds.
+"""The ledger's one operation: :func:`apply` books a request, renews or releases what it holds.
 
 As a whole or not at all, and it says what changed. Semantics: ``docs/architecture.md``, "Booking".
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from generator.demand.request import DemandRequest, Operation
+from generator.ledger import named
 from generator.ledger.books import Changes, ClaimChange, Ledger
 from generator.ledger.join import join
 from generator.ledger.release import release
@@ -16,7 +17,7 @@ __all__ = ["Changes", "ClaimChange", "Ledger", "apply"]
 
 
 def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Book what ``request`` joins, or release what its shutdown lists.
+    """Carry out what ``request`` asks: book, replace, renew, release.
 
     Args:
         ledger: what is booked.
@@ -27,9 +28,19 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
         The new ledger and what changed. Booking twice changes nothing.
 
     Raises:
-        Refused: with every contradiction to a standing claim, or where a shutdown lists nothing
-            that is held. Nothing is booked then.
+        Refused: with every contradiction to a standing claim, or where what is to be released or
+            renewed is not held. Nothing is booked then.
     """
-    if request.operation is Operation.SHUTDOWN:
-        return release(ledger, request, now)
-    return join(ledger, request, now)
+    match request.operation:
+        case Operation.JOIN:
+            return join(ledger, request, now)
+        case Operation.SHUTDOWN:
+            return release(ledger, request, now)
+        case Operation.PUT:
+            return named.put(ledger, request, now)
+        case Operation.RELEASE:
+            return named.release(ledger, request)
+        case Operation.RENEW:
+            return named.renew(ledger, request, now)
+        case Operation.EXPIRE:
+            return named.expire(ledger, request, now)
