@@ -14,21 +14,32 @@ from datetime import datetime, timezone
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
-from generator.demand import admission, wire
+from generator.demand import admission, own, permission, wire
 from generator.demand.claim import Subject
 from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from generator.errors import Fault, InvalidInput, Refused
+from generator.ledger import derived
 from generator.ledger import ledger as booking
 from generator.ledger.ledger import Changes, Ledger
+from generator.plan import quota
 from generator.plan.planner import affected, all_keys
 from generator.render import changeset
 from generator.render.changeset import Read, ReleaseChange
 from generator.render.engine import Engine
 
-_SUBJECT = re.compile(r"(apps|connections)\[(\d+)\]")
+_SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
 Stage = Literal["admitted", "booked"]
 Outcome = Literal["booked", "released", "unchanged"]
+
+_OUTCOMES: dict[Operation, Outcome] = {
+    Operation.SHUTDOWN: "released",
+    Operation.RELEASE: "released",
+    Operation.EXPIRE: "released",
+}
+
+Throttle = Callable[[DemandRequest, Catalog], Iterable[Fault]]
+"""Yields why a request comes too soon after others of its requesters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,34 +75,40 @@ def decide(
     now: datetime,
     read: Read,
     on_stage: Callable[[Stage], None] = lambda stage: None,
+    throttle: Throttle = lambda request, catalog: (),
 ) -> Decision:
-    """Decide a goal of the reference's action.
+    """Decide a goal of the reference's action or of our own.
 
     Args:
         state: configuration and books to judge against.
-        goal: the goal as plain data (:mod:`generator.demand.wire`).
+        goal: the goal as plain data (:mod:`generator.demand.wire`, :mod:`generator.demand.own`),
+            or a request of the generator's own, which is not checked again.
         now: when the demand was received, with time zone.
         read: gives the text of a file of the state repo as it is, or nothing.
         on_stage: told when the demand is admitted and when it is booked.
+        throttle: asked last before a request is admitted.
 
     Raises:
         Refused: with every fault, named by the wire's fields; nothing is to be written then.
         InvalidInput: where the state repo's own files keep a valid demand from being rendered.
     """
-    request = admit(state, goal)
+    request = goal if isinstance(goal, DemandRequest) else admit(state, goal, throttle)
     on_stage("admitted")
     try:
         ledger, changes = booking.apply(state.ledger, request, now)
+        over = list(quota.faults(state.ledger, ledger, changes, state.catalog))
+        if over:
+            raise Refused(over)
         keys = affected(state.ledger, ledger, state.catalog, changes.subjects())
         made = changeset.of_change(
             state.ledger, ledger, changes.claims, keys, (state.catalog, state.engine, read)
         )
     except Refused as error:
-        raise Refused(_in_wire_words(error.faults, request, state.catalog)) from None
+        raise Refused(_in_goals_words(error.faults, request, state.catalog)) from None
     on_stage("booked")
     outcome: Outcome = "unchanged"
     if changes.claims:
-        outcome = "released" if request.operation is Operation.SHUTDOWN else "booked"
+        outcome = _OUTCOMES.get(request.operation, "booked")
     return Decision(
         request=request,
         outcome=outcome,
@@ -103,26 +120,45 @@ def decide(
     )
 
 
-def admit(state: State, goal: object) -> DemandRequest:
-    """Parse a goal and check it against the catalog.
+def admit(
+    state: State, goal: object, throttle: Throttle = lambda request, catalog: ()
+) -> DemandRequest:
+    """Parse a goal and check it against the catalog, its access domains and the throttle.
 
     Raises:
         Refused: with every fault of form and content together.
     """
-    request, faults = wire.parse(goal, state.catalog.appdef_by_wire_type)
-    if request is None:
-        raise Refused(faults)
+    catalog = state.catalog
+    if isinstance(goal, dict) and own.is_own(goal):
+        request, faults = own.parse(goal)
+        request = permission.with_terms(request, catalog)
+        request = admission.with_types(derived.with_connections(request, state.ledger, catalog))
+    else:
+        parsed, faults = wire.parse(goal, catalog.appdef_by_wire_type)
+        if parsed is None:
+            raise Refused(faults)
+        request = permission.with_terms(parsed, catalog)
     told = {found.field for found in faults}
-    content = _in_wire_words(list(admission.faults(request, state.catalog)), request, state.catalog)
-    unread = bool(told & {"apps", "connections"})  # and so not said to be missing
+    found_in_content = [*admission.faults(request, catalog), *permission.faults(request, catalog)]
+    content = _in_goals_words(found_in_content, request, catalog)
+    # what could not be read is not said to be missing
+    unread = bool(told & {"apps", "applications", "connections"})
     faults += [
         found
         for found in content
         if not _told(found.field, told) and not (unread and found.code == "empty")
     ]
+    faults = faults or list(throttle(request, catalog))
     if faults:
         raise Refused(sorted(dict.fromkeys(faults), key=lambda found: _subject(found.field)))
     return request
+
+
+def form_faults(goal: object) -> list[Fault]:
+    """Return what of a goal has not the form of one: unknown fields, wrong types."""
+    if isinstance(goal, dict) and own.is_own(goal):
+        return own.form_faults(goal)
+    return wire.form_faults(goal)
 
 
 def consequence(
@@ -155,33 +191,30 @@ def _subject(field: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else ("", 0)
 
 
-def _in_wire_words(
+def _in_goals_words(
     faults: Iterable[Fault], request: DemandRequest, catalog: Catalog
 ) -> list[Fault]:
-    return [
-        replace(found, field=wire.wire_field(found.field, request, catalog.appdefs))
-        for found in faults
-    ]
+    """Return faults named by the fields of the goal that the request came as."""
+
+    def field(path: str) -> str:
+        if request.operation.is_reference:
+            return wire.wire_field(path, request, catalog.appdefs)
+        return own.field(path)
+
+    return [replace(found, field=field(found.field)) for found in faults]
 
 
 def _uncarried(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> Iterator[str]:
     """Yield a warning for each input that no connection brings to the application's node."""
-    if request.operation is not Operation.JOIN:
+    if not request.operation.asks:
         return
     for app in request.applications:
-        appdef = catalog.appdefs[app.appdef]
-        at_source = {
-            service.each for service in appdef.services.values() if service.placement == "source"
-        }
-        for role, topics in sorted(app.inputs.items()):
-            for topic in topics:
-                if topic.source == app.node or role in at_source:
-                    continue
-                if not ledger.carries(app.node, topic.topic):
-                    yield (
-                        f"application '{app.id}': no connection carries {role} {topic.topic} of "
-                        f"'{topic.source}' to '{app.node}'"
-                    )
+        for role, topic in derived.foreign_inputs(app, catalog.appdefs[app.appdef]):
+            if not ledger.carries(app.node, topic.topic):
+                yield (
+                    f"application '{app.id}': no connection carries {role} {topic.topic} of "
+                    f"'{topic.source}' to '{app.node}'"
+                )
 
 
 def explain(error: InvalidInput) -> str:

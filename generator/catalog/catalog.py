@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from types import MappingProxyType
 from typing import Annotated, Literal, TypeVar
 
@@ -17,8 +16,6 @@ from pydantic import BaseModel, Field, StringConstraints
 from generator import yamlio
 from generator.catalog.appdef import ApplicationDefinition, Service
 from generator.catalog.inventory import (
-    AccessDomain,
-    AccessDomainsFile,
     Broker,
     BrokersFile,
     Cluster,
@@ -27,8 +24,9 @@ from generator.catalog.inventory import (
     NodesFile,
 )
 from generator.catalog.model import DnsLabel, FileModel, Frozen
+from generator.catalog.policy import AccessDomain, AccessDomainsFile, matches
 from generator.catalog.reading import Reading
-from generator.catalog.registry import Chart, ChartsFile, Image, ImagesFile
+from generator.catalog.registry import Chart, ChartsFile, ChartSource, Image, ImagesFile
 from generator.errors import InvalidInput, near
 from generator.settings import API_VERSION, RENDER_VERSION
 
@@ -107,6 +105,11 @@ class Catalog:
                 return appdef
         return None
 
+    def versions_of(self, appdef: str) -> list[str]:
+        """Return the channels and versions that a demand for an application may name."""
+        charts = {service.chart for service in self.appdefs[appdef].services.values()}
+        return sorted({known for chart in charts for known in self.charts[chart].versions()})
+
     def values_template(self, appdef: str, service: Service) -> str:
         """Return the path of the template that gives a service's Helm values."""
         return f"appdefs/{appdef}/{service.values}"
@@ -173,7 +176,7 @@ def _domains_of_nodes(
 ) -> Mapping[str, AccessDomain]:
     owner: dict[str, AccessDomain] = {}
     for node in nodes:
-        matching = [d for d in domains.values() if any(fnmatchcase(node, p) for p in d.nodes)]
+        matching = [d for d in domains.values() if matches(node, d.nodes)]
         if len(matching) > 1:
             names = " and ".join(f"'{domain.name}'" for domain in matching)
             reading.tell(
@@ -246,26 +249,32 @@ def _check_namespaces(catalog: Catalog, reading: Reading) -> None:
 
 def _check_charts(catalog: Catalog, reading: Reading) -> None:
     for name, chart in catalog.charts.items():
-        if not chart.folder:
-            continue
-        path = f"{chart.folder}/Chart.yaml"
-        text = catalog.files.get(path)
-        if text is None:
-            message = f"'{path}' does not exist; mend the folder"
-            reading.tell(CHARTS_FILE, f"charts.{name}.folder", message)
-            continue
-        try:
-            metadata = yamlio.load(text)
-        except InvalidInput as error:
-            reading.faults += yamlio.faults_in(error, path)
-            continue
-        version = metadata.get("version") if isinstance(metadata, dict) else None
-        if version != chart.version:
-            reading.tell(
-                CHARTS_FILE,
-                f"charts.{name}.version",
-                f"is {chart.version}, but {path} says {version}; make them one",
-            )
+        _check_chart(f"charts.{name}", chart, catalog, reading)
+        for channel, source in chart.channels.items():
+            _check_chart(f"charts.{name}.channels.{channel}", source, catalog, reading)
+
+
+def _check_chart(where: str, chart: ChartSource, catalog: Catalog, reading: Reading) -> None:
+    if not chart.folder:
+        return
+    path = f"{chart.folder}/Chart.yaml"
+    text = catalog.files.get(path)
+    if text is None:
+        message = f"'{path}' does not exist; mend the folder"
+        reading.tell(CHARTS_FILE, f"{where}.folder", message)
+        return
+    try:
+        metadata = yamlio.load(text)
+    except InvalidInput as error:
+        reading.faults += yamlio.faults_in(error, path)
+        return
+    version = metadata.get("version") if isinstance(metadata, dict) else None
+    if version != chart.version:
+        reading.tell(
+            CHARTS_FILE,
+            f"{where}.version",
+            f"is {chart.version}, but {path} says {version}; make them one",
+        )
 
 
 def _check_services(catalog: Catalog, reading: Reading) -> None:

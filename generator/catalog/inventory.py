@@ -115,15 +115,6 @@ class Broker(Frozen):
     port: Annotated[int, Field(ge=1, le=65535)] = 1883
 
 
-class AccessDomain(Frozen):
-    """A namespace and service account, and the nodes whose releases live in it."""
-
-    name: DnsLabel
-    namespace: DnsLabel
-    service_account: DnsLabel = Field(default="demandops", alias="serviceAccount")
-    nodes: tuple[str, ...] = Field(default=("*",), strict=False)
-
-
 class ClustersFile(FileModel):
     """``inventory/clusters.yaml``."""
 
@@ -143,10 +134,3 @@ class BrokersFile(FileModel):
 
     kind: Literal["Brokers"]
     brokers: tuple[Broker, ...] = Field(strict=False)
-
-
-class AccessDomainsFile(FileModel):
-    """``policy/access-domains.yaml``."""
-
-    kind: Literal["AccessDomains"]
-    domains: tuple[AccessDomain, ...] = Field(strict=False)

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import StringConstraints, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
-from generator.catalog.model import DnsLabel, FileModel, Frozen
+from generator.catalog.model import DnsLabel, FileModel, Frozen, Word
 
 ChartVersion = Annotated[
     str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
 ]
 
 
-class Chart(Frozen):
-    """A Helm chart: exactly one of ``folder``, ``oci`` and ``http`` says where it is."""
+class ChartSource(Frozen):
+    """A Helm chart in one version: exactly one of ``folder``, ``oci``, ``http`` says where."""
 
     version: ChartVersion
     folder: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")] | None = (
@@ -28,7 +28,7 @@ class Chart(Frozen):
     http: Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$")] | None = None
 
     @model_validator(mode="after")
-    def _one_source(self) -> Chart:
+    def _one_source(self) -> ChartSource:
         given = [name for name in ("folder", "oci", "http") if getattr(self, name)]
         if len(given) != 1:
             raise ValueError(
@@ -38,6 +38,43 @@ class Chart(Frozen):
         if self.folder and ".." in self.folder.split("/"):
             raise ValueError("folder must stay inside the state repo; remove '..'")
         return self
+
+
+class Chart(ChartSource):
+    """A Helm chart: the version that is taken by default, and others by channel.
+
+    A demand may ask for a channel by its name, or for one of the versions.
+    """
+
+    channels: dict[Word, ChartSource] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Chart:
+        seen = {self.version: "the default"}
+        for name, source in self.channels.items():
+            other = seen.setdefault(source.version, f"channel '{name}'")
+            if other != f"channel '{name}'":
+                raise ValueError(
+                    f"channels.{name} has version {source.version}, as {other} has; one version "
+                    "is one chart, so give each its own"
+                )
+        return self
+
+    def sources(self) -> tuple[ChartSource, ...]:
+        """Return the chart in all its versions, the default first."""
+        return (self, *self.channels.values())
+
+    def at(self, version: str) -> ChartSource | None:
+        """Return the chart of a channel or version, the default where it is empty, or nothing."""
+        if not version:
+            return self
+        if version in self.channels:
+            return self.channels[version]
+        return next((source for source in self.sources() if source.version == version), None)
+
+    def versions(self) -> tuple[str, ...]:
+        """Return all that :meth:`at` knows."""
+        return (*self.channels, *(source.version for source in self.sources()))
 
 
 class Image(Frozen):

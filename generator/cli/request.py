@@ -20,8 +20,7 @@ from generator.cli.output import (
     progress,
     state_repo_option,
 )
-from generator.decision import Decision, admit, decide
-from generator.demand import wire
+from generator.decision import Decision, admit, decide, form_faults
 from generator.errors import DemandOpsError, Fault, InvalidInput, fault
 from generator.service import Generator, Receipt
 from generator.staterepo import reader
@@ -36,7 +35,8 @@ class _Document:
 
     @property
     def request_id(self) -> str:
-        id = self.goal.get("id", "") if isinstance(self.goal, dict) else ""
+        goal = self.goal if isinstance(self.goal, dict) else {}
+        id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
 
 
@@ -51,14 +51,15 @@ def request(
 ) -> None:
     """Book demand requests from files.
 
-    FILE is the action goal of DeploymentRequest as YAML, as `ros2 action send_goal` takes it, or -
-    for standard input. Several files, or documents in one, are taken in order; one that is refused
-    does not stop the next. All are parsed before any is booked.
+    FILE is the action goal of DeploymentRequest as YAML, as `ros2 action send_goal` takes it, or a
+    document of the kind Demand (docs/demands.md), or - for standard input. Several files, or
+    documents in one, are taken in order; one that is refused does not stop the next. All are parsed
+    before any is booked.
     """
     documents = [document for file in files for document in _documents(file)]
     if not documents:
         raise InvalidInput([fault("", "no request in " + ", ".join(files))])
-    faulty = [wire.form_faults(document.goal) for document in documents]
+    faulty = [form_faults(document.goal) for document in documents]
     if any(faulty):
         rows = _unbooked(documents, faulty, state_repo)
     elif dry_run:

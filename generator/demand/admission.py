@@ -7,16 +7,17 @@ does not matter here; that is the ledger's.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from generator.catalog.catalog import Catalog
 from generator.catalog.inventory import Broker
 from generator.demand import request as shape
 from generator.demand.request import (
+    AUTO,
     ApplicationDemand,
     ConnectionDemand,
     ConnectionType,
     DemandRequest,
-    Operation,
 )
 from generator.errors import Fault, fault, near, shown
 
@@ -30,11 +31,21 @@ def faults(request: DemandRequest, catalog: Catalog) -> Iterator[Fault]:
     A shutdown is not held to the inventory: what a removed node still holds can be released.
     """
     yield from shape.faults(request)
-    joining = request.operation is Operation.JOIN
+    joining = request.operation.asks
     for index, app in enumerate(request.applications):
         yield from _application(f"applications[{index}]", app, catalog, joining)
     for index, connection in enumerate(request.connections):
         yield from _connection(f"connections[{index}]", connection, catalog, joining)
+
+
+def with_types(request: DemandRequest) -> DemandRequest:
+    """Return the request with a type for each connection that leaves it open."""
+
+    def typed(connection: ConnectionDemand) -> ConnectionDemand:
+        open_type = connection.type == AUTO
+        return replace(connection, type=ConnectionType.MQTT.value) if open_type else connection
+
+    return replace(request, connections=tuple(map(typed, request.connections)))
 
 
 def choose_broker(requested: str, source: str, target: str, catalog: Catalog) -> Broker | None:
@@ -57,16 +68,7 @@ def _application(
 ) -> Iterator[Fault]:
     appdef = catalog.appdefs.get(app.appdef)
     if appdef is None:
-        known = ", ".join(
-            f"{known.deployment_request.type} ({known.name})"
-            for known in catalog.appdefs.values()
-            if known.deployment_request
-        )
-        yield fault(
-            f"{where}.appdef",
-            f"{app.appdef.removeprefix('#')} names no application definition; known: {known}",
-            code="unknown-application",
-        )
+        yield _unknown_application(where, app.appdef, catalog)
     else:
         for role, topics in app.inputs.items():
             if role not in appdef.inputs and topics:
@@ -80,6 +82,12 @@ def _application(
                     f"{where}.parameters.{name}",
                     f"{appdef.name} has no such parameter" + near(name, appdef.parameters),
                 )
+        if app.version and app.version not in catalog.versions_of(appdef.name):
+            yield fault(
+                f"{where}.version",
+                f"{shown(app.version)} is no version or channel of {appdef.name} in "
+                "registry/charts.yaml" + near(app.version, catalog.versions_of(appdef.name)),
+            )
     if not joining:
         return
     yield from _node(f"{where}.node", app.node, catalog)
@@ -91,6 +99,20 @@ def _application(
             f"{where}.inputs",
             f"is empty; list at least one topic of {' or '.join(sorted(appdef.inputs))}",
         )
+
+
+def _unknown_application(where: str, asked: str, catalog: Catalog) -> Fault:
+    if asked.startswith("#"):  # the number of a DeploymentRequest
+        known = "; known: " + ", ".join(
+            f"{one.deployment_request.type} ({one.name})"
+            for one in catalog.appdefs.values()
+            if one.deployment_request
+        )
+    else:
+        known = near(asked, catalog.appdefs)
+    named = asked.removeprefix("#") if asked.startswith("#") else shown(asked)
+    message = f"{named} names no application definition{known}"
+    return fault(f"{where}.appdef", message, code="unknown-application")
 
 
 def _connection(

@@ -36,6 +36,11 @@ class Operation(Enum):
         """Tell whether something is asked for, rather than given up or kept."""
         return self in (Operation.JOIN, Operation.PUT)
 
+    @property
+    def is_reference(self) -> bool:
+        """Tell whether it is of the reference's action, which names no demand."""
+        return self in (Operation.JOIN, Operation.SHUTDOWN)
+
 
 class ConnectionType(Enum):
     """How a connection carries its topics; the values are the wire's numbers."""
@@ -43,6 +48,10 @@ class ConnectionType(Enum):
     ROS = 0
     MQTT = 1
     ZENOH = 2
+
+
+AUTO = -1
+"""In a demand's place for a connection type: whichever the catalog has for its ends."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -141,14 +150,15 @@ def faults(request: DemandRequest) -> Iterator[Fault]:
 
 def _named(request: DemandRequest) -> Iterator[Fault]:
     """Yield the faults of what only our own requests carry."""
-    if request.operation in (Operation.JOIN, Operation.SHUTDOWN):
+    if request.operation.is_reference:
         return
     yield from _id("demand", request.demand)
-    yield from _requesters("requesters", request.named_by)
+    if not (request.applications or request.connections):  # else told for each of these
+        yield from _requesters("requesters", request.named_by)
     if request.lease_s is not None and not 0 < request.lease_s <= LONGEST_S:
         yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
-    if request.operation is Operation.RELEASE and request.lease_s is not None:
-        yield fault("lease", "says nothing in a release; leave it out")
+    if request.operation is not Operation.PUT and request.lease_s is not None:
+        yield fault("lease", "is set by a put; leave it out, or put the demand again")
     if request.operation is not Operation.PUT and (request.applications or request.connections):
         yield fault(
             "applications" if request.applications else "connections",

@@ -10,14 +10,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from generator import yamlio
 from generator.catalog.appdef import ApplicationDefinition
 from generator.catalog.identifiers import absolute
-from generator.catalog.model import Frozen, faults_of, field_path
+from generator.catalog.model import Frozen
+from generator.demand.form import sound_part
 from generator.demand.request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -116,7 +116,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
     """
     if not isinstance(data, dict):
         return None, [_no_mapping()]
-    goal, faults = _sound_part(data)
+    goal, faults = sound_part(data, WireGoal, _LISTS_OF_TEXT)
     # where it does not say which, it is held to what a shutdown is held to: the rules of both
     unsaid = any(found.field == "shutdown" for found in faults)
     request = DemandRequest(
@@ -142,60 +142,11 @@ def form_faults(data: object) -> list[Fault]:
     """Return what of ``data`` has not the form of a goal: unknown fields, wrong types."""
     if not isinstance(data, dict):
         return [_no_mapping()]
-    return _sound_part(data)[1]
+    return sound_part(data, WireGoal, _LISTS_OF_TEXT)[1]
 
 
 def _no_mapping() -> Fault:
     return fault("", "a request is a mapping with id, apps, connections and shutdown")
-
-
-def _sound_part(data: dict[str, Any]) -> tuple[WireGoal, list[Fault]]:
-    """Return what of ``data`` has the right form, and the faults of the rest."""
-    faults: list[Fault] = []
-    pruned = _with_keys_of_text(data, (), faults)
-    try:
-        return WireGoal.model_validate(pruned), faults
-    except ValidationError as error:
-        faults += faults_of(error, WireGoal)
-        for item in error.errors():
-            pruned = _blanked(pruned, item["loc"])
-        return WireGoal.model_validate(pruned), faults
-
-
-def _with_keys_of_text(
-    data: object, location: tuple[int | str, ...], faults: list[Fault]
-) -> object:
-    """Return ``data`` without the entries whose key is no text, which are told."""
-    if isinstance(data, list):
-        return [_with_keys_of_text(item, (*location, i), faults) for i, item in enumerate(data)]
-    if not isinstance(data, dict):
-        return data
-    kept = {}
-    for key, value in data.items():
-        if isinstance(key, str):
-            kept[key] = _with_keys_of_text(value, (*location, key), faults)
-        else:
-            message = f"the key {yamlio.brief(key)} must be text; put it in quotes"
-            faults.append(fault(field_path(location), message))
-    return kept
-
-
-def _blanked(data: object, location: tuple[int | str, ...], within: str = "") -> object:
-    """Return ``data`` without what stands at ``location``.
-
-    A field goes, so that its default holds; a list's item becomes an empty one, so that those
-    behind it keep their places.
-    """
-    head, *rest = location
-    if isinstance(data, list) and isinstance(head, int):
-        empty: object = "" if within in _LISTS_OF_TEXT else {}
-        item = _blanked(data[head], tuple(rest), within) if rest else empty
-        return [*data[:head], item, *data[head + 1 :]]
-    if isinstance(data, dict):
-        if rest and head in data:
-            return {**data, head: _blanked(data[head], tuple(rest), str(head))}
-        return {key: value for key, value in data.items() if key != head}
-    return data
 
 
 def _wire_inputs(appdef: ApplicationDefinition | None) -> Mapping[str, str]:

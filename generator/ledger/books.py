@@ -62,8 +62,8 @@ Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
 class Ledger:
     """All claims, with an index for each question that a request asks.
 
-    ``index`` maps what :func:`_entries` says of a claim to the claims of which it holds; ``minutes``
-    are those in which some lease ends, so that the next end is found without looking at all.
+    ``index`` maps what :func:`_entries` says of a claim to the claims of which it holds.
+    ``minutes`` are those in which some lease ends: the next end is found without looking at all.
     """
 
     claims: HashTrieMap[Subject, Claims] = field(default_factory=HashTrieMap)

@@ -120,7 +120,7 @@ def release(ledger: Ledger, request: DemandRequest) -> tuple[Ledger, Changes]:
 
 
 def renew(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Renew the leases of a demand, by the term asked for or else by their own.
+    """Renew the leases of a demand by their own terms; what has none stays as it is.
 
     Raises:
         Refused: where it holds nothing, or belongs to others.
@@ -130,8 +130,7 @@ def renew(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
     for claim in held:
         if claim.lease is None:
             continue
-        seconds = request.lease_s or claim.lease.seconds
-        term = Term(seconds, claim.lease.slack)
+        term = Term(claim.lease.seconds, claim.lease.slack)
         ledger = ledger.replace(claim.key, replace(claim, lease=claim.lease.renewed(term, now)))
     return ledger, Changes(claims=differences(start, ledger, [claim.key for claim in held]))
 

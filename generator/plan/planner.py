@@ -13,7 +13,9 @@ from typing import Literal
 
 from generator.catalog.appdef import ApplicationDefinition, Parameter, Service
 from generator.catalog.catalog import Catalog
-from generator.catalog.inventory import AccessDomain, Node
+from generator.catalog.inventory import Node
+from generator.catalog.policy import AccessDomain
+from generator.catalog.registry import ChartSource
 from generator.demand.admission import choose_broker
 from generator.demand.claim import ApplicationClaim, ConnectionClaim, Subject, SubjectKind
 from generator.demand.request import ConnectionType, InputTopic
@@ -129,6 +131,7 @@ def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceReleas
             if known.services.get(key.service) == service
         ),
         service=service,
+        chart=_chart(catalog, service, claims),
         inputs=MappingProxyType(inputs),
         outputs=MappingProxyType(_outputs(catalog, service, key)),
         parameters=MappingProxyType(values),
@@ -136,6 +139,25 @@ def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceReleas
         applications=users,
         requesters=_requesters(claims),
     )
+
+
+def _chart(catalog: Catalog, service: Service, claims: Iterable[ApplicationClaim]) -> ChartSource:
+    """Return the chart in the version that the claims ask for, the default where it has none.
+
+    Raises:
+        Refused: where applications that share the service ask for different ones.
+    """
+    chart = catalog.charts[service.chart]
+    asked = {claim.version: chart.at(claim.version) or chart for claim in claims}
+    if len({source.version for source in asked.values()}) > 1:
+        versions = " and ".join(
+            f"{source.version} (for '{version}')" for version, source in sorted(asked.items())
+        )
+        message = (
+            f"{service.chart} is shared and asked for in versions {versions}; ask for the same"
+        )
+        raise Refused([fault("version", message, code="conflict")])
+    return next(iter(asked.values()))
 
 
 def _requesters(claims: Iterable[ApplicationClaim | ConnectionClaim]) -> tuple[str, ...]:

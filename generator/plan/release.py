@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from generator.catalog.appdef import Service
-from generator.catalog.inventory import AccessDomain, Broker, Node
+from generator.catalog.inventory import Broker, Node
+from generator.catalog.policy import AccessDomain
+from generator.catalog.registry import ChartSource
 from generator.demand.request import ConnectionType, InputTopic
 
 
@@ -36,6 +38,7 @@ class ServiceRelease:
     domain: AccessDomain
     appdef: str
     service: Service
+    chart: ChartSource
     inputs: Mapping[str, tuple[InputTopic, ...]]
     outputs: Mapping[str, str]
     parameters: Mapping[str, object]

@@ -19,7 +19,7 @@ import kubernetes_validate
 from generator import yamlio
 from generator.catalog.catalog import Catalog
 from generator.catalog.model import field_path
-from generator.catalog.registry import Chart
+from generator.catalog.registry import ChartSource
 from generator.errors import Fault, InvalidInput, fault
 
 KUBERNETES_VERSION = "1.36.0"
@@ -30,7 +30,9 @@ OWN_ROOTS = ("bootstrap/", "clusters/", "ledger/")
 _BUILT_IN = frozenset({"v1", "apps/v1", "rbac.authorization.k8s.io/v1"})
 
 
-def check_values(values: Mapping[str, Any], chart: Chart, catalog: Catalog, template: str) -> None:
+def check_values(
+    values: Mapping[str, Any], chart: ChartSource, catalog: Catalog, template: str
+) -> None:
     """Hold Helm values against the chart's schema, where the chart is in the state repo.
 
     As Helm does it: laid over the chart's defaults, for a schema may require what has one.

@@ -7,8 +7,9 @@ not appear here: who else asks for a running service changes the ledger and noth
 from __future__ import annotations
 
 from generator.catalog.catalog import Catalog
-from generator.catalog.inventory import AccessDomain, Node
-from generator.catalog.registry import Chart
+from generator.catalog.inventory import Node
+from generator.catalog.policy import AccessDomain
+from generator.catalog.registry import ChartSource
 from generator.plan import naming
 from generator.plan.release import Release, ServiceRelease
 from generator.render import connections
@@ -42,7 +43,7 @@ def render(release: Release, catalog: Catalog, engine: Engine) -> str:
         return connections.render(release, catalog, engine)
     template = catalog.values_template(release.appdef, release.service)
     values = engine.data(template, **_context(release, catalog))
-    chart = catalog.charts[release.service.chart]
+    chart = release.chart
     check_values(values, chart, catalog, template)
     return engine.text(
         "flux/release.yaml.j2",
@@ -53,7 +54,7 @@ def render(release: Release, catalog: Catalog, engine: Engine) -> str:
     )
 
 
-def chart_object(name: str, chart: Chart) -> str:
+def chart_object(name: str, chart: ChartSource) -> str:
     """Return the name of the object that fetches one chart in one version."""
     return f"{name}-{chart.version}".lower()
 
@@ -75,14 +76,16 @@ def standing_files(catalog: Catalog, engine: Engine) -> dict[str, str]:
             "flux/domain.yaml.j2", cluster=cluster, domain=domain
         )
         for name, chart in sorted(catalog.charts.items()):
-            files[f"{folder}/_charts/{chart_object(name, chart)}.yaml"] = engine.text(
-                "flux/chart.yaml.j2",
-                chart=chart,
-                chart_name=name,
-                name=chart_object(name, chart),
-                namespace=domain.namespace,
-                source=catalog.repository.source,
-            )
+            for source in chart.sources():
+                object_name = chart_object(name, source)
+                files[f"{folder}/_charts/{object_name}.yaml"] = engine.text(
+                    "flux/chart.yaml.j2",
+                    chart=source,
+                    chart_name=name,
+                    name=object_name,
+                    namespace=domain.namespace,
+                    source=catalog.repository.source,
+                )
     return files
 
 
@@ -93,7 +96,14 @@ def _bootstrap(cluster: str, catalog: Catalog, engine: Engine) -> str:
         cluster=cluster,
         domains=domains,
         folders={domain.name: domain_folder(cluster, domain) for domain in domains},
-        charts=sorted({chart.folder for chart in catalog.charts.values() if chart.folder}),
+        charts=sorted(
+            {
+                source.folder
+                for chart in catalog.charts.values()
+                for source in chart.sources()
+                if source.folder
+            }
+        ),
         repository=catalog.repository,
         branch=MAIN_BRANCH,
     )

@@ -139,9 +139,12 @@ class Generator:
 
     def _run(self) -> None:
         """Settle what comes until all is settled and no more is taken; in the worker thread."""
-        while self._waiting.wait(timeout=None):
+        while self._waiting.wait(self._settler.pause()):
             batch: list[Ticket] = []
             try:
+                batch += self._settler.expired()
+                if not (batch or self._waiting.anything):
+                    continue
                 self._settler.settle(batch)
                 self._settler.catch_up()
                 self._settler.tidy()

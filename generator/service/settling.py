@@ -8,12 +8,14 @@ from __future__ import annotations
 import logging
 import random
 import threading
+import uuid
 from collections.abc import Callable
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from typing import TypeAlias
 
 from generator.catalog.catalog import Catalog
 from generator.decision import Decision, Outcome, decide
+from generator.demand.request import DemandRequest, Operation
 from generator.errors import (
     DemandOpsError,
     InvalidInput,
@@ -23,6 +25,8 @@ from generator.errors import (
     Withdrawn,
     fault,
 )
+from generator.service.expiry import LeaseClock
+from generator.service.throttle import Throttle
 from generator.service.ticket import Receipt, Ticket
 from generator.service.waiting import TAKEN_BACK, Waiting
 from generator.staterepo import history, writer
@@ -38,6 +42,8 @@ _BATCH_LIMIT_EMBEDDED = 20
 _BATCH_LIMIT_REMOTE = 200
 """Demands that are published together: a push costs some 50 ms, moving a branch less than one."""
 _TIDY_EVERY = 300
+_LONGEST_WAIT_S = 60.0
+"""Between two looks at the leases: a clock may be set meanwhile."""
 
 _Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError]
 
@@ -60,6 +66,9 @@ class Settler:
         self._waiting = waiting
         self._on_published = on_published
         self._since_tidy = 0
+        self._throttle = Throttle()
+        self._clock = LeaseClock()
+        self._tried: dict[str, datetime] = {}
         self._giving_up = threading.Event()
         embedded = repository.always_current
         self._batch_limit = _BATCH_LIMIT_EMBEDDED if embedded else _BATCH_LIMIT_REMOTE
@@ -108,6 +117,29 @@ class Settler:
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
             pause = min(pause * 2, _LONGEST_PAUSE_S)
+
+    def pause(self) -> float:
+        """Return the seconds after which to look at the leases again."""
+        return self._clock.pause(self.snapshot.state.ledger, _LONGEST_WAIT_S)
+
+    def expired(self) -> list[Ticket]:
+        """Return a ticket for each demand whose lease ran out; nobody waits for its receipt.
+
+        One that cannot be released (its files do not render) is tried again after a while.
+        """
+        now, claims = self._clock.ended(self.snapshot.state.ledger)
+        since = now - timedelta(seconds=_LONGEST_WAIT_S)
+        self._tried = {demand: when for demand, when in self._tried.items() if when > since}
+        demands = dict.fromkeys(c.demand for c in claims if c.demand not in self._tried)
+        requests = [
+            DemandRequest(id=demand, operation=Operation.EXPIRE, demand=demand)
+            for demand in demands
+        ]
+        self._tried |= dict.fromkeys(demands, now)
+        return [
+            Ticket(str(uuid.uuid4()), request, now, lambda stage, text: None)
+            for request in requests
+        ]
 
     def catch_up(self) -> None:
         """Try again what people changed and could not be carried out: a release may allow it."""
@@ -164,6 +196,9 @@ class Settler:
                 ticket.received,
                 line.read,
                 lambda stage: ticket.tell(stage, stage),
+                lambda request, catalog: self._throttle.faults(
+                    request, catalog, ticket.operation, ticket.received
+                ),
             )
             if not self._waiting.hold(ticket):
                 return Withdrawn(TAKEN_BACK)
@@ -209,10 +244,12 @@ def _published_before(ticket: Ticket, arrival: history.Arrival) -> Receipt | Dem
         message = "was refused when the connection was cut; send it again to hear why"
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal if isinstance(ticket.goal, dict) else {}
-    outcome: Outcome = "released" if goal.get("shutdown") else "booked"
+    gives_up = goal.get("shutdown") or goal.get("operation") == Operation.RELEASE.value
+    outcome: Outcome = "released" if gives_up else "booked"
     if arrival.outcome == "unchanged":
         outcome = "unchanged"
-    return Receipt(ticket.operation, str(goal.get("id", "")), outcome, arrival.commit)
+    name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
+    return Receipt(ticket.operation, str(name), outcome, arrival.commit)
 
 
 def _doubt(batch: list[Ticket], start: Snapshot) -> None:

@@ -36,6 +36,11 @@ class Waiting:
             return tuple(self._tickets)
 
     @property
+    def anything(self) -> bool:
+        """Whether a demand waits to be taken up."""
+        return bool(self._queue)
+
+    @property
     def unpublished(self) -> int:
         """How many demands the outbox holds."""
         return len(self._outbox.pending)

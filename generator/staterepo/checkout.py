@@ -131,20 +131,25 @@ def _hand_edits(files: Mapping[str, str], before: Mapping[str, str]) -> Iterator
 def _unversioned_charts(
     catalog: Catalog, files: Mapping[str, str], before: Mapping[str, str]
 ) -> Iterator[Fault]:
-    for name, chart in sorted(catalog.charts.items()):
-        metadata = f"{chart.folder}/Chart.yaml"
-        if chart.folder is None or metadata not in before:
+    sources = {
+        source.folder: (name, source)
+        for name, chart in sorted(catalog.charts.items())
+        for source in chart.sources()
+        if source.folder
+    }
+    for folder, (name, source) in sorted(sources.items()):
+        metadata, prefix = f"{folder}/Chart.yaml", f"{folder}/"
+        if metadata not in before:
             continue
-        prefix = f"{chart.folder}/"
         changed = [
             path
             for path in sorted({*files, *before})
             if path.startswith(prefix) and files.get(path) != before.get(path)
         ]
-        if changed and _version(before[metadata]) == chart.version:
+        if changed and _version(before[metadata]) == source.version:
             yield fault(
                 "version",
-                f"is still {chart.version}, but {changed[0].removeprefix(prefix)} changed; raise "
+                f"is still {source.version}, but {changed[0].removeprefix(prefix)} changed; raise "
                 f"it here and at charts.{name} in registry/charts.yaml, or no cluster takes it",
             ).within(metadata)
 

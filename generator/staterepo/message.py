@@ -6,6 +6,7 @@ The trailers are a contract: an auditor without this program finds everything by
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from datetime import datetime, timezone
 
@@ -15,6 +16,7 @@ from generator.decision import Decision
 from generator.demand.claim import SubjectKind
 from generator.demand.request import Operation
 from generator.errors import Fault
+from generator.ledger import format as ledger_format
 from generator.render.changeset import ReleaseChange
 from generator.settings import RENDER_VERSION
 
@@ -23,6 +25,7 @@ GENERATOR_EMAIL = "generator@demandops.invalid"
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
+_LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
 
 
@@ -38,11 +41,12 @@ def generator_signature(moment: datetime) -> pygit2.Signature:
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
     """Return the requesters as the author, at the time when the demand was received."""
-    names = ", ".join(decision.request.requesters())
+    names = ", ".join(_requesters(decision))
     # git takes no angle brackets in a name and strips these characters from its ends
     name = _clipped(names.replace("<", "(").replace(">", ")"), _MAX_AUTHOR).strip(" .,:;\"'\\")
     demand = decision.changes.claims[0].key.demand
-    email = f"{demand}@demandops.invalid"
+    local = demand if _LOCAL_PART.fullmatch(demand) else ledger_format.segment(demand)
+    email = f"{local}@demandops.invalid"
     return pygit2.Signature(name or "unnamed", email, int(received.timestamp()), 0)
 
 
@@ -51,17 +55,9 @@ def of_decision(
 ) -> str:
     """Return the message of a demand's commit; ``settled``: demands just before it, as trailers."""
     request = decision.request
-    joining = request.operation is Operation.JOIN
     subjects = decision.changes.subjects()
-    who = ", ".join(request.requesters())
-    verb = "Join" if joining else "Release"
-    subject = f"{verb} {', '.join(item.id for item in subjects)}"
-    moment = received.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
-    why = (
-        f"Why: request '{request.id}', received {moment}, "
-        f"{'asks for' if joining else 'gives up'} {_counted(decision)} in the name of {who}."
-    )
-    body = [_clipped(subject, _MAX_SUBJECT), "", why, "", *_desired_state(decision.releases)]
+    body = [_clipped(_title(decision), _MAX_SUBJECT), "", _why(decision, received), ""]
+    body += _desired_state(decision.releases)
     if decision.changes.not_held:
         body += ["", "Listed, but not held:", *(f"  {item}" for item in decision.changes.not_held)]
     if decision.warnings:
@@ -72,13 +68,68 @@ def of_decision(
         ("Operation-Id", operation),
         *settled,
         *(("Demand-Id", demand) for demand in dict.fromkeys(c.key.demand for c in claims)),
-        *(("Requester", requester) for requester in request.requesters()),
+        *(("Requester", requester) for requester in _requesters(decision)),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
         *(("Connection", s.id) for s in subjects if s.kind is SubjectKind.CONNECTION),
         ("Request-Id", request.id),
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
+
+
+_VERBS = {
+    Operation.JOIN: ("Join", "asks for"),
+    Operation.SHUTDOWN: ("Release", "gives up"),
+    Operation.PUT: ("Put", "asks for"),
+    Operation.RELEASE: ("Release", "gives up"),
+    Operation.RENEW: ("Renew", "renews"),
+}
+
+
+def _requesters(decision: Decision) -> tuple[str, ...]:
+    """Return in whose name a demand changed something; of one that ended, in whose it stood."""
+    claims = [change.after or change.before for change in decision.changes.claims]
+    stood = sorted({who for claim in claims if claim for who in claim.requesters})
+    return decision.request.requesters() or tuple(stood)
+
+
+def _title(decision: Decision) -> str:
+    subjects = ", ".join(subject.id for subject in decision.changes.subjects())
+    operation = decision.request.operation
+    if operation is Operation.EXPIRE:
+        return f"Expire {subjects}"
+    renewed = operation.asks and _only_leases(decision)
+    return f"{_VERBS[Operation.RENEW if renewed else operation][0]} {subjects}"
+
+
+def _why(decision: Decision, received: datetime) -> str:
+    request = decision.request
+    moment = received.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
+    who = ", ".join(_requesters(decision))
+    what = _counted(decision)
+    if request.operation is Operation.EXPIRE:
+        ends = [c.before.lease.ends for c in decision.changes.claims if c.before and c.before.lease]
+        last = max(ends).astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return (
+            f"Why: the lease of demand '{request.demand}' on {what} in the name of {who} ended "
+            f"at {last} and was not renewed."
+        )
+    verb = _VERBS[request.operation][1]
+    if request.operation.asks and _only_leases(decision):
+        verb = _VERBS[Operation.RENEW][1]
+    named = "" if request.operation.is_reference else f" of demand '{request.demand}'"
+    return (
+        f"Why: request '{request.id}'{named}, received {moment}, {verb} {what} in the name of "
+        f"{who}."
+    )
+
+
+def _only_leases(decision: Decision) -> bool:
+    """Tell whether a demand changed nothing but how long its claims hold."""
+    return all(
+        change.before and change.after and change.before.booked == change.after.booked
+        for change in decision.changes.claims
+    )
 
 
 def of_follow(

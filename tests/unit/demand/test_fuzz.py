@@ -77,6 +77,8 @@ def test_whatever_comes_is_refused_with_a_reason(data: Any) -> None:
 
 
 @FEW
+@example({"\ud800": 1})
+@example({"apps": [{"\ud800": 1}]})
 @given(ANYTHING)
 def test_the_form_is_judged_alike_with_and_without_a_catalog(data: Any) -> None:
     request, faults = wire.parse(data, lambda number: None)
