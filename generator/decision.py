@@ -68,6 +68,13 @@ class Decision:
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
 
+    @property
+    def lease_s(self) -> int | None:
+        """For how many seconds the demand holds unless it is renewed; nothing: without end."""
+        claims = self.state.ledger.of_demand(self.request.demand) if self.request.demand else ()
+        claims = claims or tuple(change.after for change in self.changes.claims if change.after)
+        return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
+
 
 def decide(
     state: State,

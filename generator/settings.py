@@ -26,6 +26,9 @@ MAIN_BRANCH = "main"
 DEFAULT_ACTION_NAME = "/event_detector_operator_plugin/operator_plugin/deployment_request"
 """Where the reference's clients send their goals (robotkube's event detector)."""
 
+DEFAULT_DEMAND_ACTION_NAME = "/demandops/demand"
+"""Where our own clients send theirs."""
+
 QUEUE_LIMIT = 10_000
 """Demands that may wait at once; beyond it a new one is rejected rather than kept in memory."""
 

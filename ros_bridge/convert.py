@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from generator.settings import API_VERSION
+
 
 def as_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
     """Return a message as mappings, lists and plain values, as its YAML form would parse.
@@ -18,6 +20,66 @@ def as_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated class
     if isinstance(message, str | bool | int | float):
         return message
     return [as_data(item) for item in message]
+
+
+_OPERATIONS = ("put", "release", "renew")
+_TYPES = ("auto", "mqtt", "zenoh", "ros", "none")
+_ANSWERS = ("pushed", "reconciled", "healthy")
+
+
+def demand_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Return a ``Demand.Goal`` as what :func:`generator.demand.own.parse` takes.
+
+    A number that the message does not define is passed on as text, to be refused with its field.
+    """
+    data = {
+        "apiVersion": API_VERSION,
+        "kind": "Demand",
+        "operation": _word(_OPERATIONS, goal.operation),
+        "demand": goal.demand_id,
+        "request": goal.request_id,
+        "requesters": list(goal.requester_ids),
+        "applications": [_application(app) for app in goal.applications],
+        "connections": [_connection(connection) for connection in goal.connections],
+        "answer": _word(_ANSWERS, goal.answer),
+    }
+    if goal.lease.sec or goal.lease.nanosec:  # a part of a second counts as a whole one
+        data["lease"] = goal.lease.sec + bool(goal.lease.nanosec)
+    return data
+
+
+def _word(words: tuple[str, ...], number: int) -> str:
+    return words[number] if number < len(words) else str(number)
+
+
+def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
+    inputs: dict[str, list[dict[str, str]]] = {}
+    for item in app.inputs:
+        topic = {"topic": item.topic_name, "source": item.source_node_id, "type": item.type}
+        inputs.setdefault(item.role, []).append(topic)
+    return {
+        "id": app.id,
+        "type": app.type,
+        "node": app.node_id,
+        "inputs": inputs,
+        "parameters_json": {parameter.name: parameter.value_json for parameter in app.parameters},
+        "version": app.version,
+        "connect": _word(_TYPES, app.connect),
+    }
+
+
+def _connection(connection: Any) -> dict[str, Any]:  # noqa: ANN401
+    return {
+        "id": connection.id,
+        "type": _word(_TYPES[:-1], connection.type),
+        "source": connection.source_node_id,
+        "target": connection.target_node_id,
+        "broker": connection.broker_node_id,
+        "topics": [
+            {"source": route.source_topic, "target": route.target_topic}
+            for route in connection.topics
+        ],
+    }
 
 
 def from_data(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401

@@ -1,4 +1,4 @@
-"""The ROS 2 node: an action server that hands demands to the generator.
+"""The ROS 2 node: action servers that hand demands to the generator.
 
 Many goals may be under way: each waits for its receipt without holding the executor. What the
 generator's worker thread tells (stages, receipts) is queued and handled in the executor's own
@@ -14,7 +14,6 @@ from functools import partial
 from threading import Thread
 from typing import Any
 
-from application_manager_interfaces.action import DeploymentRequest
 from demandops_interfaces.srv import GetBookkeeping
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
@@ -23,11 +22,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.task import Future
 
-from generator.decision import explain
-from generator.errors import DemandOpsError, InvalidInput, QueueFull, ShuttingDown, Withdrawn
+from generator.errors import QueueFull, ShuttingDown, Withdrawn
 from generator.service import Generator, Receipt
-from ros_bridge.bookkeeping import answer
-from ros_bridge.convert import as_data
+from ros_bridge.bookkeeping import BookkeepingTopic, answer
+from ros_bridge.forms import DemandForm, DeploymentRequestForm, Form
 
 QUEUE_DEPTH = 2000
 """Depth of the services' queues. With ROS's default of 10, goals that arrive together are lost."""
@@ -40,9 +38,15 @@ DEEP = QoSProfile(
 
 
 class DemandNode(Node):  # type: ignore[misc]
-    """Serves ``DeploymentRequest`` for one state repo."""
+    """Serves ``DeploymentRequest`` and ``Demand`` for one state repo."""
 
-    def __init__(self, generator: Generator, action_name: str, **options: Any) -> None:  # noqa: ANN401
+    def __init__(
+        self,
+        generator: Generator,
+        action_name: str,
+        demand_action_name: str,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
         super().__init__("demandops", **options)
         self._generator = generator
         self._open: dict[str, ServerGoalHandle] = {}
@@ -52,24 +56,35 @@ class DemandNode(Node):  # type: ignore[misc]
         self._wake = self.create_guard_condition(
             self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
         )
-        self._server = ActionServer(
-            self,
-            DeploymentRequest,
-            action_name,
-            execute_callback=self._execute,
-            goal_callback=self._admit,
-            cancel_callback=self._cancel,
-            goal_service_qos_profile=DEEP,
-            result_service_qos_profile=DEEP,
-            cancel_service_qos_profile=DEEP,
-            feedback_pub_qos_profile=DEEP,
-        )
+        self._servers = [
+            self._serve(DeploymentRequestForm(), action_name),
+            self._serve(DemandForm(), demand_action_name),
+        ]
         self.create_service(
             GetBookkeeping,
             "~/get_bookkeeping",
             self._bookkeeping,
             callback_group=ReentrantCallbackGroup(),
         )
+        self._topic = BookkeepingTopic(self, generator, self._from_worker)
+
+    def _serve(self, form: Form, name: str) -> ActionServer:
+        return ActionServer(
+            self,
+            form.action,
+            name,
+            execute_callback=partial(self._execute, form),
+            goal_callback=partial(self._admit, form),
+            cancel_callback=self._cancel,
+            goal_service_qos_profile=DEEP,
+            result_service_qos_profile=DEEP,
+            cancel_service_qos_profile=DEEP,
+            feedback_pub_qos_profile=DEEP,
+        )
+
+    def close(self) -> None:
+        """Stop what runs beside the executor."""
+        self._topic.close()
 
     @property
     def open_goals(self) -> int:
@@ -93,13 +108,13 @@ class DemandNode(Node):  # type: ignore[misc]
 
     # ---- callbacks of the action server, in the executor's thread ----
 
-    def _admit(self, goal: Any) -> GoalResponse:  # noqa: ANN401
+    def _admit(self, form: Form, goal: Any) -> GoalResponse:  # noqa: ANN401
         """Accept whatever can be decoded: a goal response carries no text to say why not."""
-        if self._stopping:
-            self.get_logger().warning(f"goal '{goal.id}' rejected: shutting down")
-            return GoalResponse.REJECT
+        reason = "shutting down" if self._stopping else ""
         if len(self._open) >= self._generator.queue_limit:
-            self.get_logger().warning(f"goal '{goal.id}' rejected: too many are waiting")
+            reason = "too many are waiting"
+        if reason:
+            self.get_logger().warning(f"goal '{form.name(goal)}' rejected: {reason}")
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
@@ -109,43 +124,45 @@ class DemandNode(Node):  # type: ignore[misc]
             return CancelResponse.ACCEPT
         return CancelResponse.REJECT
 
-    async def _execute(self, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
+    async def _execute(self, form: Form, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
         operation = _operation(handle)
         self._open[operation] = handle
         done = Future(executor=self.executor)
         try:
             ticket = self._generator.submit(
-                as_data(handle.request),
+                form.data(handle.request),
                 operation,
-                lambda stage, text: self._from_worker(partial(self._feedback, handle, text)),
+                lambda stage, text: self._from_worker(
+                    partial(self._feedback, form, handle, stage, text)
+                ),
             )
         except (ShuttingDown, QueueFull) as error:
-            return self._finish(handle, error)
+            return self._finish(form, handle, error)
         ticket.future.add_done_callback(
             lambda future: self._from_worker(partial(done.set_result, future))
         )
         outcome = (await done).exception() or ticket.future.result()
-        return self._finish(handle, outcome)
+        return self._finish(form, handle, outcome)
 
-    def _feedback(self, handle: ServerGoalHandle, text: str) -> None:
+    def _feedback(self, form: Form, handle: ServerGoalHandle, stage: str, text: str) -> None:
         if handle.is_active:
-            handle.publish_feedback(DeploymentRequest.Feedback(message=text))
+            handle.publish_feedback(form.feedback(stage, text))
 
-    def _finish(self, handle: ServerGoalHandle, outcome: Receipt | BaseException) -> Any:  # noqa: ANN401
+    def _finish(
+        self, form: Form, handle: ServerGoalHandle, outcome: Receipt | BaseException
+    ) -> Any:  # noqa: ANN401
         self._open.pop(_operation(handle), None)
-        result = DeploymentRequest.Result()
+        result = form.result(handle.request, outcome)
+        told = f"goal '{form.name(handle.request)}': "
         if isinstance(outcome, Receipt):
-            result.message = _told(outcome)
             handle.succeed()
-            self.get_logger().info(f"goal '{handle.request.id}': {result.message}")
+            self.get_logger().info(told + result.message)
         elif isinstance(outcome, Withdrawn) and handle.is_cancel_requested:
-            result.message = str(outcome)
             handle.canceled()
-            self.get_logger().info(f"goal '{handle.request.id}': cancelled")
+            self.get_logger().info(told + "cancelled")
         else:
-            result.message = _reason(outcome)
             handle.abort()
-            self.get_logger().error(f"goal '{handle.request.id}': {result.message}")
+            self.get_logger().error(told + result.message)
         return result
 
     # ---- from the worker thread into the executor's ----
@@ -161,24 +178,3 @@ class DemandNode(Node):  # type: ignore[misc]
 
 def _operation(handle: ServerGoalHandle) -> str:
     return str(uuid.UUID(bytes=bytes(handle.goal_id.uuid)))
-
-
-def _told(receipt: Receipt) -> str:
-    """Return a receipt as the one line that a result carries."""
-    lines = [f"{receipt.outcome}: {receipt.commit}"]
-    lines += [f"warning: {warning}" for warning in receipt.warnings]
-    lines += [f"not held: {item}" for item in receipt.not_held]
-    return "\n".join(lines)
-
-
-def _reason(error: BaseException) -> str:
-    """Return why a goal is aborted, as ``<code>: <field>: <remedy>``, one line for each fault."""
-    if isinstance(error, InvalidInput):
-        return explain(error)
-    if isinstance(error, ShuttingDown):
-        return f"shutting-down: {error}"
-    if isinstance(error, QueueFull):
-        return f"queue-full: {error}"
-    if isinstance(error, DemandOpsError):
-        return f"state-repo: {error}"
-    return f"fault: {error!r}"

@@ -23,7 +23,7 @@ from rclpy.signals import SignalHandlerOptions
 from generator.cli.output import errors, progress
 from generator.cluster import wake
 from generator.service import Generator
-from generator.settings import DEFAULT_ACTION_NAME
+from generator.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from ros_bridge.node import DemandNode
 
 _LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -69,10 +69,11 @@ class _ToRos(logging.Handler):
 )
 @click.pass_context
 def serve(ctx: click.Context, state_repo: str | None, wake_file: Path | None) -> None:
-    """Run the ROS 2 node that takes demands over the action DeploymentRequest.
+    """Run the ROS 2 node that takes demands over the actions DeploymentRequest and Demand.
 
-    Everything after --ros-args goes to ROS. Parameters: action_name, state_repo, log_level (debug,
-    info, warn, error or fatal). Stop it with Ctrl-C or SIGTERM: it finishes what it has in hand.
+    Everything after --ros-args goes to ROS. Parameters: action_name (of DeploymentRequest),
+    demand_action_name, state_repo, log_level (debug, info, warn, error or fatal). Stop it with
+    Ctrl-C or SIGTERM: it finishes what it has in hand.
     """
     ros_args = list(ctx.args)
     if ros_args and ros_args[0] != "--ros-args":
@@ -98,6 +99,9 @@ def _parameters(state_repo: str | None) -> dict[str, Any]:
     try:
         values = {
             "action_name": probe.declare_parameter("action_name", DEFAULT_ACTION_NAME).value,
+            "demand_action_name": probe.declare_parameter(
+                "demand_action_name", DEFAULT_DEMAND_ACTION_NAME
+            ).value,
             "state_repo": probe.declare_parameter("state_repo", state_repo or "").value,
             "log_level": probe.declare_parameter("log_level", "info").value,
         }
@@ -116,7 +120,7 @@ def _parameters(state_repo: str | None) -> dict[str, Any]:
 
 
 def _run(generator: Generator, settings: dict[str, Any]) -> None:
-    node = DemandNode(generator, settings["action_name"])
+    node = DemandNode(generator, settings["action_name"], settings["demand_action_name"])
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
         # read when the node starts; a change of them now would do nothing, so none is taken
@@ -131,11 +135,13 @@ def _run(generator: Generator, settings: dict[str, Any]) -> None:
     # the executor spins in a thread: the main thread is free to notice a signal at once
     spinner = Thread(target=executor.spin, name="demandops-executor")
     spinner.start()
-    node.get_logger().info(f"taking demands on {settings['action_name']} for {generator.address}")
+    names = f"{settings['action_name']} and {settings['demand_action_name']}"
+    node.get_logger().info(f"taking demands on {names} for {generator.address}")
     signals.wait()
     _drain(executor, node, generator)
     executor.shutdown(timeout_sec=1)
     spinner.join(5)
+    node.close()
     node.destroy_node()
 
 

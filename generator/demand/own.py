@@ -90,6 +90,7 @@ class DemandGoal(Frozen):
     lease: str | int | None = None
     applications: list[GoalApplication] = Field(default_factory=list)
     connections: list[GoalConnection] = Field(default_factory=list)
+    answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
 
 
 _LISTS_OF_TEXT = ("requesters",)

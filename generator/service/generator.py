@@ -61,7 +61,8 @@ class Generator:
         self.address = repository.address
         self.queue_limit = queue_limit
         self._waiting = Waiting(self._slot.outbox, queue_limit)
-        self._settler = Settler(repository, snapshot, self._waiting, on_published)
+        self._watchers = [on_published]
+        self._settler = Settler(repository, snapshot, self._waiting, self._tell_watchers)
         self._finished: Future[bool] | None = None
         self._stop_lock = threading.Lock()
         for operation in self._waiting.operations:
@@ -103,6 +104,14 @@ class Generator:
     def withdraw(self, operation: str) -> bool:
         """Take a demand back. False once it is committed, or was never known."""
         return self._waiting.withdraw(operation)
+
+    def watch(self, on_published: Callable[[Catalog], None]) -> None:
+        """Have ``on_published`` called as well after every push, in the worker thread."""
+        self._watchers.append(on_published)
+
+    def _tell_watchers(self, catalog: Catalog) -> None:
+        for watcher in self._watchers:
+            watcher(catalog)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
         """Refuse further demands, finish what is in hand and stop; returns at once.

@@ -146,7 +146,7 @@ class Settler:
         if self.snapshot.problems:
             line = self._line()
             if line.publish():
-                self.snapshot = line.head
+                self._taken(line)
 
     def tidy(self) -> None:
         """Every few hundred commits: a demand leaves some twenty loose objects behind."""
@@ -163,11 +163,14 @@ class Settler:
             return True
         if not published:
             return False
+        self._taken(line)
+        self._since_tidy += len(results)
+        return True
+
+    def _taken(self, line: writer.Line) -> None:
         self.snapshot = line.head
         if line.head.commit != line.start.commit:
             self._on_published(line.head.state.catalog)
-            self._since_tidy += len(results)
-        return True
 
     def _line(self) -> writer.Line:
         """Start a line on the newest tip that is known, people's changes taken in."""
@@ -236,6 +239,7 @@ def _commit(line: writer.Line, ticket: Ticket, decision: Decision) -> Receipt:
         commit=commit,
         warnings=decision.warnings,
         not_held=decision.changes.not_held,
+        lease_s=decision.lease_s,
     )
 
 

@@ -28,7 +28,8 @@ _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 class Receipt:
     """What came of a demand: the commit that holds it is published and durable.
 
-    ``commit`` is the tip where the demand changed nothing.
+    ``commit`` is the tip where the demand changed nothing. ``lease_s`` is for how many seconds
+    it holds unless it is renewed, nothing where it has no end.
     """
 
     operation: str
@@ -37,6 +38,7 @@ class Receipt:
     commit: str
     warnings: tuple[str, ...] = ()
     not_held: tuple[str, ...] = ()
+    lease_s: int | None = None
 
 
 @dataclass(eq=False)

@@ -66,7 +66,9 @@ def test_the_eight_steps_of_the_paper_give_its_bookkeeping(serve: Serve, client:
         word, commit = answer.message.split("\n")[0].split(": ")
         assert word == ("booked" if step < 5 else "released")
         told = ["admitted", "booked", f"committed {commit}", f"pushed {commit}"]
-        if step > 1:  # at first the node may not have found the client's subscription yet
+        if step == 1:  # the node may not have found the client's subscription to feedback yet
+            client.wait(lambda: bool(client.call(experiment(1)).feedback))
+        else:
             client.wait(lambda: len(answer.feedback) == 4)  # noqa: B023 - it may come last
         assert answer.feedback == told[4 - len(answer.feedback) :]
         assert git(served.state_repo, "rev-parse", "main") == commit
