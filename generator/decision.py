@@ -18,10 +18,9 @@ from generator.demand import admission, own, permission, wire
 from generator.demand.claim import Subject
 from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from generator.errors import Fault, InvalidInput, Refused
-from generator.ledger import derived
 from generator.ledger import ledger as booking
 from generator.ledger.ledger import Changes, Ledger
-from generator.plan import quota
+from generator.plan import derived, quota
 from generator.plan.planner import affected, all_keys
 from generator.render import changeset
 from generator.render.changeset import Read, ReleaseChange
@@ -216,7 +215,7 @@ def _uncarried(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> Iter
     if not request.operation.asks:
         return
     for app in request.applications:
-        for role, topic in derived.foreign_inputs(app, catalog.appdefs[app.appdef]):
+        for role, topic in derived.foreign_inputs(app, catalog):
             if not ledger.carries(app.node, topic.topic):
                 yield (
                     f"application '{app.id}': no connection carries {role} {topic.topic} of "

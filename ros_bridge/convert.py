@@ -1,10 +1,18 @@
-"""Messages as plain data. Knows no rclpy: any message of rosidl's Python will do."""
+"""Messages as plain data, and back. Knows no rclpy: messages are all it takes."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
+from builtin_interfaces.msg import Duration
+from demandops_interfaces import msg as messages
+from demandops_interfaces.action import Demand as DemandMessage
+
+from generator.catalog.policy import seconds_of
+from generator.errors import near
 from generator.settings import API_VERSION
 
 
@@ -46,6 +54,85 @@ def demand_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
     if goal.lease.sec or goal.lease.nanosec:  # a part of a second counts as a whole one
         data["lease"] = goal.lease.sec + bool(goal.lease.nanosec)
     return data
+
+
+def demand_goal(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """Return the ``Demand.Goal`` for a document of the kind ``Demand``.
+
+    Raises:
+        ValueError: for a field or a word that it does not have.
+        TypeError, AssertionError: for a value of another type.
+    """
+    goal = DemandMessage.Goal()
+    known = {"apiVersion", "kind", "lease", "operation", "answer", "applications", "connections"}
+    names = {"demand": "demand_id", "request": "request_id", "requesters": "requester_ids"}
+    _only(data, {*known, *names}, "a demand")
+    for name, field in names.items():
+        if name in data:
+            setattr(goal, field, data[name])
+    goal.operation = _number(_OPERATIONS, data.get("operation", "put"), "operation")
+    goal.answer = _number(_ANSWERS, data.get("answer", "pushed"), "answer")
+    lease = data.get("lease") or 0
+    seconds = seconds_of(lease) if isinstance(lease, str) else lease
+    goal.lease = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
+    goal.applications = [_application_message(app) for app in data.get("applications", ())]
+    goal.connections = [_connection_message(one) for one in data.get("connections", ())]
+    return goal
+
+
+def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    known = {"inputs", "parameters", "parameters_json", "connect"}
+    names = {"id": "id", "type": "type", "node": "node_id", "version": "version"}
+    _only(data, {*known, *names}, "an application")
+    values = {name: json.dumps(value) for name, value in data.get("parameters", {}).items()}
+    values |= data.get("parameters_json", {})
+    return messages.Application(
+        **{field: data[name] for name, field in names.items() if name in data},
+        inputs=[
+            messages.Input(
+                role=role,
+                topic_name=topic.get("topic", ""),
+                source_node_id=topic.get("source", ""),
+                type=topic.get("type", ""),
+            )
+            for role, topics in data.get("inputs", {}).items()
+            for topic in topics
+        ],
+        parameters=[messages.Parameter(name=name, value_json=v) for name, v in values.items()],
+        connect=_number(_TYPES, data.get("connect", "auto"), "connect"),
+    )
+
+
+def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    names = {
+        "id": "id",
+        "source": "source_node_id",
+        "target": "target_node_id",
+        "broker": "broker_node_id",
+    }
+    _only(data, {"type", "topics", *names}, "a connection")
+    return messages.Connection(
+        **{field: data[name] for name, field in names.items() if name in data},
+        type=_number(_TYPES[:-1], data.get("type", "auto"), "type"),
+        topics=[
+            messages.Route(
+                source_topic=route.get("source", ""), target_topic=route.get("target", "")
+            )
+            for route in data.get("topics", ())
+        ],
+    )
+
+
+def _only(data: Mapping[str, Any], known: set[str], what: str) -> None:
+    for name in data:
+        if name not in known:
+            raise ValueError(f"'{name}' is no field of {what}{near(name, known)}")
+
+
+def _number(words: tuple[str, ...], word: str, field: str) -> int:
+    if word not in words:
+        raise ValueError(f"{field}: '{word}' is none of {', '.join(words)}")
+    return words.index(word)
 
 
 def _word(words: tuple[str, ...], number: int) -> str:

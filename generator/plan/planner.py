@@ -133,7 +133,7 @@ def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceReleas
         service=service,
         chart=_chart(catalog, service, claims),
         inputs=MappingProxyType(inputs),
-        outputs=MappingProxyType(_outputs(catalog, service, key)),
+        outputs=MappingProxyType(outputs(catalog, service, key)),
         parameters=MappingProxyType(values),
         replicas=scaling.replicas(service.scaling, sum(map(len, inputs.values()))),
         applications=users,
@@ -200,7 +200,7 @@ def _application_inputs(
         for topic in _united(claims, str(producer.each)):
             node = topic.source if producer.placement == "source" else claims[0].node
             key = ServiceKey(producer_name, node, source=topic.source, topic=topic.topic)
-            found.add(InputTopic(_outputs(catalog, producer, key)[output], topic.source))
+            found.add(InputTopic(outputs(catalog, producer, key)[output], topic.source))
         inputs[role] = tuple(sorted(found))
     return inputs
 
@@ -232,7 +232,8 @@ def _is_usual(catalog: Catalog, service: Service, source: str, topic: str) -> bo
     return node is not None and node.topics.get(str(service.each)) == topic
 
 
-def _outputs(catalog: Catalog, service: Service, key: ServiceKey) -> dict[str, str]:
+def outputs(catalog: Catalog, service: Service, key: ServiceKey) -> dict[str, str]:
+    """Return the topics that a service instance publishes, by the appdef's name for each."""
     if key.application is not None:
         instance = naming.topic_part(key.application)
     elif _is_usual(catalog, service, str(key.source), str(key.topic)):

@@ -40,6 +40,10 @@ from generator.staterepo import tree as trees
 
 HERE = Path(__file__).parent
 RECORDER, MONITOR = 2, 3
+UNCARRIED = (
+    "application 'edge/record': no connection carries driver.points /vehicle00/driver/points of "
+    "'vehicle00' to 'edge'"
+)
 
 
 def additions() -> dict[str, str]:
@@ -100,7 +104,7 @@ def test_it_is_demanded_with_yaml_alone(tmp_path: Path, capsys: pytest.CaptureFi
     )
     assert run(["request", str(file), "--state-repo", str(state), "--output", "json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
-    assert (row["outcome"], row["warnings"]) == ("booked", [])
+    assert (row["outcome"], row["warnings"]) == ("booked", [UNCARRIED])
     assert run(["bookkeeping", "--state-repo", str(state), "--output", "json"]) == 0
     found = json.loads(capsys.readouterr().out)["services"]
     assert found == {
@@ -150,8 +154,37 @@ def test_a_service_for_each_topic_runs_where_its_source_is(books: Books) -> None
     assert "clusters/c-its/perception/vehicle00/drv-vehicle00-vehicle00.yaml" in books.rendered()
 
 
-def test_what_runs_at_its_source_needs_no_connection_to_the_application(books: Books) -> None:
-    assert books.send(goal([record()])).warnings == ()
+def test_what_runs_at_its_source_needs_a_connection_for_what_it_makes_of_its_input(
+    books: Books,
+) -> None:
+    assert books.send(goal([record()])).warnings == (UNCARRIED,)
+
+
+def test_a_demand_of_our_own_gets_the_connection_that_brings_what_is_made_at_the_source(
+    books: Books,
+) -> None:
+    topic = {"topic": CLOUD[0], "source": "vehicle00"}
+    application = {
+        "id": "edge/record",
+        "type": "recorder",
+        "node": "edge",
+        "inputs": {"point_cloud": [topic]},
+        "parameters": {"rate": 10},
+    }
+    demand = {"kind": "Demand", "demand": "d", "requesters": ["vehicle00"]}
+    assert books.send(demand | {"applications": [application]}).warnings == ()
+    assert books.books()["connections"] == {
+        "derived/vehicle00/edge": {
+            "source": "vehicle00",
+            "target": "edge",
+            "topics": ["/vehicle00/driver/points"],
+            "requesters": ["vehicle00"],
+        }
+    }
+    books.send(demand | {"applications": [application | {"node": "cloud"}]})
+    assert list(books.books()["connections"]) == ["derived/vehicle00/cloud"]
+    assert books.send(demand | {"operation": "release"}).outcome == "released"
+    assert books.books() | {"commit": ""} == {"services": {}, "connections": {}, "commit": ""}
 
 
 def test_two_applications_of_different_kinds_share_a_driver(books: Books) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from generator.catalog.appdef import ApplicationDefinition
 from generator.catalog.catalog import Catalog
 from generator.demand.request import (
     ApplicationDemand,
@@ -16,7 +15,9 @@ from generator.demand.request import (
     DemandRequest,
     InputTopic,
 )
-from generator.ledger.books import Ledger
+from generator.ledger.ledger import Ledger
+from generator.plan.planner import outputs
+from generator.plan.release import ServiceKey
 
 
 def with_connections(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> DemandRequest:
@@ -28,10 +29,9 @@ def with_connections(request: DemandRequest, ledger: Ledger, catalog: Catalog) -
     found = {connection.id: connection for connection in request.connections}
     brought = {(c.target, target) for c in request.connections for _, target in c.topics}
     for app in request.applications:
-        appdef = catalog.appdefs.get(app.appdef)
-        if app.connect is None or appdef is None:
+        if app.connect is None or app.appdef not in catalog.appdefs:
             continue
-        for _, topic in foreign_inputs(app, appdef):
+        for _, topic in foreign_inputs(app, catalog):
             if (app.node, topic.topic) in brought:
                 continue
             wanted = _connection(app, topic.source, topic.topic, ledger)
@@ -41,20 +41,35 @@ def with_connections(request: DemandRequest, ledger: Ledger, catalog: Catalog) -
     return replace(request, connections=tuple(found.values()))
 
 
-def foreign_inputs(
-    app: ApplicationDemand, appdef: ApplicationDefinition
-) -> list[tuple[str, InputTopic]]:
-    """Return (role, topic) of every input that must be carried to the application's node."""
-    at_source = {
-        service.each for service in appdef.services.values() if service.placement == "source"
-    }
-    return [
-        (role, topic)
-        for role, topics in sorted(app.inputs.items())
-        if role not in at_source
-        for topic in topics
-        if topic.source != app.node
-    ]
+def foreign_inputs(app: ApplicationDemand, catalog: Catalog) -> list[tuple[str, InputTopic]]:
+    """Return (role, topic) of all that must be carried to the application's node.
+
+    Inputs that other nodes publish, and what services at such a node make of them.
+    """
+    appdef = catalog.appdefs[app.appdef]
+    found: dict[tuple[str, InputTopic], None] = {}
+    wanted = set()
+    for service in appdef.services.values():
+        if service.each is not None and service.placement == "application":
+            wanted.add(service.each)
+        wanted |= set(service.inputs.values())
+    for origin in sorted(wanted):
+        producer_name, _, output = origin.partition(".")
+        producer = appdef.services[producer_name] if output else None
+        if producer is not None and producer.placement != "source":
+            continue
+        role = str(producer.each) if producer else origin
+        for topic in app.inputs.get(role, ()):
+            if topic.source == app.node:
+                continue
+            carried = topic
+            if producer is not None:
+                key = ServiceKey(
+                    producer_name, topic.source, source=topic.source, topic=topic.topic
+                )
+                carried = InputTopic(outputs(catalog, producer, key)[output], topic.source)
+            found[origin, carried] = None
+    return list(found)
 
 
 def _connection(
