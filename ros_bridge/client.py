@@ -8,7 +8,7 @@
             print(demand.commit)     # it runs from here on, and is given up at the end
 
 What an application or a connection holds is written as in a YAML document of the kind ``Demand``
-(docs/demands.md). Works beside the caller's own rclpy: it has a context and a thread of its own.
+(docs/demand.md). Works beside the caller's own rclpy: it has a context and a thread of its own.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ def demand(
 ) -> None:
     """Send a demand to a running node.
 
-    FILE is a YAML document of the kind Demand (docs/demands.md), or - for standard input. Exit code
+    FILE is a YAML document of the kind Demand (docs/demand.md), or - for standard input. Exit code
     1 where it is not honoured, with the node's reason.
     """
     if hold + release + renew > 1:

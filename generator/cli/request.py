@@ -52,7 +52,7 @@ def request(
     """Book demand requests from files.
 
     FILE is the action goal of DeploymentRequest as YAML, as `ros2 action send_goal` takes it, or a
-    document of the kind Demand (docs/demands.md), or - for standard input. Several files, or
+    document of the kind Demand (docs/demand.md), or - for standard input. Several files, or
     documents in one, are taken in order; one that is refused does not stop the next. All are parsed
     before any is booked.
     """

@@ -1,0 +1,122 @@
+"""What the documentation shows is run, so that it stays true."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.cli.main import cli
+from generator.decision import State, decide, explain
+from generator.errors import Refused
+from generator.ledger.ledger import Ledger
+from generator.plan.bookkeeping import as_data, bookkeeping
+from generator.staterepo import layout
+
+DOCS = Path(__file__).parents[2] / "docs"
+NOW = datetime(2026, 5, 4, 12, 0, tzinfo=timezone.utc)
+
+
+def blocks(name: str) -> list[str]:
+    """The indented blocks of a document."""
+    text = (DOCS / name).read_text()
+    return [
+        textwrap.dedent(found) for found in re.findall(r"(?:^ {4}.*\n|^\n(?= {4}))+", text, re.M)
+    ]
+
+
+def block(name: str, start: str) -> str:
+    (found,) = [text for text in blocks(name) if text.lstrip().startswith(start)]
+    return found
+
+
+def state(**files: str) -> State:
+    found = layout.files() | files
+    config = {path: text for path, text in found.items() if path.split("/")[0] in CONFIG_ROOTS}
+    return State.of(load(config), Ledger())
+
+
+def demand() -> dict[str, Any]:
+    goal: dict[str, Any] = yaml.safe_load(block("demand.md", "apiVersion: demandops/v1\nkind: Dem"))
+    return goal
+
+
+def decided(on: State, goal: object) -> Any:
+    return decide(on, goal, NOW, lambda path: None)
+
+
+def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> None:
+    decision = decided(state(), demand())
+    books = as_data(bookkeeping(decision.state.ledger, decision.state.catalog), "")
+    assert {entry["service"] for entry in books["services"].values()} == {
+        "object-detection",
+        "object-fusion",
+    }
+    assert list(books["connections"]) == ["derived/vehicle00/edge"]
+    assert decision.lease_s == 600
+    assert decision.warnings == ()
+
+
+def test_the_deployment_request_of_the_documentation_runs() -> None:
+    goal = yaml.safe_load(block("demand.md", "id: station00/collective-perception"))
+    decision = decided(state(), goal)
+    assert decision.outcome == "booked"
+    assert len(decision.changes.claims) == 2
+
+
+@pytest.mark.parametrize(
+    ("requester", "node", "start"),
+    [
+        ("vehicle01", "cloud", "not-allowed: requesters[0]: rule 'vehicles'"),
+        ("truck7", "edge", "not-allowed: requesters[0]: no rule of"),
+    ],
+)
+def test_the_policy_of_the_documentation_refuses_as_it_says(
+    requester: str, node: str, start: str
+) -> None:
+    policy = block("policy.md", "apiVersion: demandops/v1\nkind: AccessDomains")
+    on = state(**{"policy/access-domains.yaml": policy})
+    goal = demand() | {"requesters": [requester]}
+    (application,) = goal["applications"]
+    # its inputs are at the node: no connection is needed, and so none is refused too
+    inputs = {"ego_data": [{"topic": "/vehicles/vehicle01/ego_data", "source": node}]}
+    goal["applications"] = [application | {"node": node, "inputs": inputs}]
+    with pytest.raises(Refused) as refused:
+        decided(on, goal)
+    said = explain(refused.value)
+    assert said == block("policy.md", start).strip()
+    assert decided(on, demand()).outcome == "booked"
+
+
+def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:
+    runner, files = CliRunner(), layout.files()
+    listed = dict(
+        line.split(maxsplit=1) for line in runner.invoke(cli, ["schema"]).output.splitlines()
+    )
+    checked = 0
+    for name, what in listed.items():
+        schema = yaml.safe_load(runner.invoke(cli, ["schema", name]).output)
+        validator = jsonschema_rs.validator_for(schema)
+        path = what.replace("<name>", "object-detection-fusion")
+        if path in files:
+            data = yaml.safe_load(files[path])
+            assert validator.is_valid(data), name
+            assert not validator.is_valid(data | {"misspelt": 1}), name
+            checked += 1
+    assert checked == 8
+    schema = yaml.safe_load(runner.invoke(cli, ["schema", "demand"]).output)
+    assert jsonschema_rs.validator_for(schema).is_valid(demand())
+
+
+def test_schemas_are_written_to_a_folder(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(cli, ["schema", "--write", str(tmp_path / "schemas")])
+    assert ran.output == f"11 schemas in {tmp_path / 'schemas'}\n"
+    assert len(list((tmp_path / "schemas").glob("*.json"))) == 11
