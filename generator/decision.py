@@ -14,12 +14,13 @@ from datetime import datetime, timezone
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
-from generator.demand import admission, wire
+from generator.demand import admission, carriers, wire
 from generator.demand.claim import Subject
 from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from generator.errors import Fault, InvalidInput, Refused
 from generator.ledger import ledger as booking
 from generator.ledger.ledger import Changes, Ledger
+from generator.plan.clients import is_bridged
 from generator.plan.planner import affected, all_keys
 from generator.render import changeset
 from generator.render.changeset import Read, ReleaseChange
@@ -99,7 +100,10 @@ def decide(
         changes=changes,
         files=made.files if changes.claims else {},
         releases=made.releases,
-        warnings=tuple(_uncarried(request, ledger, state.catalog)),
+        warnings=(
+            *_uncarried(request, ledger, state.catalog),
+            *_bridged(request, state.catalog),
+        ),
     )
 
 
@@ -112,6 +116,7 @@ def admit(state: State, goal: object) -> DemandRequest:
     request, faults = wire.parse(goal, state.catalog.appdef_by_wire_type)
     if request is None:
         raise Refused(faults)
+    request = carriers.resolved(request, state.catalog, state.ledger.type_of)
     told = {found.field for found in faults}
     content = _in_wire_words(list(admission.faults(request, state.catalog)), request, state.catalog)
     unread = bool(told & {"apps", "connections"})  # and so not said to be missing
@@ -182,6 +187,20 @@ def _uncarried(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> Iter
                         f"application '{app.id}': no connection carries {role} {topic.topic} of "
                         f"'{topic.source}' to '{app.node}'"
                     )
+
+
+def _bridged(request: DemandRequest, catalog: Catalog) -> Iterator[str]:
+    """Yield a warning for each topic that the initial deployment carries already."""
+    if request.operation is not Operation.JOIN:
+        return
+    for connection in request.connections:
+        for route in connection.topics:
+            if is_bridged(route, connection.source, connection.target, catalog):
+                yield (
+                    f"connection '{connection.id}': {route.read} is bridged between "
+                    f"'{connection.source}' and '{connection.target}' already, so no client "
+                    "carries it"
+                )
 
 
 def explain(error: InvalidInput) -> str:

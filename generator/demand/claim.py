@@ -11,6 +11,7 @@ from enum import Enum
 from types import MappingProxyType
 
 from generator.demand.request import ConnectionType, InputTopic
+from generator.demand.route import Route
 
 
 class SubjectKind(Enum):
@@ -71,7 +72,10 @@ class ApplicationClaim:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionClaim:
-    """One demand's hold on a connection. ``topics`` maps source topic to target topic, sorted."""
+    """One demand's hold on a connection. ``topics`` are routes by source topic, sorted.
+
+    ``type`` is never ``AUTO``.
+    """
 
     connection: str
     demand: str
@@ -82,7 +86,7 @@ class ConnectionClaim:
     source: str
     target: str
     broker: str
-    topics: Mapping[str, str]
+    topics: Mapping[str, Route]
 
     @property
     def subject(self) -> Subject:

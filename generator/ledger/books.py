@@ -19,6 +19,7 @@ from generator.demand.claim import (
     Subject,
     SubjectKind,
 )
+from generator.demand.request import ConnectionType
 
 Claims: TypeAlias = "HashTrieMap[str, Claim]"
 """The claims of one subject by demand id."""
@@ -53,15 +54,18 @@ class Changes:
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """All claims, with the two look-ups that planning needs.
+    """All claims, with the look-ups that planning needs.
 
     ``takers``: (source node, topic) → applications that take that topic in.
-    ``carriers``: (target node, target topic) → connections that bring it there.
+    ``carriers``: (node, topic) → connections that bring it there.
+    ``links``: (connection type, node) → connections that end there; not for MQTT, whose clients
+    know nothing of each other.
     """
 
     claims: HashTrieMap[Subject, Claims] = field(default_factory=HashTrieMap)
     takers: HashTrieMap[tuple[str, str], HashTrieSet[str]] = field(default_factory=HashTrieMap)
     carriers: HashTrieMap[tuple[str, str], HashTrieSet[str]] = field(default_factory=HashTrieMap)
+    links: HashTrieMap[tuple[str, str], HashTrieSet[str]] = field(default_factory=HashTrieMap)
 
     def of(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
@@ -78,6 +82,11 @@ class Ledger:
         claims = self.of(Subject(SubjectKind.CONNECTION, connection))
         return tuple(claim for claim in claims if isinstance(claim, ConnectionClaim))
 
+    def type_of(self, connection: str) -> ConnectionType | None:
+        """Return the type of a connection that something holds, or nothing."""
+        claims = self.connection(connection)
+        return claims[0].type if claims else None
+
     def subjects(self, kind: SubjectKind) -> list[str]:
         """Return the ids of all subjects of a kind that something holds, sorted."""
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
@@ -89,6 +98,10 @@ class Ledger:
     def carries(self, target: str, topic: str) -> bool:
         """Tell whether some connection brings ``topic`` to the node ``target``."""
         return (target, topic) in self.carriers
+
+    def at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
+        """Return the connections of a type that end at ``node``, sorted; not kept for MQTT."""
+        return tuple(sorted(self.links.get((kind.name, node)) or ()))
 
     def get(self, key: ClaimKey) -> Claim | None:
         """Return one claim."""
@@ -113,14 +126,11 @@ class Ledger:
                 self.takers, key.subject.id, _taken([old]), _taken(after.values()), _taken([claim])
             )
             return replace(self, claims=claims, takers=takers)
-        carriers = _reindex(
-            self.carriers,
-            key.subject.id,
-            _brought([old]),
-            _brought(after.values()),
-            _brought([claim]),
+        carriers, links = (
+            _reindex(index, key.subject.id, of([old]), of(after.values()), of([claim]))
+            for index, of in ((self.carriers, _brought), (self.links, _linked))
         )
-        return replace(self, claims=claims, carriers=carriers)
+        return replace(self, claims=claims, carriers=carriers, links=links)
 
     def restored(self, subject: Subject, other: Ledger) -> Ledger:
         """Return the ledger with the claims on ``subject`` as they are in ``other``."""
@@ -152,10 +162,19 @@ def _taken(claims: Iterable[Claim | None]) -> set[tuple[str, str]]:
 
 def _brought(claims: Iterable[Claim | None]) -> set[tuple[str, str]]:
     return {
-        (claim.target, topic)
+        (route.ends(claim.source, claim.target)[1], route.written)
         for claim in claims
         if isinstance(claim, ConnectionClaim)
-        for topic in claim.topics.values()
+        for route in claim.topics.values()
+    }
+
+
+def _linked(claims: Iterable[Claim | None]) -> set[tuple[str, str]]:
+    return {
+        (claim.type.name, node)
+        for claim in claims
+        if isinstance(claim, ConnectionClaim) and claim.type is not ConnectionType.MQTT
+        for node in (claim.source, claim.target)
     }
 
 
