@@ -107,7 +107,9 @@ class Node(Frozen):
     zenoh: Zenoh | None = None
     wan: Wan | None = None
     types: dict[Topic, MessageType] = Field(default_factory=dict)
-    bridged: dict[NodeId, tuple[Topic, ...]] = Field(default_factory=dict, strict=False)
+    bridged: dict[NodeId, Annotated[tuple[Topic, ...], Field(strict=False)]] = Field(
+        default_factory=dict
+    )
 
     @model_validator(mode="after")
     def _findable(self) -> Node:

@@ -131,8 +131,8 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
         if first.target != route.target:
             yield fault(
                 f"{where}[{index}].target",
-                f"{shown(route.source)} goes to {shown(first.target)} and to {shown(route.target)}; one source "
-                "topic has one target, use a second connection",
+                f"{shown(route.source)} goes to {shown(first.target)} and to "
+                f"{shown(route.target)}; one source topic has one target, use a second connection",
             )
         for name, stands, asked in differences(first, route):
             yield fault(
