@@ -20,7 +20,7 @@ import yaml
 from tests.e2e.rig import pki
 
 USER = "fleet 007"
-PASSWORD = "12345\"'{}#\\ é%"
+PASSWORD = "12345\"'{}#\\ é%"  # noqa: S105 - of a broker that lives as long as the test
 """What would break where it is pasted into YAML, a shell or a command line."""
 
 DEADLINE_S = 20.0

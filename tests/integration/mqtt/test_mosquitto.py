@@ -71,9 +71,7 @@ def connect(pods: Ends) -> Iterator[Callable[..., Client]]:
     opened: list[Client] = []
 
     def client(side: str, **changed: Any) -> Client:
-        parameters = pods[side].parameters()
-        parameters |= {name.replace("__", "."): value for name, value in changed.items()}
-        opened.append(Client(parameters))
+        opened.append(Client(pods[side].parameters() | changed))
         return opened[-1]
 
     yield client
@@ -123,7 +121,8 @@ def test_who_comes_late_gets_what_is_retained_and_nothing_else(
 
 
 def test_the_password_is_what_lets_in(connect: Callable[..., Client]) -> None:
-    assert connect("source", broker__pass="wrong").reason == "Not authorized"
+    refused = connect("source", **{"broker.pass": "wrong"})
+    assert refused.reason == "Not authorized"
 
 
 def test_a_broker_of_another_authority_is_not_trusted(
@@ -133,7 +132,7 @@ def test_a_broker_of_another_authority_is_not_trusted(
 
     other = pki.make(tmp_path / "other").authority
     with pytest.raises(ssl.SSLCertVerificationError):
-        connect("source", broker__tls__ca_certificate=str(other))
+        connect("source", **{"broker.tls.ca_certificate": str(other)})
 
 
 def test_neither_name_nor_password_is_in_what_git_holds(manifests: dict[str, str]) -> None:
