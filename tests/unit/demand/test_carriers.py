@@ -234,3 +234,38 @@ class TestRos:
             "connections: connection 'd' would listen on port 20000 of 'edge', as 'c' does; use "
             "another connection id, or widen firstPort and lastPort of its wan"
         ]
+
+
+class TestThroughTheWire:
+    """The reference's message names the three types by number, and says nothing of options."""
+
+    def books(self, **nodes: dict[str, Any]) -> Books:
+        books = Books()
+        books.state = state(**nodes)
+        return books
+
+    @pytest.mark.parametrize(("number", "name"), [(0, "ROS"), (1, "MQTT"), (2, "ZENOH")])
+    def test_each_type_is_honoured_where_the_inventory_allows(self, number: int, name: str) -> None:
+        books = self.books(vehicle00=SPEAKS | TYPED, edge=REACHABLE | WAN)
+        asked = connection("c", topics=["/a"], broker="", type=number)
+        assert books.send(goal([], [asked])).outcome == "booked"
+        assert books.send(goal([], [asked])).outcome == "unchanged"
+        (claim,) = books.state.ledger.connection("c")
+        assert claim.type.name == name
+        assert books.books()["connections"]["c"]["topics"] == ["/a"]
+        assert books.send(goal([], [asked], shutdown=True)).outcome == "released"
+        assert len(books.state.ledger) == 0
+
+    def test_a_message_type_that_is_missing_is_told_in_words_of_the_wire(self) -> None:
+        books = self.books(edge=WAN)
+        (found,) = books.faults(goal([], [connection(topics=["/x"], broker="", type=0)]))
+        assert found.startswith("connections[0].source_topics[0]: the message type of '/x'")
+
+    def test_what_is_bridged_already_is_a_warning(self) -> None:
+        books = self.books(vehicle00={"bridged": {"edge": ["/a"]}})
+        decision = books.send(goal([], [connection("c", topics=["/a", "/b"])]))
+        assert decision.warnings == (
+            "connection 'c': /a is bridged between 'vehicle00' and 'edge' already, so no client "
+            "carries it",
+        )
+        assert len(decision.releases) == 2
