@@ -6,7 +6,7 @@ left open. Both are pure functions of request and catalog; what is booked comes 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 from generator.catalog.catalog import (
@@ -92,13 +92,20 @@ def obstacles(kind: ConnectionType, asked: ConnectionDemand, catalog: Catalog) -
             code=_UNCARRIED,
         )
     yield from _ends(kind, asked, catalog)
-    for index, route in enumerate(asked.topics):
+    yield from misfits(kind, asked.topics, (asked.source, asked.target), catalog)
+
+
+def misfits(
+    kind: ConnectionType, topics: Iterable[Route], ends: tuple[str, str], catalog: Catalog
+) -> Iterator[Fault]:
+    """Yield what of the routes between two ends ``kind`` cannot do, by ``topics[i].<option>``."""
+    for index, route in enumerate(topics):
         if topic_problem(route.source) or topic_problem(route.target):
             continue  # told by the request's own checks
         where = f"topics[{index}]"
         yield from _options(where, kind, route)
         if kind is ConnectionType.ROS:
-            yield from _of_dds(where, route, asked, catalog)
+            yield from _of_dds(where, route, route.ends(*ends)[0], catalog)
         if kind is not ConnectionType.MQTT and route.source != route.target:
             yield fault(
                 f"{where}.target",
@@ -175,8 +182,7 @@ def _options(where: str, kind: ConnectionType, route: Route) -> Iterator[Fault]:
         )
 
 
-def _of_dds(where: str, route: Route, asked: ConnectionDemand, catalog: Catalog) -> Iterator[Fault]:
-    node = route.ends(asked.source, asked.target)[0]
+def _of_dds(where: str, route: Route, node: str, catalog: Catalog) -> Iterator[Fault]:
     if node in catalog.nodes and not message_type(route, node, catalog):
         yield fault(
             f"{where}.type",

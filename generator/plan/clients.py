@@ -14,7 +14,7 @@ from typing import Literal
 from generator.catalog.catalog import Catalog
 from generator.catalog.inventory import Node
 from generator.demand import route as routes
-from generator.demand.carriers import choose_broker, message_type
+from generator.demand.carriers import choose_broker, message_type, misfits
 from generator.demand.claim import ConnectionClaim
 from generator.demand.request import ConnectionType
 from generator.demand.route import Route
@@ -73,13 +73,25 @@ def is_bridged(route: Route, source: str, target: str, catalog: Catalog) -> bool
 
 
 def carried(claims: tuple[ConnectionClaim, ...], catalog: Catalog) -> dict[str, Route]:
-    """Return the routes that a connection's clients must carry: those not bridged already."""
-    source, target = claims[0].source, claims[0].target
-    return {
+    """Return the routes that a connection's clients must carry: those not bridged already.
+
+    Raises:
+        Refused: where a person wrote a claim that its type cannot carry, or took out of the
+            inventory what it needs.
+    """
+    first = claims[0]
+    topics = {
         name: route
         for name, route in connection_topics(claims).items()
-        if not is_bridged(route, source, target, catalog)
+        if not is_bridged(route, first.source, first.target, catalog)
     }
+    found = list(misfits(first.type, topics.values(), (first.source, first.target), catalog))
+    if found:
+        raise Refused(
+            replace(one, field="connections", message=f"'{first.connection}': {one.message}")
+            for one in found
+        )
+    return topics
 
 
 def end(ledger: Ledger, catalog: Catalog, key: EndKey) -> MqttEnd | RosEnd | None:
@@ -138,14 +150,11 @@ def _own_and_peer(claim: ConnectionClaim, key: EndKey) -> tuple[str, str]:
 
 def _ros_end(ledger: Ledger, catalog: Catalog, key: EndKey, topics: dict[str, Route]) -> RosEnd:
     claim = ledger.connection(key.connection)[0]
-    typed = {}
-    for name, route in topics.items():
-        kind = message_type(route, route.ends(claim.source, claim.target)[0], catalog)
-        if not kind:
-            raise _stuck(
-                key.connection, f"no longer knows the message type of '{name}'; restore it"
-            )
-        typed[name] = replace(route, type=kind)
+    ends = (claim.source, claim.target)
+    typed = {
+        name: replace(route, type=message_type(route, route.ends(*ends)[0], catalog))
+        for name, route in topics.items()
+    }
     listener = _listener(claim, catalog)
     if listener is None:
         raise _stuck(key.connection, "finds no end with a wan address any more; restore it")

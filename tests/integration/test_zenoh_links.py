@@ -48,9 +48,8 @@ def configurations() -> dict[str, str]:
         "0.0.0.0:7447": station,
         "router.example:7447": router,
     }
-    for node in found:
-        for written, address in here.items():
-            found[node] = found[node].replace(written, address)
+    for written, address in here.items():
+        found = {node: text.replace(written, address) for node, text in found.items()}
     return found
 
 

@@ -6,8 +6,9 @@ import json
 import random
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import yaml
@@ -20,7 +21,8 @@ from test_carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, state
 from generator.catalog.catalog import load
 from generator.decision import State, rendered
 from generator.demand.claim import Subject, SubjectKind
-from generator.errors import InvalidInput
+from generator.demand.route import Route
+from generator.errors import InvalidInput, Refused
 from generator.plan.clients import BridgeKey, EndKey
 from generator.plan.planner import affected
 from generator.render.changeset import ReleaseChange
@@ -328,6 +330,52 @@ class TestBridgedAlready:
         world = World(state(vehicle00=BRIDGED))
         world.send(demand("mqtt", {"/a": "/b"}))
         assert len(world.clients()) == 2
+
+
+class TestWhatPeopleDidInGit:
+    """A claim that its type cannot carry, or an inventory that lost what a claim needs."""
+
+    NODES: ClassVar[dict[str, Any]] = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
+
+    def after(self, kind: str, route: Route, **nodes: Any) -> list[str]:
+        """Return why the books cannot be rendered once a claim or the inventory was edited."""
+        world = World(state(**self.NODES))
+        world.send(demand(kind))
+        (claim,) = world.state.ledger.connection("c")
+        edited = replace(claim, topics={route.source: route})
+        books = world.state.ledger.replace(claim.key, edited)
+        with pytest.raises(Refused) as refused:
+            rendered(replace(state(**(self.NODES | nodes)), ledger=books))
+        return [str(found) for found in refused.value.faults]
+
+    def test_an_option_that_the_type_cannot_honour(self) -> None:
+        assert self.after("zenoh", Route("/a", "/a", qos=1)) == [
+            "connections: 'c': qos of '/a' is nothing that ZENOH can do; leave it out, or use type "
+            "1 (MQTT)"
+        ]
+
+    def test_another_name(self) -> None:
+        (found,) = self.after("ros", Route("/a", "/b"))
+        assert found.startswith("connections: 'c': '/a' cannot become '/b'")
+
+    @pytest.mark.parametrize(
+        ("kind", "node", "left", "expected"),
+        [
+            ("zenoh", "vehicle00", {}, "node: 'vehicle00' carries Zenoh connections, but has no"),
+            ("ros", "edge", {}, "connections: connection 'c' finds no end with a wan address any"),
+            ("ros", "vehicle00", {}, "connections: 'c': the message type of '/a' is not known"),
+        ],
+    )
+    def test_what_the_inventory_lost(
+        self, kind: str, node: str, left: dict[str, Any], expected: str
+    ) -> None:
+        assert self.after(kind, Route("/a", "/a"), **{node: left})[0].startswith(expected)
+
+    def test_an_image_that_the_registry_lost(self) -> None:
+        world = World(state(**self.NODES))
+        world.send(demand("zenoh"))
+        with pytest.raises(Refused, match="'zenoh-bridge' is in use, but not in registry/images"):
+            rendered(replace(state("", **self.NODES), ledger=world.state.ledger))
 
 
 class TestSchemas:
