@@ -14,13 +14,14 @@ from datetime import datetime, timezone
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
-from generator.demand import admission, own, permission, wire
+from generator.demand import admission, carriers, own, permission, wire
 from generator.demand.claim import Subject
 from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from generator.errors import Fault, InvalidInput, Refused
 from generator.ledger import ledger as booking
 from generator.ledger.ledger import Changes, Ledger
 from generator.plan import derived, quota
+from generator.plan.clients import is_bridged
 from generator.plan.planner import affected, all_keys
 from generator.render import changeset
 from generator.render.changeset import Read, ReleaseChange
@@ -122,7 +123,10 @@ def decide(
         changes=changes,
         files=made.files if changes.claims else {},
         releases=made.releases,
-        warnings=tuple(_uncarried(request, ledger, state.catalog)),
+        warnings=(
+            *_uncarried(request, ledger, state.catalog),
+            *_bridged(request, state.catalog),
+        ),
     )
 
 
@@ -138,12 +142,13 @@ def admit(
     if isinstance(goal, dict) and own.is_own(goal):
         request, faults = own.parse(goal)
         request = permission.with_terms(request, catalog)
-        request = admission.with_types(derived.with_connections(request, state.ledger, catalog))
+        request = derived.with_connections(request, state.ledger, catalog)
     else:
         parsed, faults = wire.parse(goal, catalog.appdef_by_wire_type)
         if parsed is None:
             raise Refused(faults)
         request = permission.with_terms(parsed, catalog)
+    request = carriers.resolved(request, catalog, state.ledger.type_of)
     told = {found.field for found in faults}
     found_in_content = [*admission.faults(request, catalog), *permission.faults(request, catalog)]
     content = _in_goals_words(found_in_content, request, catalog)
@@ -220,6 +225,20 @@ def _uncarried(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> Iter
                 yield (
                     f"application '{app.id}': no connection carries {role} {topic.topic} of "
                     f"'{topic.source}' to '{app.node}'"
+                )
+
+
+def _bridged(request: DemandRequest, catalog: Catalog) -> Iterator[str]:
+    """Yield a warning for each topic that the initial deployment carries already."""
+    if not request.operation.asks:
+        return
+    for connection in request.connections:
+        for route in connection.topics:
+            if is_bridged(route, connection.source, connection.target, catalog):
+                yield (
+                    f"connection '{connection.id}': {route.read} is bridged between "
+                    f"'{connection.source}' and '{connection.target}' already, so no client "
+                    "carries it"
                 )
 
 

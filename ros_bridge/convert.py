@@ -12,6 +12,7 @@ from demandops_interfaces import msg as messages
 from demandops_interfaces.action import Demand as DemandMessage
 
 from generator.catalog.policy import seconds_of
+from generator.demand.route import RouteOptions
 from generator.errors import near
 from generator.settings import API_VERSION
 
@@ -32,6 +33,7 @@ def as_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated class
 
 _OPERATIONS = ("put", "release", "renew")
 _TYPES = ("auto", "mqtt", "zenoh", "ros", "none")
+_OPTIONS = tuple(RouteOptions.model_fields)
 _ANSWERS = ("pushed", "reconciled", "healthy")
 
 
@@ -114,13 +116,17 @@ def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     return messages.Connection(
         **{field: data[name] for name, field in names.items() if name in data},
         type=_number(_TYPES[:-1], data.get("type", "auto"), "type"),
-        topics=[
-            messages.Route(
-                source_topic=route.get("source", ""), target_topic=route.get("target", "")
-            )
-            for route in data.get("topics", ())
-        ],
+        topics=[_route_message(route) for route in data.get("topics", ())],
     )
+
+
+def _route_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    _only(data, {"source", "target", *_OPTIONS}, "a topic of a connection")
+    options = {name: data[name] for name in _OPTIONS if name in data}
+    if "rate" in options:
+        options["rate"] = float(options["rate"])
+    names = {"source_topic": data.get("source", ""), "target_topic": data.get("target", "")}
+    return messages.Route(**names, **options)
 
 
 def _only(data: Mapping[str, Any], known: set[str], what: str) -> None:
@@ -164,6 +170,7 @@ def _connection(connection: Any) -> dict[str, Any]:  # noqa: ANN401
         "broker": connection.broker_node_id,
         "topics": [
             {"source": route.source_topic, "target": route.target_topic}
+            | {name: getattr(route, name) for name in _OPTIONS}
             for route in connection.topics
         ],
     }

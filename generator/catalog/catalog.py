@@ -43,6 +43,12 @@ IMAGES_FILE = "registry/images.yaml"
 MQTT_CLIENT_IMAGE = "mqtt-client"
 """The image of the registry that both ends of an MQTT connection run."""
 
+ZENOH_BRIDGE_IMAGE = "zenoh-bridge"
+"""The image of the registry that carries a node's Zenoh connections."""
+
+DDS_ROUTER_IMAGE = "dds-router"
+"""The image of the registry that both ends of a ROS connection run."""
+
 _CONNECTION_PREFIXES = ("mqtt", "zenoh", "ros")
 
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs")
@@ -200,6 +206,7 @@ def cross_check(catalog: Catalog, reading: Reading) -> None:
         _check_services,
         _check_wire_types,
         _check_clients,
+        _check_links,
     ):
         check(catalog, reading)
 
@@ -324,6 +331,28 @@ def _check_clients(catalog: Catalog, reading: Reading) -> None:
     if catalog.brokers and reading.lacks(IMAGES_FILE, MQTT_CLIENT_IMAGE):
         message = f"'{MQTT_CLIENT_IMAGE}' is missing; MQTT connections run it"
         reading.tell(IMAGES_FILE, "images", message)
+
+
+def _check_links(catalog: Catalog, reading: Reading) -> None:
+    hosts: dict[tuple[object, ...], str] = {}
+    for node in catalog.nodes.values():
+        where = f"nodes[{reading.place(NODES_FILE, node.id)}]"
+        for peer in node.bridged:
+            if reading.lacks(NODES_FILE, peer):
+                known = near(peer, reading.names(NODES_FILE))
+                message = f"'{peer}' is not in nodes.yaml{known}"
+                reading.tell(NODES_FILE, f"{where}.bridged.{peer}", message)
+        if node.zenoh is None:
+            continue
+        host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
+        other = hosts.setdefault(host, node.id)
+        if other != node.id:
+            reading.tell(
+                NODES_FILE,
+                f"{where}.zenoh",
+                f"'{other}' runs a bridge on the same host and ROS domain, and two do not work; "
+                "keep one",
+            )
 
 
 def _check_wire_types(catalog: Catalog, reading: Reading) -> None:

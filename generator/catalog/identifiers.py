@@ -14,6 +14,7 @@ MAX_TOPIC = 247
 """Characters of a topic name, ``RMW_TOPIC_MAX_NAME_LENGTH`` of ROS 2's rmw."""
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_MESSAGE_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
 _UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
 _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
@@ -60,3 +61,10 @@ def topic_problem(name: str) -> str:
     if len(name) > MAX_TOPIC:
         return f"has {len(name)} characters; ROS 2 takes at most {MAX_TOPIC}"
     return ""
+
+
+def message_type_problem(name: str) -> str:
+    """Return why a name is no ROS 2 message type with its package, or nothing."""
+    if _MESSAGE_TYPE.fullmatch(name):
+        return ""
+    return f"{shown(name)} is no message type; write it like std_msgs/msg/String"

@@ -11,7 +11,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from generator.catalog.identifiers import id_problem, topic_problem
+from generator.catalog.identifiers import id_problem, message_type_problem, topic_problem
+from generator.catalog.links import Credentials, Host, Tls, Wan, Zenoh
 from generator.catalog.model import DnsLabel, FileModel, Frozen, Word
 
 
@@ -29,8 +30,16 @@ def _topic(value: str) -> str:
     return value
 
 
+def _message_type(value: str) -> str:
+    problem = message_type_problem(value)
+    if problem:
+        raise ValueError(problem)
+    return value
+
+
 NodeId = Annotated[str, AfterValidator(_id)]
 Topic = Annotated[str, AfterValidator(_topic)]
+MessageType = Annotated[str, AfterValidator(_message_type)]
 
 LabelKey = Annotated[
     str,
@@ -79,6 +88,9 @@ class Node(Frozen):
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
     ``topics`` names, for each input role, the node's usual topic: releases and derived topics
     for it carry the node's name alone; those for its further topics carry the topic as well.
+    ``zenoh`` and ``wan`` say how Zenoh and ROS connections reach the node, ``types`` the message
+    types of topics that requests do not say. ``bridged`` names topics that the initial deployment
+    carries from here to another node, under the same name: no connection carries them again.
     """
 
     id: NodeId
@@ -92,6 +104,12 @@ class Node(Frozen):
     )
     host_network: bool = Field(default=True, alias="hostNetwork")
     ros: Ros = Ros()
+    zenoh: Zenoh | None = None
+    wan: Wan | None = None
+    types: dict[Topic, MessageType] = Field(default_factory=dict)
+    bridged: dict[NodeId, Annotated[tuple[Topic, ...], Field(strict=False)]] = Field(
+        default_factory=dict
+    )
 
     @model_validator(mode="after")
     def _findable(self) -> Node:
@@ -111,8 +129,10 @@ class Broker(Frozen):
 
     node: NodeId
     type: Literal["mqtt"] = "mqtt"
-    host: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
+    host: Host
     port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    tls: Tls | None = None
+    credentials: Credentials | None = None
 
 
 class ClustersFile(FileModel):

@@ -10,19 +10,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from generator.catalog.catalog import Catalog
-from generator.catalog.inventory import Broker
+from generator.demand import carriers
 from generator.demand import request as shape
 from generator.demand.request import (
-    AUTO,
     ApplicationDemand,
     ConnectionDemand,
     ConnectionType,
     DemandRequest,
 )
 from generator.errors import Fault, fault, near, shown
-
-SUPPORTED_CONNECTIONS = frozenset({ConnectionType.MQTT})
-"""The connection types that :mod:`generator.render.connections` can write."""
 
 
 def faults(request: DemandRequest, catalog: Catalog) -> Iterator[Fault]:
@@ -36,31 +32,6 @@ def faults(request: DemandRequest, catalog: Catalog) -> Iterator[Fault]:
         yield from _application(f"applications[{index}]", app, catalog, joining)
     for index, connection in enumerate(request.connections):
         yield from _connection(f"connections[{index}]", connection, catalog, joining)
-
-
-def with_types(request: DemandRequest) -> DemandRequest:
-    """Return the request with a type for each connection that leaves it open."""
-
-    def typed(connection: ConnectionDemand) -> ConnectionDemand:
-        open_type = connection.type == AUTO
-        return replace(connection, type=ConnectionType.MQTT.value) if open_type else connection
-
-    return replace(request, connections=tuple(map(typed, request.connections)))
-
-
-def choose_broker(requested: str, source: str, target: str, catalog: Catalog) -> Broker | None:
-    """Return the broker of a connection: the requested one, the target's, the source's, the only.
-
-    Nothing where none of these exists. ``requested`` is a node id or empty.
-    """
-    if requested:
-        return catalog.brokers.get(requested)
-    for node in (target, source):
-        if node in catalog.brokers:
-            return catalog.brokers[node]
-    if len(catalog.brokers) == 1:
-        return next(iter(catalog.brokers.values()))
-    return None
 
 
 def _application(
@@ -121,7 +92,7 @@ def _connection(
     types = {known.value: known for known in ConnectionType}
     kind = types.get(connection.type)
     if kind is None:
-        known = ", ".join(f"{number} ({item.name})" for number, item in types.items())
+        known = ", ".join(f"{n} ({item.name})" for n, item in types.items() if n >= 0)
         yield fault(
             f"{where}.type",
             f"{connection.type} is no connection type; known: {known}",
@@ -133,32 +104,18 @@ def _connection(
     yield from _node(f"{where}.target", connection.target, catalog)
     if kind is None:
         return
-    if kind not in SUPPORTED_CONNECTIONS:
-        usable = ", ".join(f"{item.value} ({item.name})" for item in SUPPORTED_CONNECTIONS)
-        yield fault(
-            f"{where}.type",
-            f"{kind.value} ({kind.name}) is not carried by this version; use {usable}",
-            code="unsupported-connection-type",
-        )
+    if kind is ConnectionType.AUTO:
+        ends_known = connection.source in catalog.nodes and connection.target in catalog.nodes
+        if ends_known and carriers.choice(connection, catalog) is kind:
+            yield _within(where, carriers.none_fits(connection, catalog))
         return
-    ends_known = connection.source in catalog.nodes and connection.target in catalog.nodes
-    if not (connection.broker or ends_known):
-        return  # which broker follows from the ends, and these are told already
-    if choose_broker(connection.broker, connection.source, connection.target, catalog) is None:
-        yield _no_broker(where, connection, catalog)
+    for found in carriers.obstacles(kind, connection, catalog):
+        yield _within(where, found)
 
 
-def _no_broker(where: str, connection: ConnectionDemand, catalog: Catalog) -> Fault:
-    known = ", ".join(sorted(catalog.brokers))
-    remedy = f"name one of: {known}" if known else "inventory/brokers.yaml has none; add one there"
-    if connection.broker:
-        message = f"no broker runs on {shown(connection.broker)}; {remedy}"
-    else:
-        message = (
-            f"is open, and no broker runs on '{connection.target}' or '{connection.source}'; "
-            f"{remedy}"
-        )
-    return fault(f"{where}.broker", message, code="no-broker")
+def _within(where: str, found: Fault) -> Fault:
+    """Return a fault of a part of the request, told to be at ``where``."""
+    return replace(found, field=f"{where}.{found.field}")
 
 
 def _node(where: str, node: str, catalog: Catalog) -> Iterator[Fault]:

@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 from generator.demand.lease import Lease
 from generator.demand.request import ConnectionType, InputTopic
+from generator.demand.route import Route
 
 
 class SubjectKind(Enum):
@@ -74,7 +75,10 @@ class ApplicationClaim:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionClaim:
-    """One demand's hold on a connection. ``topics`` maps source topic to target topic, sorted."""
+    """One demand's hold on a connection. ``topics`` are routes by source topic, sorted.
+
+    ``type`` is never ``AUTO``.
+    """
 
     connection: str
     demand: str
@@ -85,7 +89,7 @@ class ConnectionClaim:
     source: str
     target: str
     broker: str
-    topics: Mapping[str, str]
+    topics: Mapping[str, Route]
     lease: Lease | None = None
 
     @property

@@ -18,7 +18,6 @@ from generator.catalog.model import Frozen
 from generator.catalog.policy import seconds_of
 from generator.demand.form import sound_part
 from generator.demand.request import (
-    AUTO,
     ApplicationDemand,
     ConnectionDemand,
     ConnectionType,
@@ -26,12 +25,13 @@ from generator.demand.request import (
     InputTopic,
     Operation,
 )
+from generator.demand.route import RouteOptions
 from generator.errors import Fault, fault
 from generator.settings import API_VERSION
 
 TypeName = Literal["auto", "mqtt", "zenoh", "ros"]
 
-_TYPES = {"auto": AUTO, **{known.name.lower(): known.value for known in ConnectionType}}
+_TYPES = {known.name.lower(): known.value for known in ConnectionType}
 
 
 class GoalTopic(Frozen):
@@ -60,7 +60,7 @@ class GoalApplication(Frozen):
     connect: Literal["auto", "mqtt", "zenoh", "ros", "none"] = "auto"
 
 
-class GoalRoute(Frozen):
+class GoalRoute(RouteOptions):
     """A topic of a connection; it has the same name at both ends where ``target`` is left out."""
 
     source: str = ""
@@ -177,7 +177,7 @@ def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> Conn
         source=connection.source,
         target=connection.target,
         topics=tuple(
-            (absolute(route.source), absolute(route.target or route.source))
+            route.route(absolute(route.source), absolute(route.target or route.source))
             for route in connection.topics
         ),
         broker=connection.broker,

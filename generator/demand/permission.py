@@ -10,11 +10,12 @@ from dataclasses import replace
 
 from generator.catalog.catalog import Catalog
 from generator.catalog.policy import AccessDomain, Rule, matches, seconds_of
-from generator.demand.admission import choose_broker
+from generator.demand.carriers import choose_broker
 from generator.demand.lease import Term
 from generator.demand.request import (
     ApplicationDemand,
     ConnectionDemand,
+    ConnectionType,
     DemandRequest,
     Operation,
 )
@@ -44,7 +45,8 @@ def faults(request: DemandRequest, catalog: Catalog) -> Iterator[Fault]:
 
 
 def _connection(where: str, asked: ConnectionDemand, catalog: Catalog) -> Iterator[Fault]:
-    broker = choose_broker(asked.broker, asked.source, asked.target, catalog)
+    mqtt = asked.type == ConnectionType.MQTT.value
+    broker = choose_broker(asked.broker, asked.source, asked.target, catalog) if mqtt else None
     for node in dict.fromkeys((asked.source, asked.target)):
         domain = catalog.domain_of.get(node)
         if domain is None:

@@ -12,7 +12,9 @@ from enum import Enum
 from types import MappingProxyType
 
 from generator.catalog.identifiers import id_problem, topic_problem
+from generator.demand import route as routes
 from generator.demand.lease import LONGEST_S, Term
+from generator.demand.route import Route
 from generator.errors import Fault, fault
 
 
@@ -43,15 +45,16 @@ class Operation(Enum):
 
 
 class ConnectionType(Enum):
-    """How a connection carries its topics; the values are the wire's numbers."""
+    """How a connection carries its topics; the values are the wire's numbers.
 
+    ``AUTO`` is asked for only, and is no number of the wire: a claim holds what was chosen
+    (:func:`generator.demand.carriers.resolved`).
+    """
+
+    AUTO = -1
     ROS = 0
     MQTT = 1
     ZENOH = 2
-
-
-AUTO = -1
-"""In a demand's place for a connection type: whichever the catalog has for its ends."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -81,16 +84,17 @@ class ApplicationDemand:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionDemand:
-    """One connection of a request; ``topics`` are pairs of source topic and target topic.
+    """One connection of a request.
 
-    ``type`` is the wire's number, known or not; ``broker`` is empty where it is left open.
+    ``type`` is a value of :class:`ConnectionType` or an unknown number of the wire; ``broker`` is
+    empty where it is left open.
     """
 
     id: str
     type: int
     source: str
     target: str
-    topics: tuple[tuple[str, str], ...]
+    topics: tuple[Route, ...]
     broker: str
     requesters: tuple[str, ...]
     term: Term | None = None
@@ -188,23 +192,13 @@ def _connection(where: str, connection: ConnectionDemand, joining: bool) -> Iter
         yield from _id(f"{where}.broker", connection.broker)
     if joining and not connection.topics:
         yield fault(f"{where}.topics", "is empty; a connection carries at least one topic, list it")
-    targets: dict[str, str] = {}
-    for index, (source, target) in enumerate(connection.topics):
-        for side, name in (("source", source), ("target", target)):
-            problem = topic_problem(name)
-            if problem:
-                yield fault(f"{where}.topics[{index}].{side}", problem)
-        if targets.setdefault(source, target) != target:
-            yield fault(
-                f"{where}.topics[{index}].target",
-                f"'{source}' goes to '{targets[source]}' and to '{target}'; one source topic has "
-                "one target, use a second connection",
-            )
+    yield from routes.faults(f"{where}.topics", connection.topics)
+    for index, route in enumerate(connection.topics):
         same_place = connection.source and connection.source == connection.target
-        if joining and same_place and source == target:
+        if joining and same_place and route.source == route.target:
             yield fault(
                 f"{where}.topics[{index}].target",
-                f"'{target}' would feed itself, for source and target are both "
+                f"'{route.target}' would feed itself, for source and target are both "
                 f"'{connection.source}'; name another target node or topic",
             )
 

@@ -21,10 +21,12 @@ from generator.demand.form import sound_part
 from generator.demand.request import (
     ApplicationDemand,
     ConnectionDemand,
+    ConnectionType,
     DemandRequest,
     InputTopic,
     Operation,
 )
+from generator.demand.route import Route
 from generator.errors import Fault, fault
 
 Uint8 = Annotated[int, Field(ge=0, le=255)]
@@ -98,6 +100,7 @@ _WIRE_NAMES = (
     (re.compile(r"^(connections\[\d+\])\.(source|target)$"), r"\1.\2_node_id"),
     (re.compile(r"^(connections\[\d+\])\.broker$"), r"\1.broker_node_id"),
     (re.compile(r"^(connections\[\d+\])\.topics(\[\d+\])\.(source|target)$"), r"\1.\3_topics\2"),
+    (re.compile(r"^(connections\[\d+\])\.topics(\[\d+\])\.\w+$"), r"\1.source_topics\2"),
     (re.compile(r"^(connections\[\d+\])\.topics$"), r"\1.source_topics"),
 )
 
@@ -118,12 +121,16 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
         return None, [_no_mapping()]
     goal, faults = sound_part(data, WireGoal, _LISTS_OF_TEXT)
     # where it does not say which, it is held to what a shutdown is held to: the rules of both
-    unsaid = any(found.field == "shutdown" for found in faults)
+    told = {found.field for found in faults}
+    unsaid = "shutdown" in told
     request = DemandRequest(
         id=goal.id,
         operation=Operation.SHUTDOWN if goal.shutdown or unsaid else Operation.JOIN,
         applications=tuple(_application(app, appdef_by_type(app.type)) for app in goal.apps),
-        connections=tuple(_connection(connection) for connection in goal.connections),
+        connections=tuple(
+            _connection(connection, sound=f"connections[{index}].type" not in told)
+            for index, connection in enumerate(goal.connections)
+        ),
     )
     for index, connection in enumerate(goal.connections):
         sources, targets = len(connection.source_topics), len(connection.target_topics)
@@ -182,7 +189,8 @@ def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
     )
 
 
-def _connection(connection: WireConnection) -> ConnectionDemand:
+def _connection(connection: WireConnection, *, sound: bool) -> ConnectionDemand:
+    """Return a connection; without a sound type it is held to no type's own rules."""
     sources, targets = connection.source_topics, connection.target_topics
     # where one list is shorter (told by the caller), the other's names stand in for its
     pairs = zip(
@@ -190,10 +198,10 @@ def _connection(connection: WireConnection) -> ConnectionDemand:
     )
     return ConnectionDemand(
         id=connection.id,
-        type=connection.type,
+        type=connection.type if sound else ConnectionType.AUTO.value,
         source=connection.source_node_id,
         target=connection.target_node_id,
-        topics=tuple((absolute(source), absolute(target)) for source, target in pairs),
+        topics=tuple(Route(absolute(source), absolute(target)) for source, target in pairs),
         broker=connection.broker_node_id,
         requesters=tuple(dict.fromkeys(connection.requester_ids)),
     )

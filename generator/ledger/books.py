@@ -20,6 +20,7 @@ from generator.demand.claim import (
     Subject,
     SubjectKind,
 )
+from generator.demand.request import ConnectionType
 
 Claims: TypeAlias = "HashTrieMap[str, Claim]"
 """The claims of one subject by demand id."""
@@ -85,6 +86,11 @@ class Ledger:
         claims = self.of(Subject(SubjectKind.CONNECTION, connection))
         return tuple(claim for claim in claims if isinstance(claim, ConnectionClaim))
 
+    def type_of(self, connection: str) -> ConnectionType | None:
+        """Return the type of a connection that something holds, or nothing."""
+        claims = self.connection(connection)
+        return claims[0].type if claims else None
+
     def subjects(self, kind: SubjectKind) -> list[str]:
         """Return the ids of all subjects of a kind that something holds, sorted."""
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
@@ -138,6 +144,10 @@ class Ledger:
         keys = sorted(self.index.get(entry) or (), key=lambda key: (str(key.subject), key.demand))
         found = (self.get(key) for key in keys)
         return tuple(claim for claim in found if claim is not None)
+
+    def at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
+        """Return the connections of a type that end at ``node``, sorted."""
+        return self._ids("link", kind.name, node)
 
     def get(self, key: ClaimKey) -> Claim | None:
         """Return one claim."""
@@ -197,7 +207,11 @@ def _entries(claim: Claim | None) -> set[Entry]:
         for _, topic in claim.all_inputs():
             entries |= {("takes", topic.source, topic.topic), ("node", topic.source)}
     else:
-        entries |= {("brings", claim.target, topic) for topic in claim.topics.values()}
+        for end in (claim.source, claim.target):
+            entries.add(("link", claim.type.name, end))
+        for route in claim.topics.values():
+            _, taking = route.ends(claim.source, claim.target)
+            entries.add(("brings", taking, route.written))
     return entries
 
 

@@ -13,7 +13,7 @@ from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from generator import yamlio
 from generator.catalog.model import Frozen, parse
@@ -26,6 +26,7 @@ from generator.demand.claim import (
 )
 from generator.demand.lease import LONGEST_S, Lease
 from generator.demand.request import ConnectionType, InputTopic
+from generator.demand.route import Route, RouteOptions
 from generator.errors import InvalidInput, fault
 from generator.settings import LEDGER_API_VERSION
 
@@ -72,6 +73,15 @@ class _Topic(Frozen):
     type: str = ""
 
 
+class _Route(RouteOptions):
+    target: str
+
+
+def _plain_route(value: object) -> object:
+    """Read ``/a: /b`` as a route without options."""
+    return {"target": value} if isinstance(value, str) else value
+
+
 class _Lease(Frozen):
     seconds: int = Field(ge=1, le=LONGEST_S)
     slack: int = Field(default=0, ge=0, le=LONGEST_S)
@@ -107,7 +117,7 @@ class _ConnectionFile(_Claim):
     source: str
     target: str
     broker: str = ""
-    topics: dict[str, str] = Field(min_length=1)
+    topics: dict[str, Annotated[_Route, BeforeValidator(_plain_route)]] = Field(min_length=1)
 
 
 def write(claim: Claim) -> str:
@@ -132,7 +142,7 @@ def write(claim: Claim) -> str:
         tail = {"type": claim.type.name.lower(), "source": claim.source, "target": claim.target}
         if claim.broker:
             tail["broker"] = claim.broker
-        tail["topics"] = dict(claim.topics)
+        tail["topics"] = {source: _route(route) for source, route in claim.topics.items()}
     if claim.lease is not None:
         lease = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
         tail["lease"] = lease | {"until": _written(claim.lease.until)}
@@ -155,6 +165,11 @@ def _written(moment: datetime) -> str:
 def _topic(topic: InputTopic) -> dict[str, str]:
     entry = {"topic": topic.topic, "source": topic.source}
     return entry | {"type": topic.type} if topic.type else entry
+
+
+def _route(route: Route) -> str | dict[str, Any]:
+    options = route.options()
+    return {"target": route.target, **options} if options else route.target
 
 
 def read(text: str, path: str) -> Claim:
@@ -235,7 +250,12 @@ def _connection(file: _ConnectionFile) -> Claim:
         source=file.source,
         target=file.target,
         broker=file.broker,
-        topics=MappingProxyType(dict(sorted(file.topics.items()))),
+        topics=MappingProxyType(
+            {
+                source: topic.route(source, topic.target)
+                for source, topic in sorted(file.topics.items())
+            }
+        ),
         lease=file.lease.lease() if file.lease else None,
     )
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from datetime import datetime
 from types import MappingProxyType
 from typing import TypeVar
 
+from generator.demand import route as routes
 from generator.demand.claim import (
     ApplicationClaim,
     Claim,
@@ -25,6 +26,7 @@ from generator.demand.request import (
     DemandRequest,
     InputTopic,
 )
+from generator.demand.route import Route
 from generator.errors import Fault, Refused, fault
 from generator.ledger.books import Changes, Ledger, differences
 
@@ -104,14 +106,38 @@ def connection_conflicts(
                 code="conflict",
             )
             return
-        for index, (source, target) in enumerate(asked.topics):
-            if claim.topics.get(source, target) != target:
+        for index, route in enumerate(asked.topics):
+            yield from _route_conflicts(f"{where}.topics[{index}]", route, claim, held)
+
+
+def _route_conflicts(
+    where: str, asked: Route, claim: ConnectionClaim, held: str
+) -> Iterator[Fault]:
+    stands = claim.topics.get(asked.source)
+    if stands is None:
+        for route in claim.topics.values() if asked.reverse else ():
+            if route.reverse and route.target == asked.target:
                 yield fault(
-                    f"{where}.topics[{index}].target",
-                    f"'{source}' goes to '{claim.topics[source]}' already: {held}; one source "
-                    "topic has one target, use a second connection",
+                    f"{where}.target",
+                    f"'{asked.target}' is carried back to '{route.source}' already: {held}; one "
+                    "topic goes to one place, use a second connection",
                     code="conflict",
                 )
+        return
+    if stands.target != asked.target:
+        yield fault(
+            f"{where}.target",
+            f"'{asked.source}' goes to '{stands.target}' already: {held}; one source topic has "
+            "one target, use a second connection",
+            code="conflict",
+        )
+    for name, value, wanted in routes.differences(stands, asked):
+        yield fault(
+            f"{where}.{name}",
+            f"{name} {wanted} of '{asked.source}' contradicts what stands: {held} with {name} "
+            f"{value}; use the same, or a second connection",
+            code="conflict",
+        )
 
 
 def _joined_application(
@@ -168,7 +194,7 @@ def _joined_connection(
     demand = demand_id(request, asked.requesters)
     key = ClaimKey(Subject(SubjectKind.CONNECTION, asked.id), demand)
     standing = ledger.get(key)
-    known: Mapping[str, str] = standing.topics if isinstance(standing, ConnectionClaim) else {}
+    known = standing.topics if isinstance(standing, ConnectionClaim) else {}
     broker = standing.broker if isinstance(standing, ConnectionClaim) else ""
     claim = ConnectionClaim(
         connection=asked.id,
@@ -180,7 +206,7 @@ def _joined_connection(
         source=asked.source,
         target=asked.target,
         broker=asked.broker or broker,
-        topics=MappingProxyType(dict(sorted({**known, **dict(asked.topics)}.items()))),
+        topics=MappingProxyType(routes.united([*known.values(), *asked.topics])),
         lease=renewed(standing.lease if standing else None, asked.term, now),
     )
     return touched(claim, standing, now)

@@ -11,6 +11,7 @@ from dataclasses import replace
 from datetime import datetime
 from types import MappingProxyType
 
+from generator.demand import route as routes
 from generator.demand.claim import (
     ApplicationClaim,
     Claim,
@@ -104,7 +105,7 @@ def _connection(
         source=asked.source,
         target=asked.target,
         broker=asked.broker,
-        topics=MappingProxyType(dict(sorted(dict(asked.topics).items()))),
+        topics=MappingProxyType(routes.united(asked.topics)),
         lease=renewed(standing.lease if standing else None, asked.term, now),
     )
     return touched(claim, standing, now)

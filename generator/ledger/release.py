@@ -19,6 +19,7 @@ from generator.demand.claim import (
 from generator.demand.request import (
     ApplicationDemand,
     ConnectionDemand,
+    ConnectionType,
     DemandRequest,
     InputTopic,
 )
@@ -79,7 +80,7 @@ def _same_ends(claim: Claim, asked: Asked) -> bool:
         return (
             asked.source in ("", claim.source)
             and asked.target in ("", claim.target)
-            and asked.type == claim.type.value
+            and asked.type in (ConnectionType.AUTO.value, claim.type.value)
         )
     return False
 
@@ -123,9 +124,9 @@ def _subtracted_topics(
 ) -> tuple[Claim | None, list[str]]:
     if not asked.topics:
         return None, []
-    gone = {source for source, _ in asked.topics}
+    gone = {route.source for route in asked.topics}
     missing = [f"topic {topic}" for topic in sorted(gone - set(claim.topics))]
-    rest = {source: target for source, target in claim.topics.items() if source not in gone}
+    rest = {source: route for source, route in claim.topics.items() if source not in gone}
     if not rest:
         return None, missing
     if rest == dict(claim.topics):

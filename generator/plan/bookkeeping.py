@@ -11,7 +11,8 @@ from typing import Any
 from generator.catalog.catalog import Catalog
 from generator.demand.claim import SubjectKind
 from generator.ledger.ledger import Ledger
-from generator.plan.planner import all_keys, connection_topics, plan
+from generator.plan.clients import connection_topics
+from generator.plan.planner import all_keys, plan
 from generator.plan.release import ServiceRelease
 
 

@@ -15,6 +15,7 @@ from generator.demand.request import (
     DemandRequest,
     InputTopic,
 )
+from generator.demand.route import Route
 from generator.ledger.ledger import Ledger
 from generator.plan.planner import outputs
 from generator.plan.release import ServiceKey
@@ -27,7 +28,11 @@ def with_connections(request: DemandRequest, ledger: Ledger, catalog: Catalog) -
     connection of their own.
     """
     found = {connection.id: connection for connection in request.connections}
-    brought = {(c.target, target) for c in request.connections for _, target in c.topics}
+    brought = {
+        (route.ends(connection.source, connection.target)[1], route.written)
+        for connection in request.connections
+        for route in connection.topics
+    }
     for app in request.applications:
         if app.connect is None or app.appdef not in catalog.appdefs:
             continue
@@ -75,26 +80,24 @@ def foreign_inputs(app: ApplicationDemand, catalog: Catalog) -> list[tuple[str, 
 def _connection(
     app: ApplicationDemand, source: str, topic: str, ledger: Ledger
 ) -> ConnectionDemand:
+    assert app.connect is not None  # noqa: S101 - the caller has looked
     for id in ledger.bringing(app.node, topic):
         standing = ledger.connection(id)[0]
-        if standing.source == source and standing.topics.get(topic) == topic:
-            return _demand(app, id, standing.type.value, source, topic)
-    own = f"derived/{source}/{app.node}"
-    standing_types = [claim.type.value for claim in ledger.connection(own)]
-    assert app.connect is not None  # noqa: S101 - the caller has looked
-    kind = standing_types[0] if standing_types else app.connect
-    return _demand(app, own, kind, source, topic)
+        route = standing.topics.get(topic)
+        if (standing.source, standing.target) == (source, app.node) and route is not None:
+            return _demand(app, id, standing.type.value, source, route)
+    return _demand(app, f"derived/{source}/{app.node}", app.connect, source, Route(topic, topic))
 
 
 def _demand(
-    app: ApplicationDemand, id: str, kind: int, source: str, topic: str
+    app: ApplicationDemand, id: str, kind: int, source: str, route: Route
 ) -> ConnectionDemand:
     return ConnectionDemand(
         id=id,
         type=kind,
         source=source,
         target=app.node,
-        topics=((topic, topic),),
+        topics=(route,),
         broker="",
         requesters=app.requesters,
         term=app.term,

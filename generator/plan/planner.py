@@ -7,43 +7,27 @@ releases: the cost of a demand does not grow with the number of others.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
 
 from generator.catalog.appdef import ApplicationDefinition, Parameter, Service
 from generator.catalog.catalog import Catalog
-from generator.catalog.inventory import Node
-from generator.catalog.policy import AccessDomain
 from generator.catalog.registry import ChartSource
-from generator.demand.admission import choose_broker
-from generator.demand.claim import ApplicationClaim, ConnectionClaim, Subject, SubjectKind
-from generator.demand.request import ConnectionType, InputTopic
+from generator.demand.claim import ApplicationClaim, Subject, SubjectKind
+from generator.demand.request import InputTopic
 from generator.errors import Refused, fault
 from generator.ledger.ledger import Ledger
-from generator.plan import naming, parameters, scaling
-from generator.plan.release import ConnectionEnd, Release, ServiceKey, ServiceRelease
+from generator.plan import clients, naming, parameters, scaling
+from generator.plan.clients import BridgeKey, EndKey
+from generator.plan.place import place
+from generator.plan.release import Release, ServiceKey, ServiceRelease
 
-Side = Literal["source", "target"]
-
-
-@dataclass(frozen=True, slots=True)
-class EndKey:
-    """One end of a connection."""
-
-    connection: str
-    side: Side
-
-
-ReleaseKey = ServiceKey | EndKey
+ReleaseKey = ServiceKey | EndKey | BridgeKey
 
 
 def keys_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
     """Yield what must run because ``subject`` is held."""
     if subject.kind is SubjectKind.CONNECTION:
-        if ledger.of(subject):
-            yield EndKey(subject.id, "source")
-            yield EndKey(subject.id, "target")
+        yield from clients.keys_of(ledger, subject.id)
         return
     claims = ledger.application(subject.id)
     if not claims:
@@ -90,7 +74,9 @@ def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
             longer in the catalog.
     """
     if isinstance(key, EndKey):
-        return _end(ledger, catalog, key)
+        return clients.end(ledger, catalog, key)
+    if isinstance(key, BridgeKey):
+        return clients.bridge(ledger, catalog, key)
     return _service(ledger, catalog, key)
 
 
@@ -110,7 +96,7 @@ def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceReleas
         return None
     appdef = _appdef(catalog, claims[0].appdef)
     service = appdef.services[key.service]
-    node, domain = _place(catalog, key.node)
+    node, domain = place(catalog, key.node)
     if service.each is not None:
         claims = tuple(claim for claim in claims if _takes(claim, service.each, key))
         inputs = {service.each: _shared_input(claims, service.each, key)}
@@ -160,7 +146,7 @@ def _chart(catalog: Catalog, service: Service, claims: Iterable[ApplicationClaim
     return next(iter(asked.values()))
 
 
-def _requesters(claims: Iterable[ApplicationClaim | ConnectionClaim]) -> tuple[str, ...]:
+def _requesters(claims: Iterable[ApplicationClaim]) -> tuple[str, ...]:
     return tuple(sorted({who for claim in claims for who in claim.requesters}))
 
 
@@ -246,49 +232,6 @@ def outputs(catalog: Catalog, service: Service, key: ServiceKey) -> dict[str, st
     }
 
 
-def _end(ledger: Ledger, catalog: Catalog, key: EndKey) -> ConnectionEnd | None:
-    claims = ledger.connection(key.connection)
-    if not claims:
-        return None
-    first = claims[0]
-    wanted = next((claim.broker for claim in claims if claim.broker), "")
-    broker = choose_broker(wanted, first.source, first.target, catalog)
-    if broker is None:
-        raise Refused(
-            [
-                fault(
-                    "broker",
-                    f"connection '{key.connection}' finds no broker; add one to "
-                    "inventory/brokers.yaml",
-                    code="no-broker",
-                )
-            ]
-        )
-    own, peer = (
-        (first.source, first.target) if key.side == "source" else (first.target, first.source)
-    )
-    node, domain = _place(catalog, own)
-    prefix = first.type.name.lower()
-    channel = naming.object_name(prefix, key.connection)
-    return ConnectionEnd(
-        connection=key.connection,
-        type=ConnectionType(first.type),
-        side=key.side,
-        name=naming.object_name(prefix, key.connection, key.side),
-        node=node,
-        peer=peer,
-        domain=domain,
-        broker=broker,
-        topics=MappingProxyType(connection_topics(claims)),
-        channel=channel,
-    )
-
-
-def connection_topics(claims: Iterable[ConnectionClaim]) -> dict[str, str]:
-    """Return source topic → target topic, united over a connection's claims and sorted."""
-    return dict(sorted({s: t for claim in claims for s, t in claim.topics.items()}.items()))
-
-
 def _appdef(catalog: Catalog, name: str) -> ApplicationDefinition:
     appdef = catalog.appdefs.get(name)
     if appdef is None:
@@ -302,20 +245,3 @@ def _appdef(catalog: Catalog, name: str) -> ApplicationDefinition:
             ]
         )
     return appdef
-
-
-def _place(catalog: Catalog, node_id: str) -> tuple[Node, AccessDomain]:
-    """Return the node and its access domain: where a release goes."""
-    node, domain = catalog.nodes.get(node_id), catalog.domain_of.get(node_id)
-    if node is None or domain is None:
-        missing = "inventory/nodes.yaml" if node is None else "any access domain"
-        raise Refused(
-            [
-                fault(
-                    "node",
-                    f"'{node_id}' is in use, but not in {missing}; restore it",
-                    code="unknown-node",
-                )
-            ]
-        )
-    return node, domain

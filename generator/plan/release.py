@@ -1,16 +1,17 @@
-"""What planning gives: releases, one for each service instance and connection end."""
+"""What planning gives: releases, one for each service instance and communication client."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from generator.catalog.appdef import Service
 from generator.catalog.inventory import Broker, Node
 from generator.catalog.policy import AccessDomain
 from generator.catalog.registry import ChartSource
 from generator.demand.request import ConnectionType, InputTopic
+from generator.demand.route import Route
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,19 +50,71 @@ class ServiceRelease:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionEnd:
-    """The desired state of one end of a connection: one communication client."""
+    """The desired state of one end of a connection: one communication client of its own."""
+
+    type: ClassVar[ConnectionType]
 
     connection: str
-    type: ConnectionType
     side: Literal["source", "target"]
     name: str
     node: Node
     peer: str
     domain: AccessDomain
+    topics: Mapping[str, Route]
+
+    def reads(self, route: Route) -> bool:
+        """Tell whether this end takes the topic in from ROS, and the other gives it out."""
+        return route.reverse is (self.side == "target")
+
+
+@dataclass(frozen=True, slots=True)
+class MqttEnd(ConnectionEnd):
+    """One end of an MQTT connection."""
+
+    type = ConnectionType.MQTT
+
     broker: Broker
-    topics: Mapping[str, str]
     channel: str
     """What this connection's MQTT topics start with, the same at both ends."""
 
 
-Release = ServiceRelease | ConnectionEnd
+@dataclass(frozen=True, slots=True)
+class RosEnd(ConnectionEnd):
+    """One end of a ROS connection. Every route of ``topics`` has its message type."""
+
+    type = ConnectionType.ROS
+
+    listens: bool
+    address: Address
+    """Where the end that listens does so, the same at both ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """A host and port that DDS Routers meet at."""
+
+    host: str
+    port: int
+    transport: str
+
+
+@dataclass(frozen=True, slots=True)
+class Bridge:
+    """The desired state of a node's Zenoh bridge, which serves all its Zenoh connections.
+
+    ``publishers`` are the topics that it takes from the node's ROS graph, ``subscribers`` those
+    that it gives to it, ``rates`` the most messages a second of a topic that it takes.
+    """
+
+    name: str
+    node: Node
+    domain: AccessDomain
+    connections: tuple[str, ...]
+    publishers: tuple[str, ...]
+    subscribers: tuple[str, ...]
+    rates: Mapping[str, float]
+    connect: tuple[str, ...]
+    listen: tuple[str, ...]
+
+
+Release = ServiceRelease | MqttEnd | RosEnd | Bridge

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
+from generator.demand.route import Route
 from generator.errors import Refused
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import ClaimChange, Ledger
 from generator.plan.planner import ReleaseKey, plan
-from generator.plan.release import Release, ServiceRelease
+from generator.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
 from generator.render import flux
 from generator.render.check import check_files
 from generator.render.engine import Engine
@@ -118,6 +119,8 @@ def _described(old: Release | None, new: Release | None, stood: bool) -> Release
     if isinstance(release, ServiceRelease):
         what = f"{release.key.service} on {release.node.id}"
         what += f" for {release.key.source or release.key.application}"
+    elif isinstance(release, Bridge):
+        what = f"Zenoh bridge on {release.node.id}"
     else:
         what = f"{release.type.name} {release.side} of connection {release.connection}"
         what += f" on {release.node.id}"
@@ -142,5 +145,29 @@ def _facts(release: Release | None) -> list[str]:
         facts = [f"{role} {t.topic}" for role, topics in release.inputs.items() for t in topics]
         facts += [f"{name} = {value}" for name, value in release.parameters.items()]
         return [*facts, f"replicas {release.replicas}"]
-    topics = [f"topic {source} to {target}" for source, target in release.topics.items()]
-    return [*topics, f"broker {release.broker.node}"]
+    if isinstance(release, Bridge):
+        return _facts_of_bridge(release)
+    return [*map(_told, release.topics.values()), _meeting_place(release)]
+
+
+def _told(route: Route) -> str:
+    way = "from" if route.reverse else "to"
+    options = {name: value for name, value in route.options().items() if name != "reverse"}
+    more = ", ".join(f"{name} {value}" for name, value in options.items())
+    return f"topic {route.source} {way} {route.target}" + (f" ({more})" if more else "")
+
+
+def _meeting_place(end: MqttEnd | RosEnd) -> str:
+    if isinstance(end, MqttEnd):
+        return f"broker {end.broker.node}"
+    return f"address {end.address.host}:{end.address.port}"
+
+
+def _facts_of_bridge(bridge: Bridge) -> list[str]:
+    return [
+        *(f"connection {id}" for id in bridge.connections),
+        *(f"takes {topic}" for topic in bridge.publishers),
+        *(f"gives {topic}" for topic in bridge.subscribers),
+        *(f"rate {rate:g} of {topic}" for topic, rate in bridge.rates.items()),
+        *(f"connects to {endpoint}" for endpoint in bridge.connect),
+    ]

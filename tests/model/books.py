@@ -159,7 +159,7 @@ class Books:
         if not joining:
             return
         if connection.get("type", 0) != MQTT:
-            yield "this version carries MQTT only"  # it says so itself; the design lists three
+            yield "the inventory lets nothing but MQTT be carried"  # no bridges, no addresses
         if not sources:
             yield "a connection without topics"
         ends = connection.get("source_node_id", ""), connection.get("target_node_id", "")

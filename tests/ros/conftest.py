@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +20,11 @@ from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
+from unique_identifier_msgs.msg import UUID
 
 from ros_bridge.convert import from_data
 from ros_bridge.node import DEEP
+from tests.ros_domain import reserved
 
 ACTION = "/event_detector_operator_plugin/operator_plugin/deployment_request"
 DEADLINE_S = 60.0
@@ -33,10 +36,10 @@ STATUS = {
 
 
 @pytest.fixture(scope="session")
-def ros_domain() -> int:
-    """A ROS domain for each test process, so that nothing else answers."""
-    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
-    return 120 + int(worker.removeprefix("gw") or 0) + os.getpid() % 40 * 2
+def ros_domain() -> Iterator[int]:
+    """A ROS domain for this test process, so that nothing else answers."""
+    with reserved() as domain:
+        yield domain
 
 
 @dataclass
@@ -142,6 +145,11 @@ class Client:
             else {}
         )
         self._client = ActionClient(self.node, DeploymentRequest, action, **qos)
+        # an action client forgets a goal's feedback once it has the result; a subscription does not
+        self._sent: dict[bytes, Sent] = {}
+        self.node.create_subscription(
+            DeploymentRequest.Impl.FeedbackMessage, f"{action}/_action/feedback", self._hear, DEEP
+        )
 
     def wait(self, condition: Callable[[], bool], seconds: float = DEADLINE_S) -> None:
         """Spin until something holds; fail the test where it does not in time."""
@@ -155,13 +163,18 @@ class Client:
 
     def send(self, goal: dict[str, Any]) -> Sent:
         """Send a goal; what is heard of it arrives while the client waits for something."""
-        sent = Sent()
+        sent, id = Sent(), uuid.uuid4().bytes
+        self._sent[id] = sent
         future = self._client.send_goal_async(
-            from_data(DeploymentRequest.Goal(), goal),
-            feedback_callback=lambda told: sent.feedback.append(told.feedback.message),
+            from_data(DeploymentRequest.Goal(), goal), goal_uuid=UUID(uuid=list(id))
         )
         future.add_done_callback(lambda done: self._on_response(sent, done.result()))
         return sent
+
+    def _hear(self, told: Any) -> None:
+        sent = self._sent.get(bytes(told.goal_id.uuid))
+        if sent is not None:
+            sent.feedback.append(told.feedback.message)
 
     def _on_response(self, sent: Sent, handle: Any) -> None:
         sent.handle, sent.accepted = handle, handle.accepted

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -40,7 +39,7 @@ LINK = {
     "id": "link",
     "source": "vehicle00",
     "target": "edge",
-    "topics": [{"source": "/a"}, {"source": "/b", "target": "/c"}],
+    "topics": [{"source": "/a", "qos": 1, "reverse": True}, {"source": "/b", "target": "/c"}],
 }
 
 
@@ -68,7 +67,6 @@ def with_policy(state_repo: Path, **more: Any) -> None:
 
 @pytest.fixture
 def client(ros_domain: int) -> Iterator[DemandClient]:
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     with DemandClient("vehicle00", domain_id=ros_domain) as made:
         yield made
 

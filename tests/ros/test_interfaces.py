@@ -162,10 +162,10 @@ def test_the_bookkeeping_is_a_service() -> None:
 
 @needs_ros
 @pytest.mark.usefixtures("built")
-def test_a_goal_goes_round_with_nothing_set_by_hand(tmp_path: Path) -> None:
+def test_a_goal_goes_round_with_nothing_set_by_hand(tmp_path: Path, ros_domain: int) -> None:
     alone = {
         "HOME": str(tmp_path),
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_DOMAIN_ID": str(ros_domain),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
     result = subprocess.run(

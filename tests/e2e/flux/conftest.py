@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 from tests.e2e.rig.capture import uncaptured
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
+from tests.ros_domain import reserved
 
 from .expected import NODES, STANDING
 from .ros import Client
@@ -43,14 +43,14 @@ def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
 
 
 @pytest.fixture(scope="session")
-def ros_domain() -> int:
+def ros_domain() -> Iterator[int]:
     """A ROS domain for this process, so that nothing else answers."""
-    return 120 + os.getpid() % 100
+    with reserved() as domain:
+        yield domain
 
 
 @pytest.fixture(scope="session")
 def client(ros_domain: int) -> Iterator[Client]:
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     made = Client(ros_domain)
     yield made
     made.close()

@@ -75,6 +75,55 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
             "'cluster'?",
         ],
     ),
+    # how nodes reach each other
+    "an endpoint that needs certificates": (
+        NODES, V1, V1 + "    zenoh: {endpoint: tls/vehicle01:7447}\n",
+        [
+            f"nodes[1].zenoh.endpoint: 'tls/vehicle01:7447' {NAME} "
+            r"^(tcp|udp|ws)/[^\s/#?]+:\d{1,5}$"
+        ],
+    ),
+    "listening where nobody connects": (
+        NODES, V1, V1 + '    zenoh: {listen: ["tcp/0.0.0.0:7447"]}\n',
+        ["nodes[1].zenoh: listen needs an endpoint, where others reach the node; add it"],
+    ),
+    "two bridges on one host": (
+        NODES, V1,
+        "- id: twin\n    type: vehicle\n    cluster: c-its\n    zenoh: {}\n"
+        "    selector: {host: a}\n  " + V1 + "    zenoh: {}\n    selector: {host: a}\n",
+        [
+            "nodes[2].zenoh: 'twin' runs a bridge on the same host and ROS domain, and two do not "
+            "work; keep one"
+        ],
+    ),
+    "ports in the wrong order": (
+        NODES, V1, V1 + "    wan: {host: 192.0.2.1, firstPort: 3000, lastPort: 2000}\n",
+        ["nodes[1].wan: lastPort 2000 is below firstPort 3000; swap them"],
+    ),
+    "a port that only root may open": (
+        NODES, V1, V1 + "    wan: {host: 192.0.2.1, firstPort: 80}\n",
+        ["nodes[1].wan.firstPort: input should be greater than or equal to 1024, not 80"],
+    ),
+    "a message type without its package": (
+        NODES, V1, V1 + "    types: {/a: String}\n",
+        ["nodes[1].types./a: 'String' is no message type; write it like std_msgs/msg/String"],
+    ),
+    "topics that are bridged to a node that does not exist": (
+        NODES, V1, V1 + "    bridged: {egde: [/a]}\n",
+        ["nodes[1].bridged.egde: 'egde' is not in nodes.yaml; did you mean 'edge'?"],
+    ),
+    "a password in Git": (
+        BROKERS, "    port: 1883\n", "    port: 1883\n    credentials: {secret: a, password: b}\n",
+        ["brokers[0].credentials.password: is not a field here; remove it or mend its spelling"],
+    ),
+    "credentials without the Secret that holds them": (
+        BROKERS, "    port: 1883\n", "    port: 1883\n    credentials: {userKey: name}\n",
+        ["brokers[0].credentials.secret: is missing; add it"],
+    ),
+    "a key of a Secret that is a path": (
+        BROKERS, "    port: 1883\n", "    port: 1883\n    tls: {caSecret: a, caKey: ../ca.crt}\n",
+        [f"brokers[0].tls.caKey: '../ca.crt' {NAME} ^[A-Za-z0-9_][A-Za-z0-9_.-]*$"],
+    ),
     # demandops.yaml
     "a controller that is not known": (
         ROOT, "gitops: flux", "gitops: helm", ["gitops: is 'helm', but must be 'flux'"],

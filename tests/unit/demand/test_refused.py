@@ -38,13 +38,39 @@ REFUSED: dict[str, tuple[Goal, list[str]]] = {
         goal([], [connection(type=3)]),
         [f"{C0}.type: 3 is no connection type; {TYPES}"],
     ),
-    "a ROS connection, which this version cannot carry": (
-        goal([], [connection(type=0)]),
-        [f"{C0}.type: 0 (ROS) is not carried by this version; use 1 (MQTT)"],
+    "a ROS connection, for which the inventory has nothing": (
+        goal([], [connection(type=0, broker="", topics=["/a"])]),
+        [
+            f"{C0}.type: 0 (ROS) needs an image 'dds-router'; add it to registry/images.yaml",
+            f"{C0}.type: 0 (ROS) needs an address that one end can be reached at; add wan: "
+            "{host: …} to 'vehicle00' or 'edge' in inventory/nodes.yaml",
+            f"{C0}.source_topics[0]: the message type of '/a' is not known, and ROS needs it; say "
+            "it in the request where it has a field for it, or add it to types of 'vehicle00' in "
+            "inventory/nodes.yaml",
+        ],
     ),
-    "a Zenoh connection, which this version cannot carry": (
+    "a Zenoh connection, for which the inventory has nothing": (
+        goal([], [connection(type=2, broker="")]),
+        [
+            f"{C0}.type: 2 (ZENOH) needs an image 'zenoh-bridge'; add it to registry/images.yaml",
+            *(
+                f"{C0}.{end}_node_id: '{node}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to "
+                "it in inventory/nodes.yaml, or zenoh: {} where others can be reached from it"
+                for end, node in (("source", "vehicle00"), ("target", "edge"))
+            ),
+        ],
+    ),
+    "a broker of a connection that needs none": (
         goal([], [connection(type=2)]),
-        [f"{C0}.type: 2 (ZENOH) is not carried by this version; use 1 (MQTT)"],
+        [
+            f"{C0}.type: 2 (ZENOH) needs an image 'zenoh-bridge'; add it to registry/images.yaml",
+            f"{C0}.broker_node_id: is of MQTT only, and this is ZENOH; leave it out",
+            *(
+                f"{C0}.{end}_node_id: '{node}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to "
+                "it in inventory/nodes.yaml, or zenoh: {} where others can be reached from it"
+                for end, node in (("source", "vehicle00"), ("target", "edge"))
+            ),
+        ],
     ),
     "a misspelt node": (
         goal([application(node="egde")]),

@@ -19,6 +19,7 @@ from generator.demand.claim import (
     demand_id,
 )
 from generator.demand.request import ConnectionType, InputTopic, id_problem
+from generator.demand.route import Route, united
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger
 
@@ -48,6 +49,21 @@ topics = st.from_regex(r"(/[a-zA-Z_][a-zA-Z0-9_]{0,6}){1,3}", fullmatch=True)
 moments = st.datetimes(datetime(2000, 1, 1), datetime(2100, 1, 1), timezones=st.just(timezone.utc))
 people = st.lists(ids, min_size=1, max_size=4, unique=True).map(lambda who: tuple(sorted(who)))
 inputs = st.lists(st.builds(InputTopic, topics, ids, st.just("") | ids), min_size=1, max_size=4)
+CONCRETE = [kind for kind in ConnectionType if kind is not ConnectionType.AUTO]
+routes = st.builds(
+    Route,
+    topics,
+    topics,
+    type=st.sampled_from(["", "std_msgs/msg/String"]),
+    reverse=st.booleans(),
+    qos=st.integers(0, 2),
+    retained=st.booleans(),
+    primitive=st.booleans(),
+    reliability=st.sampled_from(["", "reliable", "best_effort"]),
+    durability=st.sampled_from(["", "volatile", "transient_local"]),
+    queue=st.integers(0, 1000),
+    rate=st.sampled_from([0.0, 0.5, 10.0]),
+)
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | ids,
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(ids, inner, max_size=3),
@@ -91,13 +107,11 @@ def connection_claims(draw: st.DrawFn) -> ConnectionClaim:
         request=request,
         requesters=who,
         booked=draw(moments),
-        type=draw(st.sampled_from(ConnectionType)),
+        type=draw(st.sampled_from(CONCRETE)),
         source=draw(ids),
         target=draw(ids),
         broker=draw(st.just("") | ids),
-        topics=MappingProxyType(
-            dict(sorted(draw(st.dictionaries(topics, topics, min_size=1)).items()))
-        ),
+        topics=MappingProxyType(united(draw(st.lists(routes, min_size=1, max_size=4)))),
     )
 
 
@@ -151,7 +165,7 @@ def test_a_time_is_the_same_moment_in_any_zone(moment: datetime, hours: int) -> 
         source="d",
         target="e",
         broker="",
-        topics=MappingProxyType({"/a": "/b"}),
+        topics=MappingProxyType({"/a": Route("/a", "/b")}),
     )
 
     read = ledger_format.read(ledger_format.write(claim), ledger_format.path_of(claim.key))

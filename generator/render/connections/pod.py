@@ -1,0 +1,31 @@
+"""What the pods of all communication clients have in common: image, place, checksum."""
+
+from __future__ import annotations
+
+import hashlib
+
+from generator.catalog.catalog import IMAGES_FILE, Catalog
+from generator.catalog.inventory import Node
+from generator.errors import Refused, fault
+
+
+def context(node: Node, image: str, catalog: Catalog) -> dict[str, object]:
+    """Return what every client's template needs.
+
+    Raises:
+        Refused: where the registry has no such image.
+    """
+    if image not in catalog.images:
+        message = f"'{image}' is in use, but not in {IMAGES_FILE}; add it there"
+        raise Refused([fault("images", message, code="unsupported-connection-type")])
+    return {
+        "node": node,
+        "selector": node.labels(),
+        "tolerations": [item.model_dump(exclude_defaults=True) for item in node.tolerations],
+        "image": catalog.images[image].reference(),
+    }
+
+
+def checksum(text: str) -> str:
+    """Return what a pod carries so that a change of ``text`` restarts it."""
+    return hashlib.sha256(text.encode()).hexdigest()

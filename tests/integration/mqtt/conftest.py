@@ -1,0 +1,211 @@
+"""A real mosquitto on a loopback port, and pods' configuration as the containers would see it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import paho.mqtt.client as mqtt
+import pytest
+import yaml
+
+from tests.e2e.rig import pki
+
+USER = "fleet 007"
+PASSWORD = "12345\"'{}#\\ é%"  # noqa: S105 - of a broker that lives as long as the test
+"""What would break where it is pasted into YAML, a shell or a command line."""
+
+DEADLINE_S = 20.0
+
+
+def _program(name: str) -> str:
+    found = shutil.which(name) or shutil.which(name, path="/usr/sbin:/usr/local/sbin")
+    assert found, f"{name} is missing; .ci/run installs it (Debian: apt-get install mosquitto)"
+    return found
+
+
+@dataclass(frozen=True)
+class Broker:
+    """A broker that takes TLS connections with a password only."""
+
+    port: int
+    authority: Path
+
+    def inventory(self) -> str:
+        """Return it as ``inventory/brokers.yaml``."""
+        entry = {
+            "node": "edge",
+            "host": "127.0.0.1",
+            "port": self.port,
+            "tls": {"caSecret": "broker-ca"},
+            "credentials": {"secret": "broker-login"},
+        }
+        return yaml.safe_dump({"apiVersion": "demandops/v1", "kind": "Brokers", "brokers": [entry]})
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    """Run mosquitto for the tests of a module."""
+    folder = tmp_path_factory.mktemp("broker")
+    keys = pki.make(folder / "pki")
+    passwords = folder / "passwords"
+    subprocess.run(
+        [_program("mosquitto_passwd"), "-c", "-b", str(passwords), USER, PASSWORD],
+        check=True,
+    )
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    configuration = folder / "mosquitto.conf"
+    configuration.write_text(
+        f"listener {port} 127.0.0.1\nallow_anonymous false\npassword_file {passwords}\n"
+        f"cafile {keys.authority}\ncertfile {keys.server_certificate}\n"
+        f"keyfile {keys.server_key}\nuser root\n"
+    )
+    log = folder / "log"
+    with log.open("w") as out:
+        process = subprocess.Popen(
+            [_program("mosquitto"), "-c", str(configuration)], stdout=out, stderr=out
+        )
+    try:
+        _wait_until_it_listens(process, port, log)
+        yield Broker(port, keys.authority)
+    finally:
+        process.terminate()
+        process.wait(DEADLINE_S)
+
+
+def _wait_until_it_listens(process: subprocess.Popen[bytes], port: int, log: Path) -> None:
+    until = time.monotonic() + DEADLINE_S
+    while time.monotonic() < until:
+        assert process.poll() is None, log.read_text()
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.05)
+    raise AssertionError(f"mosquitto does not listen: {log.read_text()}")
+
+
+class Pod:
+    """One end's pod without its cluster: volumes as folders, the init container run for real."""
+
+    def __init__(self, manifest: str, secrets: dict[str, dict[str, str]], folder: Path) -> None:
+        """Lay out the volumes and run what comes before the client."""
+        config, self.deployment = yaml.safe_load_all(manifest)
+        self._spec = self.deployment["spec"]["template"]["spec"]
+        self._folder = folder
+        for volume in self._spec["volumes"]:
+            place = folder / volume["name"]
+            place.mkdir(parents=True)
+            if "configMap" in volume:
+                files = config["data"]
+            elif "secret" in volume:
+                held = secrets[volume["secret"]["secretName"]]
+                files = {item["path"]: held[item["key"]] for item in volume["secret"]["items"]}
+            else:
+                files = {}
+            for name, text in files.items():
+                (place / name).write_text(text)
+        for container in self._spec.get("initContainers", ()):
+            self._run(container, [sys.executable, *container["command"][1:]])
+
+    def path(self, container: dict[str, Any], text: str) -> str:
+        """Return ``text`` with the container's mount points made this pod's folders."""
+        for mount in container["volumeMounts"]:
+            text = text.replace(f"{mount['mountPath']}", str(self._folder / mount["name"]))
+        return text
+
+    def _run(self, container: dict[str, Any], command: list[str]) -> str:
+        done = subprocess.run(
+            [self.path(container, part) for part in command],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the client's parameters as the real rcl reads them from its arguments."""
+        (container,) = self._spec["containers"]
+        arguments = container["args"]
+        assert arguments[:4] == ["ros2", "run", "mqtt_client", "mqtt_client"]
+        script = str(Path(__file__).with_name("read_parameters.py"))
+        read = json.loads(self._run(container, [sys.executable, script, *arguments[4:]]))
+        assert read["node"] == self.deployment["metadata"]["name"].replace("-", "_")
+        found: dict[str, Any] = read["parameters"]
+        found["broker.tls.ca_certificate"] = self.path(
+            container, found["broker.tls.ca_certificate"]
+        )
+        return found
+
+
+class Client:
+    """What mqtt_client does with its parameters on the broker's side, and nothing of its own."""
+
+    def __init__(self, parameters: dict[str, Any]) -> None:
+        """Connect, subscribe to what the end takes in, and keep what arrives."""
+        self.parameters = parameters
+        self.arrived: list[tuple[str, bytes, int, bool]] = []
+        self.acknowledged: list[int] = []
+        self._client = mqtt.Client(
+            mqtt.CallbackAPIVersion.VERSION2, client_id=parameters["client.id"]
+        )
+        self._client.username_pw_set(parameters["broker.user"], parameters["broker.pass"])
+        if parameters["broker.tls.enabled"]:
+            self._client.tls_set(ca_certs=parameters["broker.tls.ca_certificate"])
+        self._client.on_message = self._take
+        self._client.on_subscribe = lambda *_: self.acknowledged.append(1)
+        self.reason = ""
+        self._client.on_connect = self._connected
+        self._client.connect(parameters["broker.host"], parameters["broker.port"])
+        self._client.loop_start()
+        self.wait(lambda: bool(self.reason))
+
+    def _connected(self, client: mqtt.Client, _: object, __: object, reason: Any, ___: Any) -> None:
+        topics = self.parameters.get("bridge.mqtt2ros.mqtt_topics", [])
+        for topic in topics if not reason.is_failure else []:
+            qos = self.parameters.get(f"bridge.mqtt2ros.{topic}.advanced.mqtt.qos", 0)
+            client.subscribe(topic, qos)
+        self.reason = str(reason)
+
+    def _take(self, _: object, __: object, message: mqtt.MQTTMessage) -> None:
+        self.arrived.append((message.topic, message.payload, message.qos, message.retain))
+
+    def publish(self, ros_topic: str, payload: bytes) -> None:
+        """Send what a ROS topic gave, as the end's parameters say."""
+        prefix = f"bridge.ros2mqtt.{ros_topic}"
+        sent = self._client.publish(
+            self.parameters[f"{prefix}.mqtt_topic"],
+            payload,
+            qos=self.parameters.get(f"{prefix}.advanced.mqtt.qos", 0),
+            retain=self.parameters.get(f"{prefix}.advanced.mqtt.retained", False),
+        )
+        sent.wait_for_publish(DEADLINE_S)
+        assert sent.is_published()
+
+    def ready(self) -> None:
+        """Wait until the broker confirmed every subscription."""
+        topics = self.parameters.get("bridge.mqtt2ros.mqtt_topics", [])
+        self.wait(lambda: len(self.acknowledged) == len(topics))
+
+    def wait(self, done: Any) -> None:
+        """Wait until something holds, or fail."""
+        until = time.monotonic() + DEADLINE_S
+        while not done():
+            assert time.monotonic() < until, (self.reason, self.arrived)
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        """Leave the broker."""
+        self._client.disconnect()
+        self._client.loop_stop()

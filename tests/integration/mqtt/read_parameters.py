@@ -1,0 +1,23 @@
+"""Prints the parameters that a ROS node gets from its arguments, read by the real rcl, as JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import rclpy
+from rclpy.node import Node
+
+
+def main() -> None:
+    """Start a node with the arguments given and print what it was given as parameters."""
+    rclpy.init(args=sys.argv)
+    node = Node("replaced_by_remapping", automatically_declare_parameters_from_overrides=True)
+    known = {name: found.value for name, found in node.get_parameters_by_prefix("").items()}
+    print(json.dumps({"node": node.get_name(), "parameters": known}))
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""The bridges' configuration in the hands of the real Zenoh: it is read, and the nodes link up.
+
+Zenoh's own library stands in for the bridges: it reads the same configuration, refuses fields that
+it does not know, and keeps the part of the plugin for a plugin that is not there. What the
+bridge's plugin reads is held against our schema only.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import yaml
+import zenoh
+
+from tests.golden.cases import play
+
+DEADLINE_S = 30.0
+STEP = "2-station00-joins"
+"""Of the golden case: the edge can be reached by both others, and the station too."""
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def configurations() -> dict[str, str]:
+    """Return the rendered configuration of each node's bridge, its hosts made this machine."""
+    steps = dict(play("zenoh"))
+    found = {}
+    for path, text in steps[STEP].items():
+        name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
+        if path.startswith("clusters/") and name.startswith("zenoh-"):
+            config, _ = yaml.safe_load_all(text)
+            found[name.removeprefix("zenoh-")] = config["data"]["config.json5"]
+    edge, station, router = (f"127.0.0.1:{free_port()}" for _ in range(3))
+    here = {
+        "edge.example:7448": edge,
+        "10.0.0.2:7448": edge,
+        "station00.example:7447": station,
+        "0.0.0.0:7447": station,
+        "router.example:7447": router,
+    }
+    for written, address in here.items():
+        found = {node: text.replace(written, address) for node, text in found.items()}
+    return found
+
+
+@pytest.fixture(scope="module")
+def sessions(configurations: dict[str, str]) -> Iterator[dict[str, Any]]:
+    """Run a Zenoh session on each node's configuration, the plugin's part left out."""
+    opened = {}
+    for node, text in configurations.items():
+        whole = json.loads(text)
+        del whole["plugins"]
+        opened[node] = zenoh.open(zenoh.Config.from_json5(json.dumps(whole)))
+    yield opened
+    for session in opened.values():
+        session.close()
+
+
+def wait(done: Callable[[], bool]) -> None:
+    until = time.monotonic() + DEADLINE_S
+    while not done():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_zenoh_reads_the_whole_text(configurations: dict[str, str]) -> None:
+    assert configurations.keys() == {"edge", "station00", "vehicle00"}
+    for text in configurations.values():
+        assert zenoh.Config.from_json5(text)
+
+
+def test_zenoh_refuses_a_field_that_it_does_not_know(configurations: dict[str, str]) -> None:
+    whole = json.loads(configurations["edge"])
+    with pytest.raises(zenoh.ZError):
+        zenoh.Config.from_json5(json.dumps(whole | {"listne": {}}))
+
+
+def test_each_node_links_with_those_it_has_connections_with_and_no_other(
+    sessions: dict[str, Any],
+) -> None:
+    ids = {str(session.info.zid()): node for node, session in sessions.items()}
+
+    def links() -> dict[str, set[str]]:
+        return {
+            node: {ids[str(peer)] for peer in session.info.routers_zid()}
+            for node, session in sessions.items()
+        }
+
+    expected = {"edge": {"station00", "vehicle00"}, "station00": {"edge"}, "vehicle00": {"edge"}}
+    wait(lambda: links() == expected)
+
+
+def test_what_one_node_puts_arrives_at_another_that_is_linked(sessions: dict[str, Any]) -> None:
+    arrived: list[bytes] = []
+    subscriber = sessions["edge"].declare_subscriber(
+        "points", lambda sample: arrived.append(bytes(sample.payload))
+    )
+
+    def put() -> bool:
+        sessions["vehicle00"].put("points", b"here")  # the subscription takes a moment to spread
+        return bool(arrived)
+
+    wait(put)
+    subscriber.undeclare()
+    assert set(arrived) == {b"here"}

@@ -1,0 +1,126 @@
+"""What a route may say at all, whatever carries it."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import pytest
+
+from generator.demand import carriers
+from generator.demand.route import Route, RouteOptions, differences, faults, parse, united
+
+OPTIONS: dict[str, object] = {
+    "type": "std_msgs/msg/String",
+    "reverse": True,
+    "qos": 2,
+    "retained": True,
+    "primitive": True,
+    "reliability": "best_effort",
+    "durability": "volatile",
+    "queue": 7,
+    "rate": 0.5,
+}
+
+
+def told(found: Any) -> list[str]:
+    return [f"{one.field}: {one.message}" for one in found]
+
+
+def test_a_route_is_plain_unless_something_is_said() -> None:
+    route, found = parse("t", "/a", "/b", {})
+    assert (route, found) == (Route("/a", "/b"), [])
+    assert route.options() == {}
+
+
+def test_every_option_is_kept() -> None:
+    route, found = parse("t", "/a", "/b", OPTIONS)
+    assert not found
+    assert route.options() == OPTIONS
+    assert (route.source, route.target) == ("/a", "/b")
+
+
+def test_options_and_routes_have_the_same_fields_and_defaults() -> None:
+    of_route = {item.name: item.default for item in fields(Route)}
+    assert of_route.keys() - {"source", "target"} == RouteOptions.model_fields.keys()
+    for name, field in RouteOptions.model_fields.items():
+        assert field.default == of_route[name]
+
+
+def test_every_option_does_something_in_some_client() -> None:
+    honoured = set().union(*carriers.HONOURED.values())
+    assert honoured == RouteOptions.model_fields.keys() - {"type", "reverse"}
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"qos": 3}, "t.qos: input should be less than or equal to 2, not 3"),
+        ({"qos": -1}, "t.qos: input should be greater than or equal to 0, not -1"),
+        ({"qos": "1"}, "t.qos: must be a whole number, not '1'"),
+        ({"rate": -1}, "t.rate: input should be greater than or equal to 0, not -1"),
+        ({"rate": float("nan")}, "t.rate: input should be a finite number, not nan"),
+        ({"queue": -1}, "t.queue: input should be greater than or equal to 0, not -1"),
+        ({"retained": "yes"}, "t.retained: must be true or false, not 'yes'"),
+        (
+            {"reliability": "relaible"},
+            "t.reliability: is 'relaible', but must be '', 'reliable' or 'best_effort'",
+        ),
+        (
+            {"durability": "kept"},
+            "t.durability: is 'kept', but must be '', 'volatile' or 'transient_local'",
+        ),
+        (
+            {"type": "String"},
+            "t.type: 'String' is no message type; write it like std_msgs/msg/String",
+        ),
+        (
+            {"qso": 1},
+            "t.qso: is not a field here; remove it or mend its spelling; did you mean 'qos'?",
+        ),
+    ],
+)
+def test_what_no_option_can_be_is_told(options: dict[str, object], expected: str) -> None:
+    route, found = parse("t", "/a", "/b", options | {"queue": options.get("queue", 5)})
+    assert told(found) == [expected]
+    assert route == Route("/a", "/b", queue=0 if "queue" in options else 5)
+
+
+def test_a_whole_number_is_a_rate_too() -> None:
+    assert parse("t", "/a", "/a", {"rate": 5})[0].rate == 5.0
+
+
+def test_a_topic_listed_with_two_ways_to_carry_it_is_told() -> None:
+    routes = [Route("/a", "/b"), Route("/a", "/b", qos=1, reverse=True)]
+    assert told(faults("topics", routes)) == [
+        "topics[1].reverse: '/a' is listed with reverse false and true; list it once",
+        "topics[1].qos: '/a' is listed with qos 0 and 1; list it once",
+    ]
+
+
+def test_a_topic_that_is_carried_back_goes_to_one_place() -> None:
+    routes = [Route("/a", "/x", reverse=True), Route("/b", "/x", reverse=True)]
+    assert told(faults("topics", routes)) == [
+        "topics[1].target: '/x' is carried back to '/a' and to '/b'; one topic goes to one place, "
+        "use a second connection"
+    ]
+
+
+def test_two_topics_may_arrive_as_one() -> None:
+    assert not list(faults("topics", [Route("/a", "/x"), Route("/b", "/x")]))
+
+
+def test_a_type_that_is_not_said_contradicts_none_and_is_filled_in() -> None:
+    plain, typed = Route("/a", "/a"), Route("/a", "/a", type="std_msgs/msg/String")
+    assert not list(differences(plain, typed))
+    assert united([plain, typed]) == united([typed, plain]) == {"/a": typed}
+    other = Route("/a", "/a", type="std_msgs/msg/Bool")
+    assert list(differences(typed, other)) == [
+        ("type", "'std_msgs/msg/String'", "'std_msgs/msg/Bool'")
+    ]
+
+
+def test_where_messages_come_from_and_arrive() -> None:
+    there, back = Route("/a", "/b"), Route("/a", "/b", reverse=True)
+    assert (there.read, there.written, there.ends("s", "t")) == ("/a", "/b", ("s", "t"))
+    assert (back.read, back.written, back.ends("s", "t")) == ("/b", "/a", ("t", "s"))

@@ -1,0 +1,164 @@
+"""Routes in the books: their files, what contradicts them, and who is linked where."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timezone
+from types import MappingProxyType
+from typing import Any
+
+import pytest
+import yaml
+
+from generator.demand.claim import ConnectionClaim, demand_id
+from generator.demand.request import ConnectionDemand, ConnectionType, DemandRequest, Operation
+from generator.demand.route import Route, united
+from generator.errors import InvalidInput, Refused
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger, apply
+
+NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
+STRING = "std_msgs/msg/String"
+
+
+def claim(*routes: Route, kind: ConnectionType = ConnectionType.MQTT) -> ConnectionClaim:
+    return ConnectionClaim(
+        connection="c",
+        demand=demand_id("r", ["v"]),
+        request="r",
+        requesters=("v",),
+        booked=NOW,
+        type=kind,
+        source="s",
+        target="t",
+        broker="",
+        topics=MappingProxyType(united(routes)),
+    )
+
+
+def joined(ledger: Ledger, *routes: Route, who: str = "v", **more: Any) -> Ledger:
+    asked = ConnectionDemand("c", ConnectionType.MQTT.value, "s", "t", routes, "", (who,))
+    asked = replace(asked, **more)
+    request = DemandRequest("r", Operation.JOIN, connections=(asked,))
+    return apply(ledger, request, NOW)[0]
+
+
+def refusal(ledger: Ledger, *routes: Route, who: str = "w") -> list[str]:
+    with pytest.raises(Refused) as refused:
+        joined(ledger, *routes, who=who)
+    return [f"{found.field}: {found.message}" for found in refused.value.faults]
+
+
+class TestFiles:
+    """A plain route is one line; one with options shows them, and nothing else."""
+
+    def test_topics_stay_readable(self) -> None:
+        held = claim(Route("/b", "/c", qos=1, rate=0.5), Route("/a", "/b"))
+        text = ledger_format.write(held)
+        assert text.endswith(
+            "topics:\n  /a: /b\n  /b:\n    target: /c\n    qos: 1\n    rate: 0.5\n"
+        )
+        assert ledger_format.read(text, ledger_format.path_of(held.key)) == held
+
+    def test_a_file_of_before_there_were_options_is_read(self) -> None:
+        held = claim(Route("/a", "/b"))
+        text = ledger_format.write(held)
+        assert yaml.safe_load(text)["topics"] == {"/a": "/b"}
+        assert ledger_format.read(text, ledger_format.path_of(held.key)) == held
+
+    @pytest.mark.parametrize(
+        ("written", "expected"),
+        [
+            ("{qos: 1}", "topics./a.target: is missing; add it"),
+            ("{target: /b, qso: 1}", "topics./a.qso: is not a field here; remove it or mend its"),
+            ("{target: /b, qos: 7}", "topics./a.qos: input should be less than or equal to 2"),
+            ("{target: /b, reverse: 1}", "topics./a.reverse: must be true or false, not 1"),
+            ("[/b]", "topics./a: must be a mapping, not ['/b']"),
+            ("5", "topics./a: must be a mapping, not 5"),
+        ],
+    )
+    def test_they_are_read_strictly(self, written: str, expected: str) -> None:
+        held = claim(Route("/a", "/b"))
+        text = ledger_format.write(held).replace("/a: /b", f"/a: {written}")
+        path = ledger_format.path_of(held.key)
+        with pytest.raises(InvalidInput) as invalid:
+            ledger_format.read(text, path)
+        (found,) = invalid.value.faults
+        assert str(found).startswith(f"{path}: {expected}")
+
+    def test_a_claim_of_a_type_that_is_open_is_not_read(self) -> None:
+        held = claim(Route("/a", "/b"))
+        text = ledger_format.write(held).replace("type: mqtt", "type: auto")
+        with pytest.raises(InvalidInput, match="type: is 'auto', but must be"):
+            ledger_format.read(text, ledger_format.path_of(held.key))
+
+
+class TestContradictions:
+    """What stands is kept, and named."""
+
+    @pytest.mark.parametrize(
+        ("option", "stands", "asked"),
+        [
+            ("qos", "2", "0"),
+            ("retained", "true", "false"),
+            ("primitive", "true", "false"),
+            ("reliability", "'reliable'", "''"),
+            ("durability", "'volatile'", "''"),
+            ("queue", "3", "0"),
+            ("rate", "1.5", "0.0"),
+            ("reverse", "true", "false"),
+        ],
+    )
+    def test_another_way_to_carry_a_topic(self, option: str, stands: str, asked: str) -> None:
+        value: Any = yaml.safe_load(stands)
+        ledger = joined(Ledger(), Route("/a", "/b", **{option: value}))
+        assert refusal(ledger, Route("/a", "/b")) == [
+            f"connections[0].topics[0].{option}: {option} {asked} of '/a' contradicts what stands: "
+            f"'c' is held by v with {option} {stands}; use the same, or a second connection"
+        ]
+        assert joined(ledger, Route("/a", "/b", **{option: value}), who="w") != ledger
+
+    def test_another_message_type(self) -> None:
+        ledger = joined(Ledger(), Route("/a", "/b", type=STRING))
+        (found,) = refusal(ledger, Route("/a", "/b", type="std_msgs/msg/Bool"))
+        assert found.startswith("connections[0].topics[0].type: type 'std_msgs/msg/Bool' of '/a'")
+
+    def test_the_same_holds_for_ones_own_claim(self) -> None:
+        ledger = joined(Ledger(), Route("/a", "/b", qos=1))
+        assert len(refusal(ledger, Route("/a", "/b", qos=2), who="v")) == 1
+
+    def test_a_topic_that_somebody_has_carried_back_to_another(self) -> None:
+        ledger = joined(Ledger(), Route("/a", "/x", reverse=True))
+        assert refusal(ledger, Route("/b", "/x", reverse=True)) == [
+            "connections[0].topics[0].target: '/x' is carried back to '/a' already: 'c' is held by "
+            "v; one topic goes to one place, use a second connection"
+        ]
+        assert joined(ledger, Route("/b", "/x"), who="w")
+
+
+def test_a_type_that_is_said_later_is_filled_in_and_kept() -> None:
+    ledger = joined(Ledger(), Route("/a", "/b"))
+    ledger = joined(ledger, Route("/a", "/b", type=STRING))
+    assert joined(ledger, Route("/a", "/b")) == ledger
+    (held,) = ledger.connection("c")
+    assert held.topics == {"/a": Route("/a", "/b", type=STRING)}
+
+
+def test_what_is_carried_back_arrives_at_the_source() -> None:
+    ledger = joined(Ledger(), Route("/a", "/b"), Route("/c", "/d", reverse=True))
+    assert ledger.carries("t", "/b")
+    assert ledger.carries("s", "/c")
+    assert not ledger.carries("t", "/d")
+
+
+@pytest.mark.parametrize("kind", [ConnectionType.ZENOH, ConnectionType.ROS])
+def test_links_are_known_at_both_nodes_as_long_as_somebody_holds_them(kind: ConnectionType) -> None:
+    ledger = joined(Ledger(), Route("/a", "/a"), type=kind.value)
+    ledger = joined(ledger, Route("/a", "/a"), type=kind.value, who="w")
+    ledger = joined(ledger, Route("/a", "/a"), type=kind.value, id="d", target="u")
+    first, second = ledger.connection("c")
+    assert (ledger.at(kind, "s"), ledger.at(kind, "t")) == (("c", "d"), ("c",))
+    ledger = ledger.replace(first.key, None)
+    assert ledger.at(kind, "t") == ("c",)
+    ledger = ledger.replace(second.key, None)
+    assert (ledger.at(kind, "s"), ledger.at(kind, "t")) == (("d",), ())

@@ -1,0 +1,422 @@
+"""Zenoh bridges, DDS routers and MQTT clients with options: what they are told, and when."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "demand"))
+
+from asking import NOW, skeleton
+from test_carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, state
+
+from generator.catalog.catalog import load
+from generator.decision import State, rendered
+from generator.demand.claim import Subject, SubjectKind
+from generator.demand.route import Route
+from generator.errors import InvalidInput, Refused
+from generator.plan.clients import BridgeKey, EndKey
+from generator.plan.planner import affected
+from generator.render.changeset import ReleaseChange
+from generator.render.connections import schema
+from generator.render.connections.ros import dds_type
+from tests import demanding
+
+
+class World:
+    """A state repo in memory that demands with options are sent to."""
+
+    def __init__(self, before: State) -> None:
+        self.state = before
+        self.files: dict[str, str] = dict(rendered(before))
+        self.releases: tuple[ReleaseChange, ...] = ()
+
+    def send(self, asked: dict[str, Any]) -> None:
+        self.state, made = demanding.decide(self.state, asked, NOW, self.files.get)
+        self.releases = made.releases
+        for path, text in made.files.items():
+            if text is None:
+                del self.files[path]
+            else:
+                self.files[path] = text
+
+    def clients(self) -> dict[str, Any]:
+        """Return the configuration of each client by its name."""
+        return {name: documents[0]["data"] for name, documents in self._pods().items()}
+
+    def checksums(self) -> dict[str, str]:
+        """Return what restarts each client where it changes."""
+        return {
+            name: pod["spec"]["template"]["metadata"]["annotations"]["demandops/config-checksum"]
+            for name, (_, pod) in self._pods().items()
+        }
+
+    def _pods(self) -> dict[str, list[Any]]:
+        found = {}
+        for path, text in self.files.items():
+            name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
+            if path.startswith("clusters/") and name.split("-")[0] in ("mqtt", "zenoh", "ros"):
+                found[name] = list(yaml.safe_load_all(text))
+        return found
+
+    def zenoh(self, node: str) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.clients()[f"zenoh-{node}"]["config.json5"])
+        return found
+
+
+def zenoh_world() -> World:
+    return World(state(vehicle00=SPEAKS, vehicle01=SPEAKS, edge=REACHABLE))
+
+
+class TestZenoh:
+    """One bridge on a node, for all that it carries."""
+
+    def test_both_nodes_of_a_connection_are_affected_and_no_other(self) -> None:
+        world = zenoh_world()
+        before = world.state.ledger
+        world.send(demand("zenoh", {"/b": "/b"}, id="other", source="vehicle01"))
+        world.send(demand("zenoh"))
+        subject = Subject(SubjectKind.CONNECTION, "c")
+        keys = affected(before, world.state.ledger, world.state.catalog, [subject])
+        assert keys == (BridgeKey("vehicle00"), BridgeKey("edge"))
+        assert [(found.name, found.change) for found in world.releases] == [
+            ("zenoh-vehicle00", "start"),
+            ("zenoh-edge", "change"),
+        ]
+        assert world.releases[1].details == ("+ connection c", "+ gives /a")
+
+    def test_of_another_type_the_ends_are_affected(self) -> None:
+        world = zenoh_world()
+        before = world.state.ledger
+        world.send(demand("mqtt"))
+        subject = Subject(SubjectKind.CONNECTION, "c")
+        keys = affected(before, world.state.ledger, world.state.catalog, [subject])
+        assert keys == (EndKey("c", "source"), EndKey("c", "target"))
+
+    def test_its_cost_does_not_grow_with_connections_elsewhere(self) -> None:
+        world = zenoh_world()
+        for number in range(30):
+            world.send(demand("zenoh", id=f"c{number}", source="vehicle01"))
+        world.send(demand("zenoh", target="vehicle00", source="edge"))
+        assert world.state.ledger.at(world.state.ledger.connection("c")[0].type, "vehicle00") == (
+            "c",
+        )
+
+    def test_topics_match_whole_names_and_nothing_else(self) -> None:
+        world = zenoh_world()
+        world.send(demand("zenoh", {"/a": "/a", "/a_b/c1": "/a_b/c1"}))
+        (only,) = world.zenoh("vehicle00")["plugins"]["ros2dds"]["allow"].values()
+        assert only == ["^/a$", "^/a_b/c1$"]
+        assert not any(re.search(pattern, "/a/b") for pattern in only)
+
+    def test_of_two_that_can_be_reached_one_connects(self) -> None:
+        other = {"zenoh": {"endpoint": "tcp/vehicle00:7447"}}
+        world = World(state(vehicle00=other, edge=REACHABLE))
+        for id, source, target in (("c", "vehicle00", "edge"), ("d", "edge", "vehicle00")):
+            world.send(demand("zenoh", {f"/{id}": f"/{id}"}, id=id, source=source, target=target))
+        assert world.zenoh("edge")["connect"] == {"endpoints": ["tcp/vehicle00:7447"]}
+        assert world.zenoh("vehicle00")["connect"] == {"endpoints": []}
+        assert world.zenoh("vehicle00")["listen"] == {"endpoints": ["tcp/0.0.0.0:7447"]}
+
+    def test_a_rate_is_where_the_topic_is_taken_from(self) -> None:
+        world = zenoh_world()
+        world.send(demand("zenoh", {"/a": {"rate": 2.5}, "/b": {"rate": 1, "reverse": True}}))
+        rates = {
+            node: world.zenoh(node)["plugins"]["ros2dds"]["pub_max_frequencies"]
+            for node in ("vehicle00", "edge")
+        }
+        assert rates == {"vehicle00": ["^/a$=2.5"], "edge": ["^/b$=1"]}
+
+    def test_a_further_topic_restarts_both_bridges_and_no_other(self) -> None:
+        world = zenoh_world()
+        world.send(demand("zenoh", id="other", source="vehicle01"))
+        world.send(demand("zenoh"))
+        before = world.checksums()
+        world.send(demand("zenoh", {"/b": "/b"}, requesters=["vehicle01"]))
+        after = world.checksums()
+        assert {name for name in after if after[name] != before[name]} == {
+            "zenoh-edge",
+            "zenoh-vehicle00",
+        }
+
+    def test_demands_in_any_order_leave_what_the_books_alone_would_give(self) -> None:
+        chance = random.Random(7)
+        world = zenoh_world()
+        for _ in range(60):
+            id = chance.choice("abc")
+            source = {"a": "vehicle00", "b": "vehicle01", "c": "edge"}[id]
+            target = "edge" if source != "edge" else "vehicle01"
+            names = chance.sample(["/1", "/2", "/3"], chance.randrange(1, 4))
+            topics = {f"/{id}{name[1:]}": {"reverse": id == "c"} for name in names}
+            who = chance.choice(["vehicle00", "vehicle01"])
+            asked = demand("zenoh", topics, id=id, source=source, target=target, requesters=[who])
+            asked["shutdown"] = chance.random() < 0.5
+            if asked["shutdown"] and not world.state.ledger.connection(id):
+                continue
+            try:
+                world.send(asked)
+            except InvalidInput:
+                continue  # a shutdown of what this requester does not hold
+            kept = {path: text for path, text in world.files.items() if "ledger/" not in path}
+            assert kept == rendered(world.state)
+
+
+class TestRos:
+    """A DDS router at each end."""
+
+    def world(self, **more: Any) -> World:
+        types = {"/a": "std_msgs/msg/String", "/b": "sensor_msgs/msg/PointCloud2"}
+        return World(state(vehicle00={"types": types}, edge=WAN | TYPED, **more))
+
+    def ends(self, world: World) -> dict[str, Any]:
+        return {
+            "source" if "-source" in name else "target": yaml.safe_load(data["config.yaml"])
+            for name, data in world.clients().items()
+        }
+
+    def test_the_types_of_messages_as_dds_knows_them(self) -> None:
+        assert dds_type("std_msgs/msg/String") == "std_msgs::msg::dds_::String_"
+
+    def test_both_meet_at_the_targets_address(self) -> None:
+        world = self.world()
+        world.send(demand("ros"))
+        ends = self.ends(world)
+        (listening,) = ends["target"]["participants"][1]["listening-addresses"]
+        (connecting,) = ends["source"]["participants"][1]["connection-addresses"]
+        assert listening == connecting
+        assert listening["ip"] == "192.0.2.1"
+        assert 20000 <= listening["port"] <= 29999
+
+    def test_or_at_the_sources_where_only_that_can_be_reached(self) -> None:
+        named = {"wan": {"host": "vehicle00.example", "transport": "udp"}}
+        world = World(state(vehicle00=named | TYPED))
+        world.send(demand("ros"))
+        ends = self.ends(world)
+        (address,) = ends["source"]["participants"][1]["listening-addresses"]
+        assert (address["domain"], address["transport"]) == ("vehicle00.example", "udp")
+        assert "connection-addresses" in ends["target"]["participants"][1]
+
+    def test_the_port_is_of_the_connection_alone(self) -> None:
+        alone, second = self.world(), self.world()
+        alone.send(demand("ros"))
+        second.send(demand("ros", {"/b": "/b"}, id="before"))
+        second.send(demand("ros"))
+        assert alone.clients().items() <= second.clients().items()
+
+    def test_a_further_topic_does_not_restart_a_router_but_an_option_does(self) -> None:
+        world = self.world()
+        world.send(demand("ros"))
+        before = world.checksums()
+        world.send(demand("ros", {"/b": "/b"}, requesters=["vehicle01"]))
+        assert world.checksums() == before
+        assert len(self.ends(world)["source"]["allowlist"]) == 2
+        world.send(demand("ros", {"/c": {"type": "a/msg/B", "rate": 1}}, requesters=["station00"]))
+        changed = {name for name, sum in world.checksums().items() if sum != before[name]}
+        assert len(changed) == 1
+        assert "-source" in changed.pop()
+
+    def test_messages_pass_one_way(self) -> None:
+        world = self.world()
+        world.send(demand("ros", {"/a": "/a", "/b": {"type": "a/msg/B", "reverse": True}}))
+        inward = [{"src": "local", "dst": ["wan"]}, {"src": "wan"}]
+        outward = [{"src": "wan", "dst": ["local"]}, {"src": "local"}]
+        ends = self.ends(world)
+        assert (ends["source"]["routes"], ends["target"]["routes"]) == (inward, outward)
+        back = {side: end["topic-routes"][0]["routes"] for side, end in ends.items()}
+        assert back == {"source": outward, "target": inward}
+
+
+class TestMqtt:
+    """What an option becomes at which end."""
+
+    def test_options_at_both_ends(self) -> None:
+        world = World(state())
+        said = {
+            "target": "/b",
+            "type": "std_msgs/msg/Bool",
+            "qos": 1,
+            "retained": True,
+            "primitive": True,
+            "reliability": "reliable",
+            "durability": "volatile",
+            "queue": 4,
+        }
+        world.send(demand("mqtt", {"/a": said}))
+        bridges = {
+            name: yaml.safe_load(data["params.yaml"])["/**/*"]["ros__parameters"]["bridge"]
+            for name, data in world.clients().items()
+        }
+        both = {"primitive": True, "ros_type": "std_msgs/msg/Bool"}
+        ros = {"queue_size": 4, "qos": {"reliability": "reliable", "durability": "volatile"}}
+        sent, taken = {"qos": 1, "retained": True}, {"qos": 1}
+        assert bridges == {
+            "mqtt-c-source": {
+                "ros2mqtt": {
+                    "ros_topics": ["/a"],
+                    "/a": both | {"mqtt_topic": "mqtt-c/a", "advanced": {"ros": ros, "mqtt": sent}},
+                }
+            },
+            "mqtt-c-target": {
+                "mqtt2ros": {
+                    "mqtt_topics": ["mqtt-c/a"],
+                    "mqtt-c/a": both | {"ros_topic": "/b", "advanced": {"ros": ros, "mqtt": taken}},
+                }
+            },
+        }
+
+    def test_a_connection_that_only_brings_back_has_its_ends_turned(self) -> None:
+        world = World(state())
+        world.send(demand("mqtt", {"/a": {"target": "/b", "reverse": True}}))
+        ways = {
+            name: yaml.safe_load(data["params.yaml"])["/**/*"]["ros__parameters"]["bridge"]
+            for name, data in world.clients().items()
+        }
+        assert ways == {
+            "mqtt-c-source": {
+                "mqtt2ros": {"mqtt_topics": ["mqtt-c/a"], "mqtt-c/a": {"ros_topic": "/a"}}
+            },
+            "mqtt-c-target": {"ros2mqtt": {"ros_topics": ["/b"], "/b": {"mqtt_topic": "mqtt-c/a"}}},
+        }
+
+    def test_tls_without_a_secret_trusts_what_the_image_trusts(self) -> None:
+        before = state()
+        files = dict(skeleton())
+        files["inventory/brokers.yaml"] += "    tls: {}\n"
+        catalog = load({path: text for path, text in files.items() if "README" not in path})
+        world = World(State.of(catalog, before.ledger))
+        world.send(demand("mqtt"))
+        for path, text in world.files.items():
+            if "mqtt-" in path and path.startswith("clusters"):
+                config, pod = yaml.safe_load_all(text)
+                parameters = yaml.safe_load(config["data"]["params.yaml"])
+                broker = parameters["/**/*"]["ros__parameters"]["broker"]
+                assert broker["tls"] == {"enabled": True}
+                (volume,) = pod["spec"]["template"]["spec"]["volumes"]
+                assert volume["name"] == "config"
+
+
+BRIDGED: dict[str, Any] = {"bridged": {"edge": ["/a"]}}
+
+
+class TestBridgedAlready:
+    """What the initial deployment carries is not carried twice, and no client is empty."""
+
+    @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
+    def test_no_client_without_a_topic(self, kind: str) -> None:
+        nodes = {"vehicle00": SPEAKS | TYPED | BRIDGED, "edge": REACHABLE | WAN | TYPED}
+        world = World(state(**nodes))
+        world.send(demand(kind))
+        assert world.clients() == {}
+        assert world.releases == ()
+        assert len(world.state.ledger) == 1
+        world.send(demand(kind, {"/b": {"type": "std_msgs/msg/String"}}))
+        assert len(world.clients()) == 2
+        assert not any("/a" in str(data).split("mqtt-c") for data in world.clients().values())
+
+    def test_the_other_way_is_another_topic(self) -> None:
+        world = World(state(vehicle00=BRIDGED))
+        world.send(demand("mqtt", {"/a": {"reverse": True}}))
+        assert len(world.clients()) == 2
+
+    def test_another_name_is_not_carried_already(self) -> None:
+        world = World(state(vehicle00=BRIDGED))
+        world.send(demand("mqtt", {"/a": "/b"}))
+        assert len(world.clients()) == 2
+
+
+class TestWhatPeopleDidInGit:
+    """A claim that its type cannot carry, or an inventory that lost what a claim needs."""
+
+    NODES: ClassVar[dict[str, Any]] = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
+
+    def after(self, kind: str, route: Route, **nodes: Any) -> list[str]:
+        """Return why the books cannot be rendered once a claim or the inventory was edited."""
+        world = World(state(**self.NODES))
+        world.send(demand(kind))
+        (claim,) = world.state.ledger.connection("c")
+        edited = replace(claim, topics={route.source: route})
+        books = world.state.ledger.replace(claim.key, edited)
+        with pytest.raises(Refused) as refused:
+            rendered(replace(state(**(self.NODES | nodes)), ledger=books))
+        return [str(found) for found in refused.value.faults]
+
+    def test_an_option_that_the_type_cannot_honour(self) -> None:
+        assert self.after("zenoh", Route("/a", "/a", qos=1)) == [
+            "connections: 'c': qos of '/a' is nothing that ZENOH can do; leave it out, or use type "
+            "1 (MQTT)"
+        ]
+
+    def test_another_name(self) -> None:
+        (found,) = self.after("ros", Route("/a", "/b"))
+        assert found.startswith("connections: 'c': '/a' cannot become '/b'")
+
+    @pytest.mark.parametrize(
+        ("kind", "node", "left", "expected"),
+        [
+            ("zenoh", "vehicle00", {}, "node: 'vehicle00' carries Zenoh connections, but has no"),
+            ("ros", "edge", {}, "connections: connection 'c' finds no end with a wan address any"),
+            ("ros", "vehicle00", {}, "connections: 'c': the message type of '/a' is not known"),
+        ],
+    )
+    def test_what_the_inventory_lost(
+        self, kind: str, node: str, left: dict[str, Any], expected: str
+    ) -> None:
+        assert self.after(kind, Route("/a", "/a"), **{node: left})[0].startswith(expected)
+
+    def test_an_image_that_the_registry_lost(self) -> None:
+        world = World(state(**self.NODES))
+        world.send(demand("zenoh"))
+        with pytest.raises(Refused, match="'zenoh-bridge' is in use, but not in registry/images"):
+            rendered(replace(state("", **self.NODES), ledger=world.state.ledger))
+
+
+class TestSchemas:
+    """A field that the client does not read never reaches a commit."""
+
+    @pytest.mark.parametrize(
+        ("kind", "configuration", "expected"),
+        [
+            (
+                "mqtt",
+                {"/**/*": {"ros__parameters": {"broker": {}, "client": {"id": "x"}, "bridge": {}}}},
+                "mqtt of x: /**/*.ros__parameters.bridge: {} has less than 1 property",
+            ),
+            ("zenoh", {"mode": "router"}, 'zenoh of x: "plugins" is a required property'),
+            ("ros", {"version": "v4.0"}, 'ros of x: version: "v5.0" was expected'),
+        ],
+    )
+    def test_it_is_told(self, kind: str, configuration: dict[str, Any], expected: str) -> None:
+        with pytest.raises(InvalidInput) as invalid:
+            schema.check(kind, configuration, "x")
+        assert expected in [str(found) for found in invalid.value.faults]
+
+    @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
+    def test_a_field_more_anywhere_is_refused(self, kind: str) -> None:
+        nodes = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
+        world = World(state(**nodes))
+        world.send(demand(kind))
+        for data in world.clients().values():
+            (text,) = data.values()
+            whole = yaml.safe_load(text)
+            schema.check(kind, whole, "x")
+            for spot in _mappings(whole):
+                spot["surplus"] = 1
+                with pytest.raises(InvalidInput):
+                    schema.check(kind, whole, "x")
+                del spot["surplus"]
+
+
+def _mappings(value: Any) -> list[dict[str, Any]]:
+    if isinstance(value, dict):
+        return [value, *(found for item in value.values() for found in _mappings(item))]
+    if isinstance(value, list):
+        return [found for item in value for found in _mappings(item)]
+    return []

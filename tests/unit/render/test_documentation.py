@@ -1,0 +1,58 @@
+"""The example of docs/connections.md, played as it stands there."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import yaml
+from asking import Books, skeleton
+
+from generator.demand import carriers
+from generator.demand.route import RouteOptions
+
+PAGE = (Path(__file__).parents[3] / "docs" / "connections.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+
+
+def titled() -> dict[str, str]:
+    """Return the blocks that start with the path of the file they are."""
+    found = {}
+    for block in blocks("yaml"):
+        title, _, text = block.partition("\n")
+        if title.startswith("# "):
+            found[title.removeprefix("# ")] = text
+    return found
+
+
+def test_the_example_gives_what_the_page_says() -> None:
+    files = titled()
+    more = files.pop("registry/images.yaml, one more")
+    request = yaml.safe_load(files.pop("request.yaml"))
+    images = {"registry/images.yaml": skeleton()["registry/images.yaml"] + more}
+    books = Books({**files, **images})
+    decision = books.send(request)
+
+    clients = books.objects("ConfigMap")
+    (bridge,) = blocks("json")
+    assert json.loads(clients["zenoh-vehicle00"]["data"]["config.json5"]) == json.loads(bridge)
+    (warning,) = blocks("text")
+    assert decision.warnings == (warning.strip(),)
+    (station,) = (item for name, item in clients.items() if "-source-" in name)
+    parameters = yaml.safe_load(station["data"]["params.yaml"])["/**/*"]["ros__parameters"]
+    assert parameters["bridge"]["ros2mqtt"]["ros_topics"] == ["/warnings"]
+    assert parameters["broker"]["tls"]["enabled"] is True
+
+
+def test_every_field_of_a_route_is_explained_with_the_types_that_honour_it() -> None:
+    rows = re.findall(r"^\| `(\w+)`[^|]*\|[^|]*\| ([^|]*) \|$", PAGE, re.MULTILINE)
+    told = {name: row for name, row in rows if name in RouteOptions.model_fields}
+    assert told.keys() == RouteOptions.model_fields.keys()
+    for kind, options in carriers.HONOURED.items():
+        label = {"MQTT": "MQTT", "ZENOH": "Zenoh", "ROS": "ROS"}[kind.name]
+        listed = {name for name, row in told.items() if label in row and name != "type"}
+        assert listed == options
