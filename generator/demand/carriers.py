@@ -72,12 +72,13 @@ def choice(asked: ConnectionDemand, catalog: Catalog) -> ConnectionType:
 
 def none_fits(asked: ConnectionDemand, catalog: Catalog) -> Fault:
     """Say of each type what keeps it from carrying a connection."""
-    reasons = "; ".join(
-        f"{kind.name}: {found.message}"
-        for kind in PREFERENCE
-        for found in [next(obstacles(kind, asked, catalog))]
-    )
-    return fault("type", f"is open, and nothing can carry it. {reasons}", code=_UNCARRIED)
+    reasons = []
+    for kind in PREFERENCE:
+        found = next(obstacles(kind, asked, catalog))
+        place = "" if found.field == "type" else f"{found.field} "
+        reasons.append(f"{kind.name}: {place}{found.message}")
+    message = f"is open, and nothing can carry it. {'; '.join(reasons)}"
+    return fault("type", message, code=_UNCARRIED)
 
 
 def obstacles(kind: ConnectionType, asked: ConnectionDemand, catalog: Catalog) -> Iterator[Fault]:

@@ -46,9 +46,7 @@ class Route:
     def options(self) -> dict[str, Any]:
         """Return what is not as by default, besides the two names."""
         return {
-            item.name: getattr(self, item.name)
-            for item in fields(self)
-            if item.name not in ("source", "target") and getattr(self, item.name) != item.default
+            name: value for name, default in _DEFAULTS if (value := getattr(self, name)) != default
         }
 
     @property
@@ -64,6 +62,11 @@ class Route:
     def ends(self, source: str, target: str) -> tuple[str, str]:
         """Return the nodes that messages come from and arrive at, of a connection's two ends."""
         return (target, source) if self.reverse else (source, target)
+
+
+_DEFAULTS = tuple(
+    (item.name, item.default) for item in fields(Route) if item.name not in ("source", "target")
+)
 
 
 def _message_type(value: str) -> str:
@@ -152,13 +155,11 @@ def differences(one: Route, other: Route) -> Iterator[tuple[str, object, object]
 
     A message type that is not said contradicts none.
     """
-    for item in fields(Route):
-        first, second = getattr(one, item.name), getattr(other, item.name)
-        if item.name in ("source", "target") or first == second:
+    for name, _ in _DEFAULTS:
+        first, second = getattr(one, name), getattr(other, name)
+        if first == second or (name == "type" and not (first and second)):
             continue
-        if item.name == "type" and not (first and second):
-            continue
-        yield item.name, _written(first), _written(second)
+        yield name, _written(first), _written(second)
 
 
 def _written(value: object) -> str:

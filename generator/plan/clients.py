@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Literal
 
@@ -160,8 +161,9 @@ def _ros_end(ledger: Ledger, catalog: Catalog, key: EndKey, topics: dict[str, Ro
         raise _stuck(key.connection, "finds no end with a wan address any more; restore it")
     address = _address(key.connection, listener)
     for other in ledger.at(ConnectionType.ROS, listener.id):
-        taken = other != key.connection and _listener(ledger.connection(other)[0], catalog)
-        if taken and taken.id == listener.id and _address(other, listener) == address:
+        if other == key.connection or _address(other, listener) != address:
+            continue
+        if _listener(ledger.connection(other)[0], catalog) is listener:
             raise _stuck(
                 key.connection,
                 f"would listen on port {address.port} of '{listener.id}', as '{other}' does; use "
@@ -201,8 +203,13 @@ def _address(connection: str, listener: Node) -> Address:
     wan = listener.wan
     assert wan is not None  # noqa: S101 - that makes it the listener
     ports = wan.last_port - wan.first_port + 1
-    port = wan.first_port + int(naming.digest("port", connection), 16) % ports
-    return Address(wan.host, port, wan.transport)
+    return Address(wan.host, wan.first_port + _number(connection) % ports, wan.transport)
+
+
+@lru_cache(maxsize=65_536)
+def _number(connection: str) -> int:
+    """Return a number of a connection's id; kept, for all that share a node are compared."""
+    return int(naming.digest("port", connection), 16)
 
 
 def bridge(ledger: Ledger, catalog: Catalog, key: BridgeKey) -> Bridge | None:

@@ -133,8 +133,9 @@ def _described(old: Release | None, new: Release | None, stood: bool) -> Release
 
 def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
     before, after = _facts(old), _facts(new)
-    gone = [f"- {fact}" for fact in before if fact not in after]
-    come = [f"+ {fact}" for fact in after if fact not in before]
+    known, wanted = frozenset(before), frozenset(after)
+    gone = [f"- {fact}" for fact in before if fact not in wanted]
+    come = [f"+ {fact}" for fact in after if fact not in known]
     return (*gone, *come)
 
 

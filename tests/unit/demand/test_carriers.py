@@ -95,9 +95,9 @@ class TestAutomaticChoice:
     def test_where_nothing_can_carry_it_each_is_told(self) -> None:
         assert faults(state("", brokers=False), demand()) == [
             "connections[0].type: is open, and nothing can carry it. ZENOH: 2 (ZENOH) needs an "
-            "image 'zenoh-bridge'; add it to registry/images.yaml; MQTT: is open, and no broker "
-            "runs on 'edge' or 'vehicle00'; inventory/brokers.yaml has none; add one there; ROS: "
-            "0 (ROS) needs an image 'dds-router'; add it to registry/images.yaml"
+            "image 'zenoh-bridge'; add it to registry/images.yaml; MQTT: broker is open, and no "
+            "broker runs on 'edge' or 'vehicle00'; inventory/brokers.yaml has none; add one there; "
+            "ROS: 0 (ROS) needs an image 'dds-router'; add it to registry/images.yaml"
         ]
 
     def test_what_stands_keeps_its_type(self) -> None:
