@@ -2,23 +2,20 @@
 
 ``tests/golden/<case>/requests/*.yaml`` are played in order; after each, everything below
 ``clusters/`` and ``ledger/`` stands in ``expected/<request>/``, as real files that a reviewer and
-`kubectl` can read. A case may lay files over the skeleton's in ``state-repo/``. A request that says
-more of topics than the reference's message can is written as :mod:`tests.demanding` takes it.
+`kubectl` can read. A case may lay files over the skeleton's in ``state-repo/``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from generator import yamlio
 from generator.catalog.catalog import CONFIG_ROOTS, load
 from generator.decision import State, decide, rendered
 from generator.ledger.ledger import Ledger
 from generator.staterepo import layout
-from tests import demanding
 
 HERE = Path(__file__).parent
 EXPERIMENT = HERE.parent.parent / "examples" / "experiment"
@@ -55,20 +52,11 @@ def play(case: str) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield (request name, all generated files) after each request."""
     state, world = start(case)
     for file in requests_of(case):
-        state, changed = _decided(state, yamlio.load(file.read_text()), world)
-        for path, text in changed.items():
+        decision = decide(state, yamlio.load(file.read_text()), NOW, world.get)
+        state = decision.state
+        for path, text in decision.files.items():
             if text is None:
                 del world[path]
             else:
                 world[path] = text
         yield file.stem, dict(world)
-
-
-def _decided(
-    state: State, asked: dict[str, Any], world: Mapping[str, str]
-) -> tuple[State, Mapping[str, str | None]]:
-    if any("topics" in item for item in asked.get("connections", [])):
-        after, made = demanding.decide(state, asked, NOW, world.get)
-        return after, made.files
-    decision = decide(state, asked, NOW, world.get)
-    return decision.state, decision.files

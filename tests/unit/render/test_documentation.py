@@ -32,7 +32,7 @@ def titled() -> dict[str, str]:
 def test_the_example_gives_what_the_page_says() -> None:
     files = titled()
     more = files.pop("registry/images.yaml, one more")
-    request = yaml.safe_load(files.pop("request.yaml"))
+    request = yaml.safe_load(files.pop("demand.yaml"))
     images = {"registry/images.yaml": skeleton()["registry/images.yaml"] + more}
     books = Books({**files, **images})
     decision = books.send(request)
