@@ -194,7 +194,6 @@ def test_a_push_becomes_a_pod_changes_and_goes(domain: Domain) -> None:
     files = {
         "clusters/edge/config.yaml": config("one"),
         "clusters/edge/deployment.yaml": deployment("edge"),
-        "elsewhere/broken.yaml": "outside of the sparse checkout",
     }
     domain.create(files)
     domain.kube.wait("the pod to be ready", lambda: running_on(domain.pods()) == {"edge"})
@@ -314,7 +313,7 @@ def test_a_part_that_dies_is_named_with_its_log(rig: Rig) -> None:
         pytest.skip("the parts of an existing cluster are not ours to kill")
     os.kill(rig.pids()["kwok"], signal.SIGKILL)
     with pytest.raises(RigError) as caught:
-        rig.kube.wait("what never comes", lambda: None, timeout=20)
+        rig.kube.wait("what never comes", lambda: None)
     assert str(caught.value).startswith("kwok: ended with -9 after ")
     assert f"{rig.log('kwok')} ends with:\n" in str(caught.value)
     rig.restart("kwok")
@@ -382,7 +381,7 @@ def test_nothing_outlives_a_killed_test_run(tmp_path: Path) -> None:
         run.wait()
         run.stdout.close()
     assert len(pids) > 8
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while alive := [name for name, pid in pids.items() if Path(f"/proc/{pid}").exists()]:
         assert time.monotonic() < deadline, alive
         time.sleep(0.1)

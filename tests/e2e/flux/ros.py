@@ -47,7 +47,7 @@ class Sent:
         """The commit that the result names."""
         return self.message.splitlines()[0].split()[-1]
 
-    def hears(self, stage: str, timeout: float = 10.0) -> None:
+    def hears(self, stage: str, timeout: float = 60.0) -> None:
         """Wait until a stage is told."""
         deadline = time.monotonic() + timeout
         while stage not in self.stages:

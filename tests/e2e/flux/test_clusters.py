@@ -14,7 +14,7 @@ from . import expected
 from .conftest import CLUSTER, NAMESPACE, MakeWorld
 from .expected import NODES, STANDING, STEPS, VEHICLES
 from .relay import Relay
-from .view import Domain
+from .view import SOURCE, Domain
 from .world import World
 
 FLEET = "vehicles"
@@ -76,6 +76,18 @@ def test_each_cluster_gets_what_its_own_nodes_run(world: World) -> None:
     assert here.lines() == there.lines() == STANDING
 
 
+def test_a_cluster_fetches_its_own_part_and_the_charts(world: World, rig: Rig) -> None:
+    if rig.existing:
+        pytest.skip("the artifacts of an existing cluster are not reached from here")
+    charts = "appdefs/object-detection-fusion/charts/"
+    for cluster, domain in world.domains.items():
+        part = f"clusters/{cluster}/{NAMESPACE}/"
+        files = domain.fetched_files()
+        assert f"{part}_domain.yaml" in files
+        assert f"{charts}object-fusion/Chart.yaml" in files
+        assert [file for file in files if not file.startswith((part, charts))] == []
+
+
 def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(
     world: World, rig: Rig, link: Relay
 ) -> None:
@@ -94,7 +106,7 @@ def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(
         for domain in (here, there):
             domain.wake()
         here.wait_lines(expected.after(step, OTHERS))
-    there.kube.wait("the cut to be noticed", lambda: there.trouble("GitRepository", "demandops"))
+    there.kube.wait("the cut to be noticed", lambda: there.trouble("GitRepository", SOURCE) or None)
     assert there.lines() == expected.after(1, VEHICLES)
     assert pod_uids(there) == pods, "what runs there goes on"
     link.mend()

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
 
 from . import expected
@@ -19,6 +21,7 @@ from .world import World
 
 NEIGHBOUR = "neighbour"
 FILE = "clusters/c-its/perception/edge/foreign.yaml"
+BASE = "clusters/c-its/perception/foreign/kustomization.yaml"
 _RBAC = "rbac.authorization.k8s.io"
 
 
@@ -40,9 +43,9 @@ Slip = Callable[..., None]
 def slip_in(world: World, neighbour: Domain) -> Iterator[Slip]:
     """Commit manifests to the domain's folder and wait until Flux has tried them."""
 
-    def push(*manifests: dict[str, Any]) -> None:
+    def push(*manifests: dict[str, Any], file: str = FILE) -> None:
         text = "\n---\n".join(json.dumps(manifest) for manifest in manifests)
-        commit = world.push({FILE: text})
+        commit = world.push({file: text})
         world.domain.wake()
         world.domain.wait_attempted(commit)
 
@@ -53,8 +56,8 @@ def slip_in(world: World, neighbour: Domain) -> Iterator[Slip]:
 def take_out(world: World) -> None:
     """Take the file out again, where nobody has yet, and wait until Flux goes on."""
     commit = world.tip()
-    if FILE in world.person.git("ls-files").split():
-        commit = world.push({FILE: None})
+    if there := {FILE, BASE} & set(world.person.git("ls-files").split()):
+        commit = world.push(dict.fromkeys(there))
     world.domain.wake()
     world.domain.wait_applied(commit)
 
@@ -135,6 +138,34 @@ def test_no_way_around_the_account(
     assert neighbour.inventory() == untouched
 
 
+def test_a_reference_does_not_leave_the_namespace(
+    world: World, neighbour: Domain, slip_in: Slip
+) -> None:
+    domain, here = world.domain, world.domain.inventory()
+    chart = {"kind": "HelmChart", "name": "object-detection-0.1.0", "namespace": NEIGHBOUR}
+    manifest = release(
+        serviceAccountName="demandops", targetNamespace=domain.namespace, chartRef=chart
+    )
+    slip_in(manifest)
+    wait_refused(domain, "cross-namespace references are not allowed", manifest)
+    take_out(world)
+    domain.wait_inventory(here)
+
+
+def test_a_base_is_not_fetched_from_elsewhere(
+    world: World, rig: Rig, neighbour: Domain, slip_in: Slip, tmp_path: Path
+) -> None:
+    domain, here, name = world.domain, world.domain.inventory(), f"elsewhere-{world.name}"
+    base = {"resources": ["foreign.yaml"]}
+    files = {"kustomization.yaml": base, "foreign.yaml": config("foreign", domain.namespace)}
+    Clone(rig.push_url(name), tmp_path / "elsewhere").push(
+        {file: json.dumps(content) for file, content in files.items()}
+    )
+    slip_in({"resources": [f"{rig.git_url(name)}?ref=main"]}, file=BASE)
+    wait_refused(domain, "fs-security-constraint")
+    assert domain.inventory() == here
+
+
 def wait_refused(domain: Domain, why: str, manifest: dict[str, Any] | None = None) -> None:
     """Wait until the Kustomization, or the release that it made, says that it may not."""
     looks = [("Kustomization", domain.name)]
@@ -144,4 +175,4 @@ def wait_refused(domain: Domain, why: str, manifest: dict[str, Any] | None = Non
     def refused() -> bool:
         return any(why in domain.trouble(kind, name) for kind, name in looks)
 
-    domain.kube.wait(f"'{why}' to be reported", refused, 15)
+    domain.kube.wait(f"'{why}' to be reported", refused)

@@ -5,7 +5,9 @@ It reads the API and asks Flux to look; it changes nothing that Flux or a releas
 
 from __future__ import annotations
 
+import tarfile
 import time
+import urllib.request
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -94,6 +96,15 @@ class Domain:
         """The commit that the source has fetched."""
         return _commit(self._status("GitRepository", SOURCE).get("artifact", {}).get("revision"))
 
+    def fetched_files(self) -> list[str]:
+        """The paths of what the source has fetched, where its address can be reached from here."""
+        url = self._status("GitRepository", SOURCE)["artifact"]["url"]
+        with (
+            urllib.request.urlopen(url, timeout=60) as answer,  # noqa: S310 - the source's own
+            tarfile.open(fileobj=answer, mode="r|gz") as archive,
+        ):
+            return [member.name for member in archive if member.isfile()]
+
     def trouble(self, kind: str, name: str) -> str:
         """Why an object is not ready; empty where it is or has not said yet."""
         conditions = self._status(kind, name).get("conditions") or []
@@ -106,17 +117,17 @@ class Domain:
         """Ask the source to look now; its new artifact wakes the Kustomization."""
         self.kube.reconcile("GitRepository", SOURCE, self.namespace)
 
-    def wait_fetched(self, commit: str, timeout: float = 30.0) -> float:
+    def wait_fetched(self, commit: str, timeout: float = 60.0) -> float:
         """Wait until the source has fetched a commit; returns when it was seen."""
         self._wait_for(f"{commit[:10]} to be fetched", lambda: self.fetched() == commit, timeout)
         return time.monotonic()
 
-    def wait_applied(self, commit: str, timeout: float = 30.0) -> float:
+    def wait_applied(self, commit: str, timeout: float = 60.0) -> float:
         """Wait until the Kustomization has applied a commit; returns when it was seen."""
         self._wait_for(f"{commit[:10]} to be applied", lambda: self.applied() == commit, timeout)
         return time.monotonic()
 
-    def wait_attempted(self, commit: str, timeout: float = 30.0) -> None:
+    def wait_attempted(self, commit: str, timeout: float = 60.0) -> None:
         """Wait until the Kustomization has tried a commit, whatever came of it."""
 
         def attempted() -> bool:
@@ -125,11 +136,11 @@ class Domain:
 
         self._wait_for(f"{commit[:10]} to be tried", attempted, timeout)
 
-    def wait_lines(self, wanted: frozenset[str], timeout: float = 45.0) -> float:
+    def wait_lines(self, wanted: frozenset[str], timeout: float = 60.0) -> float:
         """Wait until there is exactly what is wanted; returns when it was seen."""
         return self._wait_same(self.lines, wanted, timeout)
 
-    def wait_inventory(self, wanted: frozenset[str], timeout: float = 45.0) -> None:
+    def wait_inventory(self, wanted: frozenset[str], timeout: float = 60.0) -> None:
         """Wait until the namespace holds exactly what it held when `inventory` was asked."""
         self._wait_same(self.inventory, wanted, timeout)
 
@@ -144,7 +155,7 @@ class Domain:
                 seen, since = now, time.monotonic()
             return time.monotonic() - since > seconds
 
-        self.kube.wait("the releases to come to rest", quiet, 30)
+        self.kube.wait("the releases to come to rest", quiet, 60)
         return seen
 
     def wait_releases_ready(self) -> None:

@@ -30,7 +30,7 @@ from .timing import Times
 from .view import SOURCE, Domain
 
 _READY = "taking demands on"
-_START_S = 30.0
+_START_S = 60.0
 
 
 class Generator:

@@ -135,7 +135,7 @@ class Rig:
             githttp.init_bare(path)
         return path
 
-    def add_nodes(self, node_ids: Iterable[str], timeout: float = 30.0) -> list[str]:
+    def add_nodes(self, node_ids: Iterable[str], timeout: float = 60.0) -> list[str]:
         """Make fake nodes with these `node_id` labels, wait until Ready; returns their names."""
         manifests = [kwok.manifest(node_id) for node_id in node_ids]
         names = [manifest["metadata"]["name"] for manifest in manifests]

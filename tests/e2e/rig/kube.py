@@ -161,7 +161,7 @@ class Kube:
         what = f"{kind} {namespace}/{name} to go"
         self.wait(what, lambda: self.get(kind, name, namespace, version) is None, timeout)
 
-    def install_crds(self, files: Iterable[Path], timeout: float = 30.0) -> None:
+    def install_crds(self, files: Iterable[Path], timeout: float = 60.0) -> None:
         """Apply CRDs and wait until the server serves them."""
         crds = _documents([path.read_text() for path in files])
         self.apply(*crds)
