@@ -60,6 +60,17 @@ class Withdrawn(DemandOpsError):
     """A demand that its requester took back before it was committed."""
 
 
+class NotReached(DemandOpsError):
+    """A demand that is booked and published, and was not as far as asked in time.
+
+    ``level`` is how far it was to be: reconciled or healthy.
+    """
+
+    def __init__(self, level: str, message: str) -> None:
+        super().__init__(message)
+        self.level = level
+
+
 class ShuttingDown(DemandOpsError):
     """A demand that came after the generator was told to stop."""
 

@@ -51,12 +51,17 @@ class DemandError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What came of a goal: ``outcome`` booked, released or unchanged; ``lease_s`` 0 for no end."""
+    """What came of a goal.
+
+    ``outcome`` is booked, released or unchanged, ``lease_s`` 0 for no end, ``reached`` pushed,
+    reconciled or healthy.
+    """
 
     outcome: str
     commit: str
     lease_s: float
     warnings: tuple[str, ...]
+    reached: str
 
 
 class DemandClient:
@@ -126,6 +131,7 @@ class DemandClient:
         connections: Iterable[Mapping[str, Any]] = (),
         *,
         lease: float | str | None = None,
+        answer: str = "pushed",
         request: str = "",
         told: Told = lambda stage, text: None,
     ) -> Answer:
@@ -134,6 +140,7 @@ class DemandClient:
         Args:
             demand: the demand's id.
             applications, connections: as in a YAML document of the kind ``Demand``.
+            answer: when to return: pushed, reconciled or healthy.
             lease: seconds, or a duration like ``10m``; the access domain's where left out.
             request: free text for the commit.
             told: called with each stage.
@@ -145,6 +152,7 @@ class DemandClient:
         data: dict[str, Any] = {
             "demand": demand,
             "request": request,
+            "answer": answer,
             "applications": list(applications),
             "connections": list(connections),
         }
@@ -187,7 +195,8 @@ class DemandClient:
         if answer.status != GoalStatus.STATUS_SUCCEEDED:
             raise DemandError(result.code or "aborted", result.message)
         lease_s = result.lease.sec + result.lease.nanosec / 1e9
-        return Answer(result.outcome, result.commit, lease_s, tuple(result.warnings))
+        warnings = tuple(result.warnings)
+        return Answer(result.outcome, result.commit, lease_s, warnings, result.reached)
 
     def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
         done = Event()

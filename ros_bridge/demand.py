@@ -91,6 +91,7 @@ def _told(answer: Answer, output: str) -> None:
             {
                 "outcome": answer.outcome,
                 "commit": answer.commit,
+                "reached": answer.reached,
                 "lease": answer.lease_s or None,
                 "warnings": list(answer.warnings),
             }
@@ -107,7 +108,7 @@ def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.set())
     client.requesters = tuple(data.get("requesters", ()))
-    options = {name: data[name] for name in ("lease", "request") if name in data}
+    options = {name: data[name] for name in ("lease", "request", "answer") if name in data}
     with client.demand(
         str(data.get("demand", "")),
         data.get("applications", ()),

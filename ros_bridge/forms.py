@@ -11,10 +11,20 @@ from application_manager_interfaces.action import DeploymentRequest
 from builtin_interfaces.msg import Duration
 from demandops_interfaces.action import Demand
 
+from generator.cluster.health import Level
 from generator.decision import explain
-from generator.errors import DemandOpsError, InvalidInput, QueueFull, ShuttingDown, Withdrawn
+from generator.errors import (
+    DemandOpsError,
+    InvalidInput,
+    NotReached,
+    QueueFull,
+    ShuttingDown,
+    Withdrawn,
+)
 from generator.service import Receipt
 from ros_bridge.convert import as_data, demand_data
+
+LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
 
 
 class Form(Protocol):
@@ -28,11 +38,14 @@ class Form(Protocol):
     def name(self, goal: Any) -> str:  # noqa: ANN401
         """Return what the log calls a goal."""
 
+    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
+        """Return when a goal is to be answered, or nothing where it cannot say."""
+
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         """Return the feedback for a stage."""
 
-    def result(self, goal: Any, outcome: Receipt | BaseException) -> Any:  # noqa: ANN401
-        """Return the result for what came of a goal."""
+    def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
+        """Return the result for what came of a goal, and how far it is."""
 
 
 class DeploymentRequestForm:
@@ -48,11 +61,15 @@ class DeploymentRequestForm:
         """Return the request's id."""
         return str(goal.id)
 
+    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
+        """Return nothing: the message has no field for it."""
+        return None
+
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         """Return the stage as text."""
         return DeploymentRequest.Feedback(message=text)
 
-    def result(self, goal: Any, outcome: Receipt | BaseException) -> Any:  # noqa: ANN401
+    def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
         """Return ``<outcome>: <commit>``, or ``<code>: <field>: <remedy>``."""
         return DeploymentRequest.Result(message=_text(outcome))
 
@@ -70,11 +87,15 @@ class DemandForm:
         """Return the demand's id."""
         return str(goal.demand_id)
 
+    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
+        """Return the level that the goal asks for."""
+        return LEVELS[goal.answer] if goal.answer < len(LEVELS) else None
+
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         """Return stage and text."""
         return Demand.Feedback(stage=stage, message=text)
 
-    def result(self, goal: Any, outcome: Receipt | BaseException) -> Any:  # noqa: ANN401
+    def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
         """Return code and text, and for a demand that was honoured what it came to."""
         result = Demand.Result(code=_code(outcome), message=_text(outcome))
         if isinstance(outcome, Receipt):
@@ -82,10 +103,7 @@ class DemandForm:
             result.commit = outcome.commit
             result.lease = Duration(sec=outcome.lease_s or 0)
             result.warnings = [*outcome.warnings, *(f"not held: {x}" for x in outcome.not_held)]
-            if goal.answer != Demand.Goal.ANSWER_PUSHED:
-                result.warnings.append(
-                    "answered at pushed: this node has no access to the clusters"
-                )
+            result.reached = reached
         return result
 
 
@@ -109,6 +127,7 @@ def _code(outcome: Receipt | BaseException) -> str:
         return outcome.faults[0].code
     for kind, code in (
         (Withdrawn, "withdrawn"),
+        (NotReached, f"not-{getattr(outcome, 'level', '')}"),
         (ShuttingDown, "shutting-down"),
         (QueueFull, "queue-full"),
         (DemandOpsError, "state-repo"),

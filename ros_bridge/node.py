@@ -10,6 +10,7 @@ from __future__ import annotations
 import uuid
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from threading import Thread
 from typing import Any
@@ -22,7 +23,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.task import Future
 
-from generator.errors import QueueFull, ShuttingDown, Withdrawn
+from generator.cluster.health import Level
+from generator.cluster.status import Status
+from generator.errors import NotReached, QueueFull, ShuttingDown, Withdrawn
 from generator.service import Generator, Receipt
 from ros_bridge.bookkeeping import BookkeepingTopic, answer
 from ros_bridge.forms import DemandForm, DeploymentRequestForm, Form
@@ -37,6 +40,18 @@ DEEP = QoSProfile(
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """When goals are answered: those that cannot say at ``level``, none later than ``timeout_s``.
+
+    ``status`` tells what came of a demand, nothing without access to the clusters.
+    """
+
+    level: Level = "pushed"
+    timeout_s: float = 120.0
+    status: Status | None = None
+
+
 class DemandNode(Node):  # type: ignore[misc]
     """Serves ``DeploymentRequest`` and ``Demand`` for one state repo."""
 
@@ -45,10 +60,12 @@ class DemandNode(Node):  # type: ignore[misc]
         generator: Generator,
         action_name: str,
         demand_action_name: str,
+        answers: Answers,
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__("demandops", **options)
         self._generator = generator
+        self._answers = answers
         self._open: dict[str, ServerGoalHandle] = {}
         self._events: deque[Callable[[], None]] = deque()
         self._stopping = False
@@ -142,17 +159,59 @@ class DemandNode(Node):  # type: ignore[misc]
             lambda future: self._from_worker(partial(done.set_result, future))
         )
         outcome = (await done).exception() or ticket.future.result()
-        return self._finish(form, handle, outcome)
+        level = form.level(handle.request) or self._answers.level
+        if not isinstance(outcome, Receipt) or level == "pushed":
+            return self._finish(form, handle, outcome)
+        problem = self._unfollowed(outcome)
+        if problem:
+            outcome = replace(outcome, warnings=(*outcome.warnings, problem))
+            return self._finish(form, handle, outcome)
+        return self._finish(form, handle, await self._followed(form, handle, outcome, level), level)
+
+    def _unfollowed(self, receipt: Receipt) -> str:
+        """Return why it cannot be told what comes of a demand; empty where it can."""
+        if self._answers.status is None:
+            return "answered at pushed: this node has no access to the clusters"
+        problem = self._answers.status.reaches(target.place for target in receipt.targets)
+        return f"answered at pushed: {problem}" if problem else ""
+
+    async def _followed(
+        self, form: Form, handle: ServerGoalHandle, receipt: Receipt, level: Level
+    ) -> Receipt | NotReached:
+        """Wait until a demand is as far as asked, or its time is over."""
+        assert self._answers.status is not None  # noqa: S101 - the caller has looked
+        done = Future(executor=self.executor)
+        followed = self._answers.status.follow(
+            receipt.commit,
+            receipt.targets,
+            level,
+            self._answers.timeout_s,
+            lambda stage, text: self._from_worker(
+                partial(self._feedback, form, handle, stage, text)
+            ),
+        )
+        followed.add_done_callback(
+            lambda future: self._from_worker(partial(done.set_result, future.result()))
+        )
+        health = await done
+        if health.reaches(level):
+            return receipt
+        where = f"{health.object}: " if health.object else ""
+        return NotReached(level, f"{where}{health.reason}; it is booked in {receipt.commit}")
 
     def _feedback(self, form: Form, handle: ServerGoalHandle, stage: str, text: str) -> None:
         if handle.is_active:
             handle.publish_feedback(form.feedback(stage, text))
 
     def _finish(
-        self, form: Form, handle: ServerGoalHandle, outcome: Receipt | BaseException
+        self,
+        form: Form,
+        handle: ServerGoalHandle,
+        outcome: Receipt | BaseException,
+        reached: Level = "pushed",
     ) -> Any:  # noqa: ANN401
         self._open.pop(_operation(handle), None)
-        result = form.result(handle.request, outcome)
+        result = form.result(outcome, reached)
         told = f"goal '{form.name(handle.request)}': "
         if isinstance(outcome, Receipt):
             handle.succeed()

@@ -21,10 +21,12 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from generator.cli.output import errors, progress
-from generator.cluster import wake
+from generator.cluster import access, wake
+from generator.cluster.status import Status
 from generator.service import Generator
 from generator.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
-from ros_bridge.node import DemandNode
+from ros_bridge.forms import LEVELS
+from ros_bridge.node import Answers, DemandNode
 
 _LEVELS = ("debug", "info", "warn", "error", "fatal")
 _POLL_S = 0.02
@@ -60,20 +62,22 @@ class _ToRos(logging.Handler):
     "parameter state_repo [env: DEMANDOPS_STATE_REPO].",
 )
 @click.option(
-    "--wake",
-    "wake_file",
-    envvar="DEMANDOPS_WAKE",
+    "--clusters",
+    "access_file",
+    envvar="DEMANDOPS_CLUSTERS",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Which clusters to wake after a push, and how; see docs/flux.md [env: DEMANDOPS_WAKE].",
+    help="How the clusters are reached, to wake them after a push and to hear what came of a "
+    "demand; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
 )
 @click.pass_context
-def serve(ctx: click.Context, state_repo: str | None, wake_file: Path | None) -> None:
+def serve(ctx: click.Context, state_repo: str | None, access_file: Path | None) -> None:
     """Run the ROS 2 node that takes demands over the actions DeploymentRequest and Demand.
 
     Everything after --ros-args goes to ROS. Parameters: action_name (of DeploymentRequest),
-    demand_action_name, state_repo, log_level (debug, info, warn, error or fatal). Stop it with
-    Ctrl-C or SIGTERM: it finishes what it has in hand.
+    demand_action_name, answer (of DeploymentRequest: pushed, reconciled or healthy), answer_timeout
+    (seconds), state_repo, log_level (debug, info, warn, error or fatal). Stop it with Ctrl-C or
+    SIGTERM: it finishes what it has in hand.
     """
     ros_args = list(ctx.args)
     if ros_args and ros_args[0] != "--ros-args":
@@ -84,10 +88,17 @@ def serve(ctx: click.Context, state_repo: str | None, wake_file: Path | None) ->
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
         settings = _parameters(state_repo)
-        waker = wake.Wake(wake.read(wake_file).clusters if wake_file else {})
+        clusters = access.read(access_file).clusters if access_file else {}
+        waker = wake.Wake(clusters)
         with progress("reading the ledger") as tell:
-            generator = Generator(settings["state_repo"], progress=tell, on_published=waker)
-        _run(generator, settings)
+            generator = Generator(
+                settings["state_repo"],
+                progress=tell,
+                on_published=waker,
+                with_targets=bool(clusters),
+            )
+        status = Status(clusters, generator.includes) if clusters else None
+        _run(generator, settings, status)
         waker.close()
     finally:
         rclpy.try_shutdown()
@@ -102,6 +113,8 @@ def _parameters(state_repo: str | None) -> dict[str, Any]:
             "demand_action_name": probe.declare_parameter(
                 "demand_action_name", DEFAULT_DEMAND_ACTION_NAME
             ).value,
+            "answer": probe.declare_parameter("answer", LEVELS[0]).value,
+            "answer_timeout": probe.declare_parameter("answer_timeout", 120.0).value,
             "state_repo": probe.declare_parameter("state_repo", state_repo or "").value,
             "log_level": probe.declare_parameter("log_level", "info").value,
         }
@@ -112,6 +125,10 @@ def _parameters(state_repo: str | None) -> dict[str, Any]:
             "which state repo? give --state-repo URL_OR_DIR, set DEMANDOPS_STATE_REPO, or the ROS "
             "parameter state_repo"
         )
+    if values["answer"] not in LEVELS:
+        raise click.UsageError(
+            f"parameter answer is '{values['answer']}'; it takes {', '.join(LEVELS)}"
+        )
     if values["log_level"] not in _LEVELS:
         raise click.UsageError(
             f"parameter log_level is '{values['log_level']}'; it takes {', '.join(_LEVELS)}"
@@ -119,8 +136,13 @@ def _parameters(state_repo: str | None) -> dict[str, Any]:
     return values
 
 
-def _run(generator: Generator, settings: dict[str, Any]) -> None:
-    node = DemandNode(generator, settings["action_name"], settings["demand_action_name"])
+def _run(generator: Generator, settings: dict[str, Any], status: Status | None) -> None:
+    node = DemandNode(
+        generator,
+        settings["action_name"],
+        settings["demand_action_name"],
+        Answers(settings["answer"], settings["answer_timeout"], status),
+    )
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
         # read when the node starts; a change of them now would do nothing, so none is taken
@@ -138,18 +160,23 @@ def _run(generator: Generator, settings: dict[str, Any]) -> None:
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
     signals.wait()
-    _drain(executor, node, generator)
+    _drain(executor, node, generator, status)
     executor.shutdown(timeout_sec=1)
     spinner.join(5)
     node.close()
     node.destroy_node()
 
 
-def _drain(executor: SingleThreadedExecutor, node: DemandNode, generator: Generator) -> None:
+def _drain(
+    executor: SingleThreadedExecutor, node: DemandNode, generator: Generator, status: Status | None
+) -> None:
     """Finish what is in hand: goals under way get their results before the node goes."""
     node.stop_accepting()
     node.get_logger().info(f"stopping: finishing {node.open_goals} goals in hand")
     finished = generator.stop()
+    published = finished.result()
+    if status is not None:
+        status.close()  # goals that wait for their clusters are answered with what is known
     while node.open_goals:
         time.sleep(_POLL_S)
     for _ in range(2):  # results leave by tasks of the executor: let those in it pass
@@ -157,7 +184,7 @@ def _drain(executor: SingleThreadedExecutor, node: DemandNode, generator: Genera
         executor.create_task(passed.set)
         passed.wait(_TASK_S)
     time.sleep(_FLUSH_S)  # and clients ask for them
-    if not finished.result():
+    if not published:
         node.get_logger().warning("the outbox is not empty; it is taken up at the next start")
 
 

@@ -15,12 +15,13 @@ from generator.catalog.inventory import BrokersFile, ClustersFile, NodesFile
 from generator.catalog.policy import AccessDomainsFile
 from generator.catalog.registry import ChartsFile, ImagesFile
 from generator.cli.output import console
-from generator.cluster.wake import WakeFile
+from generator.cluster.access import AccessFile
 from generator.demand.own import DemandGoal
 from generator.demand.wire import WireGoal
 
 _SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "access-domains": (AccessDomainsFile, "policy/access-domains.yaml"),
+    "cluster-access": (AccessFile, "the file of `demandops serve --clusters`"),
     "application": (ApplicationDefinition, "appdefs/<name>/appdef.yaml"),
     "brokers": (BrokersFile, "inventory/brokers.yaml"),
     "charts": (ChartsFile, "registry/charts.yaml"),
@@ -30,7 +31,6 @@ _SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "images": (ImagesFile, "registry/images.yaml"),
     "nodes": (NodesFile, "inventory/nodes.yaml"),
     "state-repo": (Repository, "demandops.yaml"),
-    "wake": (WakeFile, "the file of `demandops serve --wake`"),
 }
 
 

@@ -1,8 +1,6 @@
 """Waking Flux after a push, so that it fetches at once instead of at its next interval.
 
 Optional, and never in the way: a cluster that does not answer is logged and left to its interval.
-Which clusters, and how each is reached, stands in a file of the operator's that is not part of
-the state repo, for a receiver's URL is a secret.
 """
 
 from __future__ import annotations
@@ -13,14 +11,10 @@ import urllib.error
 import urllib.request
 from collections.abc import Mapping
 from datetime import datetime, timezone
-from pathlib import Path
-from typing import Any, Literal
-
-from pydantic import Field, model_validator
+from typing import Any
 
 from generator.catalog.catalog import Catalog
-from generator.catalog.model import DnsLabel, FileModel, Frozen, parse_file
-from generator.errors import InvalidInput, fault
+from generator.cluster.access import Reached
 from generator.render.flux import domains_in_use
 
 log = logging.getLogger("demandops")
@@ -29,46 +23,11 @@ _TIMEOUT_S = 5.0
 _REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
 
 
-class Reached(Frozen):
-    """How one cluster is woken: through its API, or by the webhook of a Flux Receiver."""
-
-    kubeconfig: Path | None = Field(default=None, strict=False)
-    context: str | None = None
-    receiver: str | None = Field(default=None, pattern=r"^https?://\S+$")
-
-    @model_validator(mode="after")
-    def _one_way(self) -> Reached:
-        if bool(self.kubeconfig) == bool(self.receiver):
-            raise ValueError("needs either kubeconfig or receiver")
-        return self
-
-
-class WakeFile(FileModel):
-    """The operator's file: cluster name → how it is woken."""
-
-    kind: Literal["Wake"]
-    clusters: dict[DnsLabel, Reached]
-
-
-def read(path: Path) -> WakeFile:
-    """Read the operator's file.
-
-    Raises:
-        InvalidInput: with every fault.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise InvalidInput([fault("", f"cannot be read: {reason}").within(str(path))]) from None
-    return parse_file(WakeFile, text, str(path))
-
-
 class Wake:
     """Wakes clusters from a thread of its own; several pushes that come together wake once."""
 
     def __init__(self, clusters: Mapping[str, Reached]) -> None:
-        self._clusters = dict(clusters)
+        self._clusters = {name: reached for name, reached in clusters.items() if reached.wake}
         self._catalog: Catalog | None = None
         self._apis: dict[str, Any] = {}
         self._due = threading.Event()
@@ -127,8 +86,7 @@ class Wake:
 
     def _api(self, name: str, reached: Reached) -> Any:  # noqa: ANN401
         if name not in self._apis:
-            from kubernetes import client, config  # noqa: PLC0415 - half a second; only when used
+            from kubernetes import client  # noqa: PLC0415 - half a second; only when used
 
-            loaded = config.new_client_from_config(str(reached.kubeconfig), reached.context)
-            self._apis[name] = client.CustomObjectsApi(loaded)
+            self._apis[name] = client.CustomObjectsApi(reached.client())
         return self._apis[name]

@@ -33,6 +33,7 @@ class Generator:
         data: Path | None = None,
         queue_limit: int = settings.QUEUE_LIMIT,
         patient: bool = True,
+        with_targets: bool = False,
         progress: Progress = lambda done, total: None,
         on_published: Callable[[Catalog], None] = lambda catalog: None,
     ) -> None:
@@ -43,6 +44,7 @@ class Generator:
             data: where outbox and clone are kept; by default :func:`settings.data_home`.
             queue_limit: how many demands may wait.
             patient: whether to start while the remote is away, from what was fetched last.
+            with_targets: whether receipts say which releases a demand needs.
             progress: told (files read, files in all) while the ledger is loaded.
             on_published: called in the worker thread after every push, with the catalog in force;
                 must return at once.
@@ -57,12 +59,15 @@ class Generator:
         except BaseException:
             self._slot.close()
             raise
+        self._repository = repository
         self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
         self._waiting = Waiting(self._slot.outbox, queue_limit)
         self._watchers = [on_published]
-        self._settler = Settler(repository, snapshot, self._waiting, self._tell_watchers)
+        self._settler = Settler(
+            repository, snapshot, self._waiting, self._tell_watchers, with_targets
+        )
         self._finished: Future[bool] | None = None
         self._stop_lock = threading.Lock()
         for operation in self._waiting.operations:
@@ -100,6 +105,10 @@ class Generator:
             ticket.base = str(self.snapshot.commit)
             self._waiting.add(ticket)
         return ticket
+
+    def includes(self, commit: str, other: str) -> bool:
+        """Tell whether ``commit`` is ``other`` or comes after it; from any thread."""
+        return self._repository.includes(commit, other)
 
     def withdraw(self, operation: str) -> bool:
         """Take a demand back. False once it is committed, or was never known."""

@@ -10,6 +10,7 @@ import random
 import threading
 import uuid
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from typing import TypeAlias
 
@@ -26,6 +27,7 @@ from generator.errors import (
     fault,
 )
 from generator.service.expiry import LeaseClock
+from generator.service.targets import of_decision as targets_of
 from generator.service.throttle import Throttle
 from generator.service.ticket import Receipt, Ticket
 from generator.service.waiting import TAKEN_BACK, Waiting
@@ -60,11 +62,13 @@ class Settler:
         snapshot: Snapshot,
         waiting: Waiting,
         on_published: Callable[[Catalog], None],
+        with_targets: bool,
     ) -> None:
         self.snapshot = snapshot
         self._repository = repository
         self._waiting = waiting
         self._on_published = on_published
+        self._with_targets = with_targets
         self._since_tidy = 0
         self._throttle = Throttle()
         self._clock = LeaseClock()
@@ -205,7 +209,9 @@ class Settler:
             )
             if not self._waiting.hold(ticket):
                 return Withdrawn(TAKEN_BACK)
-            return _commit(line, ticket, decision)
+            before = line.head.state.ledger
+            targets = targets_of(before, decision) if self._with_targets else ()
+            return replace(_commit(line, ticket, decision), targets=targets)
         except InvalidInput as error:
             line.note(ticket.operation, "Refused")
             return error

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from typing import Any, Literal
 
+from generator.cluster.health import Target
 from generator.decision import Outcome
 from generator.errors import Refused, fault
 from generator.staterepo.outbox import Entry
@@ -29,7 +30,8 @@ class Receipt:
     """What came of a demand: the commit that holds it is published and durable.
 
     ``commit`` is the tip where the demand changed nothing. ``lease_s`` is for how many seconds
-    it holds unless it is renewed, nothing where it has no end.
+    it holds unless it is renewed, nothing where it has no end. ``targets`` are the releases that
+    it needs or gave up, where the generator was asked to say so.
     """
 
     operation: str
@@ -39,6 +41,7 @@ class Receipt:
     warnings: tuple[str, ...] = ()
     not_held: tuple[str, ...] = ()
     lease_s: int | None = None
+    targets: tuple[Target, ...] = ()
 
 
 @dataclass(eq=False)

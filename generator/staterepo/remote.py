@@ -85,6 +85,18 @@ class StateRepository(ABC):
             RemoteAway, PushDenied: where it could not be published for another reason.
         """
 
+    def includes(self, commit: str, other: str) -> bool:
+        """Tell whether ``commit`` is ``other`` or comes after it; false for one not known here.
+
+        May be called from any thread: it opens the objects anew.
+        """
+        if commit == other:
+            return True
+        try:
+            return Repository(self.objects.path).descendant_of(commit, other)
+        except (pygit2.GitError, KeyError, ValueError):
+            return False
+
     def give_up(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End what is under way with a remote; nothing where there is none."""
 

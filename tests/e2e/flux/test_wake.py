@@ -1,4 +1,4 @@
-"""What waking Flux is worth: a demand with `--wake`, and one that waits for the next look."""
+"""What waking Flux is worth: a demand with `--clusters`, and one that waits for the next look."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_wake_saves_the_wait_for_the_next_look(
     domain = world.bootstrap(CLUSTER, rig, interval=f"{INTERVAL_S:.0f}s")
     file = wake_file(world.folder, limited(domain, rig.kubeconfig, world.folder))
     took: dict[str, Times] = {}
-    for way, arguments in (("woken", ("--wake", str(file))), ("at the next look", ())):
+    for way, arguments in (("woken", ("--clusters", str(file))), ("at the next look", ())):
         world.generator.start(*arguments)
         took[way] = demanded_right_after_a_look(world, domain)
         world.follow(world.demand(expected.demand(1) | {"shutdown": True}), STANDING)
@@ -56,9 +56,9 @@ def demanded_right_after_a_look(world: World, domain: Domain) -> Times:
 
 def wake_file(folder: Path, kubeconfig: Path) -> Path:
     """What the operator of the generator writes."""
-    file = folder / "wake.yaml"
+    file = folder / "clusters.yaml"
     clusters = {CLUSTER: {"kubeconfig": str(kubeconfig)}}
-    wake = {"apiVersion": "demandops/v1", "kind": "Wake", "clusters": clusters}
+    wake = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": clusters}
     file.write_text(yaml.safe_dump(wake))
     return file
 

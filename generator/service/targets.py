@@ -1,0 +1,48 @@
+"""What a demand is to come to on the clusters: the releases that it needs, or gives up."""
+
+from __future__ import annotations
+
+from generator.cluster.health import Place, Target
+from generator.decision import Decision
+from generator.demand.claim import Subject, SubjectKind
+from generator.demand.request import DemandRequest
+from generator.errors import Refused
+from generator.ledger.ledger import Ledger
+from generator.plan.planner import ReleaseKey, affected, keys_of, plan
+from generator.plan.release import Release, ServiceRelease
+
+
+def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
+    """Return every release that a demand needs, and those that run no more because of it."""
+    after, catalog = decision.state.ledger, decision.state.catalog
+    subjects = [*_asked(decision.request, after), *decision.changes.subjects()]
+    keys: dict[ReleaseKey, None] = {}
+    for subject in dict.fromkeys(subjects):
+        keys |= dict.fromkeys(keys_of(after, catalog, subject))
+    keys |= dict.fromkeys(affected(before, after, catalog, decision.changes.subjects()))
+    found = []
+    for key in keys:
+        new = plan(after, catalog, key)
+        old = None
+        if new is None:
+            try:
+                old = plan(before, catalog, key)
+            except Refused:
+                continue
+        release = new or old
+        if release is not None:
+            found.append(_target(release, wanted=new is not None))
+    return tuple(dict.fromkeys(found))
+
+
+def _asked(request: DemandRequest, ledger: Ledger) -> list[Subject]:
+    subjects = [claim.subject for claim in ledger.of_demand(request.demand)]
+    if request.operation.asks:
+        subjects += [Subject(SubjectKind.APPLICATION, app.id) for app in request.applications]
+        subjects += [Subject(SubjectKind.CONNECTION, one.id) for one in request.connections]
+    return subjects
+
+
+def _target(release: Release, *, wanted: bool) -> Target:
+    place = Place(release.node.cluster, release.domain.name, release.domain.namespace)
+    return Target(place, release.name, isinstance(release, ServiceRelease), wanted)
