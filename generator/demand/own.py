@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 import re
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, PlainValidator
 
+from generator import yamlio
 from generator.catalog.identifiers import absolute
 from generator.catalog.model import Frozen
 from generator.catalog.policy import seconds_of
@@ -78,6 +79,16 @@ class GoalConnection(Frozen):
     topics: list[GoalRoute] = Field(default_factory=list)
 
 
+def _lease_form(value: object) -> object:
+    if value is None or (isinstance(value, str | int) and not isinstance(value, bool)):
+        return value
+    raise ValueError(f"must be a duration like 10m, or whole seconds, not {yamlio.brief(value)}")
+
+
+Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
+"""One validator for all that it may be: pydantic names each member of a union a field."""
+
+
 class DemandGoal(Frozen):
     """A demand. ``lease`` is a duration like ``10m``, or whole seconds."""
 
@@ -87,7 +98,7 @@ class DemandGoal(Frozen):
     demand: str = ""
     request: str = ""
     requesters: list[str] = Field(default_factory=list)
-    lease: str | int | None = None
+    lease: Lease = None
     applications: list[GoalApplication] = Field(default_factory=list)
     connections: list[GoalConnection] = Field(default_factory=list)
 

@@ -147,9 +147,9 @@ def configuration(
         for path in sorted((_APPDEFS / name).rglob("*")):
             if path.is_file():
                 files[f"appdefs/{path.relative_to(_APPDEFS).as_posix()}"] = path.read_text()
-        folder = "appdefs/recorder/charts/recorder"
+        chart = {"folder": "appdefs/recorder/charts/recorder", "version": "0.1.0"}
         overlays += [
-            ("registry/charts.yaml", {"charts": {"recorder": {"folder": folder, "version": "0.1.0"}}}),
+            ("registry/charts.yaml", {"charts": {"recorder": chart}}),
             ("registry/images.yaml", {"images": {
                 image: {"repository": f"ghcr.io/example/{image}", "tag": "v1"}
                 for image in ("driver", "recorder")
