@@ -7,6 +7,7 @@ The action ``demandops_interfaces/action/Demand`` and YAML of the kind ``Demand`
 from __future__ import annotations
 
 import json
+import math
 import re
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -27,7 +28,7 @@ from generator.demand.request import (
     InputTopic,
     Operation,
 )
-from generator.errors import Fault, fault
+from generator.errors import Fault, fault, shown
 from generator.settings import API_VERSION
 
 TypeName = Literal["auto", "mqtt", "zenoh", "ros"]
@@ -103,6 +104,8 @@ class DemandGoal(Frozen):
     connections: list[GoalConnection] = Field(default_factory=list)
 
 
+_DEEPEST = 50
+"""Levels of a parameter's value: a claim's file is read to a depth of 100."""
 _LISTS_OF_TEXT = ("requesters",)
 
 
@@ -155,13 +158,19 @@ def _application(
     requesters: tuple[str, ...],
     faults: list[Fault],
 ) -> ApplicationDemand:
-    parameters = dict(app.parameters)
+    parameters: dict[str, Any] = {}
+    for name, value in app.parameters.items():
+        parameters[name] = _usable(f"{where}.parameters.{name}", value, faults)
     for name, text in app.parameters_json.items():
+        place = f"{where}.parameters_json.{name}"
+        if name in parameters:
+            faults.append(fault(place, "is given in parameters already; give it once"))
+            continue
         try:
-            parameters[name] = json.loads(text)
+            parameters[name] = _usable(place, json.loads(text), faults)
         except (ValueError, RecursionError):
             message = 'is no JSON; a text needs quotes of its own, as in "\\"fast\\""'
-            faults.append(fault(f"{where}.parameters_json.{name}", message))
+            faults.append(fault(place, message))
     return ApplicationDemand(
         id=app.id,
         appdef=app.type,
@@ -178,6 +187,26 @@ def _application(
         version=app.version,
         connect=None if app.connect == "none" else _TYPES[app.connect],
     )
+
+
+def _usable(where: str, value: object, faults: list[Fault]) -> object:
+    """Return a parameter's value; what of it no ledger could keep is noted, and left out."""
+    problem = _unkeepable(value, 0)
+    if problem:
+        faults.append(fault(where, problem))
+    return None if problem else value
+
+
+def _unkeepable(value: object, depth: int) -> str:
+    if depth > _DEEPEST:
+        return f"is nested deeper than {_DEEPEST} levels; make it flatter"
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"holds {value}, which is no finite number; give one, or leave it out"
+    if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
+        return f"holds {shown(value)}, which is no Unicode text; write whole characters"
+    parts = [*value, *value.values()] if isinstance(value, dict) else value
+    nested = parts if isinstance(parts, list) else ()
+    return next(filter(None, (_unkeepable(part, depth + 1) for part in nested)), "")
 
 
 def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> ConnectionDemand:
