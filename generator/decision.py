@@ -199,7 +199,7 @@ def _in_goals_words(
     def field(path: str) -> str:
         if request.operation.is_reference:
             return wire.wire_field(path, request, catalog.appdefs)
-        return own.field(path)
+        return own.field(path, request)
 
     return [replace(found, field=field(found.field)) for found in faults]
 

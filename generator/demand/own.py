@@ -231,9 +231,13 @@ _NAMES = (
 )
 
 
-def field(path: str) -> str:
-    """Return the goal's name for a field of its request."""
+_OF_CONNECTION = re.compile(r"connections\[(\d+)\]")
+
+
+def field(path: str, request: DemandRequest) -> str:
+    """Return the goal's name for a field of its request; of a derived connection, its input."""
     for pattern, replacement in _NAMES:
         if pattern.match(path):
             return pattern.sub(replacement, path)
-    return path
+    of = _OF_CONNECTION.match(path)
+    return (request.connections[int(of[1])].because if of else "") or path

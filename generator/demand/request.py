@@ -84,6 +84,7 @@ class ConnectionDemand:
     """One connection of a request; ``topics`` are pairs of source topic and target topic.
 
     ``type`` is the wire's number, known or not; ``broker`` is empty where it is left open.
+    ``because`` is the field of the input that a derived one is for.
     """
 
     id: str
@@ -94,6 +95,7 @@ class ConnectionDemand:
     broker: str
     requesters: tuple[str, ...]
     term: Term | None = None
+    because: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 from generator.catalog.appdef import ApplicationDefinition
 from generator.catalog.catalog import Catalog
+from generator.catalog.identifiers import topic_problem
 from generator.demand.request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -23,22 +24,30 @@ def with_connections(request: DemandRequest, ledger: Ledger, catalog: Catalog) -
     """Return the request with a connection for each input that would not arrive otherwise.
 
     One that others hold and that brings the topic already is joined; else the two nodes share one
-    connection of their own.
+    connection of their own. None is derived from a faulty input, which is told as it is.
     """
-    found = {connection.id: connection for connection in request.connections}
+    found = list(request.connections)
     brought = {(c.target, target) for c in request.connections for _, target in c.topics}
-    for app in request.applications:
+    for index, app in enumerate(request.applications):
         appdef = catalog.appdefs.get(app.appdef)
         if app.connect is None or appdef is None:
             continue
-        for _, topic in foreign_inputs(app, appdef):
-            if (app.node, topic.topic) in brought:
+        for role, topic in foreign_inputs(app, appdef):
+            if (app.node, topic.topic) in brought or not _sound(app, topic, catalog):
                 continue
             wanted = _connection(app, topic.source, topic.topic, ledger)
-            known = found.get(wanted.id, wanted)
+            place = f"applications[{index}].inputs.{role}[{app.inputs[role].index(topic)}]"
+            known = next((c for c in found if c.id == wanted.id), None)
+            if known is None:
+                found.append(replace(wanted, because=place))
+                continue
             topics = dict.fromkeys((*known.topics, *wanted.topics))
-            found[wanted.id] = replace(known, topics=tuple(topics))
-    return replace(request, connections=tuple(found.values()))
+            found[found.index(known)] = replace(known, topics=tuple(topics))
+    return replace(request, connections=tuple(found))
+
+
+def _sound(app: ApplicationDemand, topic: InputTopic, catalog: Catalog) -> bool:
+    return {app.node, topic.source} <= catalog.domain_of.keys() and not topic_problem(topic.topic)
 
 
 def foreign_inputs(
