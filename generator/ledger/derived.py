@@ -70,9 +70,9 @@ def _connection(
     app: ApplicationDemand, source: str, topic: str, ledger: Ledger
 ) -> ConnectionDemand:
     for id in ledger.bringing(app.node, topic):
-        standing = ledger.connection(id)[0]
-        if standing.source == source and standing.topics.get(topic) == topic:
-            return _demand(app, id, standing.type.value, source, topic)
+        for standing in ledger.connection(id):
+            if standing.source == source and standing.topics.get(topic) == topic:
+                return _demand(app, id, standing.type.value, source, topic)
     own = f"derived/{source}/{app.node}"
     standing_types = [claim.type.value for claim in ledger.connection(own)]
     assert app.connect is not None  # noqa: S101 - the caller has looked
