@@ -45,8 +45,8 @@ Patterns = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    """Tell whether a name is one of ``patterns`` (``*`` and ``?``)."""
-    return any(fnmatchcase(name, pattern) for pattern in patterns)
+    """Tell whether a name is one of ``patterns`` (``*`` and ``?``; a bracket is a bracket)."""
+    return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
 
 
 class Rule(Frozen):
