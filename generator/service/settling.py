@@ -129,8 +129,10 @@ class Settler:
         """
         now, claims = self._clock.ended(self.snapshot.state.ledger)
         since = now - timedelta(seconds=_LONGEST_WAIT_S)
-        self._tried = {demand: when for demand, when in self._tried.items() if when > since}
-        demands = dict.fromkeys(c.demand for c in claims if c.demand not in self._tried)
+        over = dict.fromkeys(claim.demand for claim in claims)
+        tried = self._tried  # what is over no more was released or renewed
+        self._tried = {d: when for d, when in tried.items() if when > since and d in over}
+        demands = [demand for demand in over if demand not in self._tried]
         requests = [
             DemandRequest(id=demand, operation=Operation.EXPIRE, demand=demand)
             for demand in demands
