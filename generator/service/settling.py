@@ -78,6 +78,15 @@ class Settler:
         self._giving_up.set()
         self._repository.give_up()
 
+    def take_up(self, batch: list[Ticket]) -> None:
+        """Move what waits into ``batch``, and behind it the demands whose lease ran out.
+
+        A renewal that waits was received before: it is judged first, or nothing expires yet.
+        """
+        self._waiting.take_up(batch, self._batch_limit)
+        if not self._waiting.anything:
+            batch += self.expired()
+
     def settle(self, batch: list[Ticket]) -> None:
         """Take up what waits into ``batch``, bring it to an end, and empty the batch.
 
