@@ -88,7 +88,7 @@ class Settler:
             batch += self.expired()
 
     def settle(self, batch: list[Ticket]) -> None:
-        """Take up what waits into ``batch``, bring it to an end, and empty the batch.
+        """Bring a batch to an end, with what comes in while the remote moves, and empty it.
 
         Raises:
             ShuttingDown: where it was given up; the demands are still in the batch.
@@ -97,7 +97,6 @@ class Settler:
         pause = _FIRST_PAUSE_S
         verdict_is_current = self._repository.always_current
         while True:
-            self._waiting.take_up(batch, self._batch_limit)
             self._waiting.dismiss_withdrawn(batch)
             try:
                 line = self._line()
@@ -126,6 +125,7 @@ class Settler:
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
             pause = min(pause * 2, _LONGEST_PAUSE_S)
+            self._waiting.take_up(batch, self._batch_limit)
 
     def pause(self) -> float:
         """Return the seconds after which to look at the leases again."""
