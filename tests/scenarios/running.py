@@ -15,7 +15,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import Field, model_validator
 
-from generator.catalog.catalog import CONFIG_ROOTS, Catalog, load
+from generator.catalog.catalog import CONFIG_ROOTS, load
 from generator.catalog.model import Frozen, parse_file
 from generator.catalog.policy import seconds_of
 from generator.decision import Decision, State, decide, rendered
@@ -188,8 +188,8 @@ class Clocks:
 class World:
     """A state repo in memory, and one generator at it."""
 
-    def __init__(self, catalog: Catalog, config: Mapping[str, str]) -> None:
-        self.state = State.of(catalog, Ledger())
+    def __init__(self, state: State, config: Mapping[str, str]) -> None:
+        self.state = state
         self._standing = {**_skeleton(), **config, **rendered(self.state)}
         self.files = dict(self._standing)
         self.clocks = Clocks()
@@ -309,7 +309,7 @@ def _purpose(entry: Mapping[str, Any]) -> str:
 def run(scenario: Scenario) -> None:
     """Take every step and compare what the scenario says of it."""
     files = configuration(scenario.appdefs, scenario.config)
-    world = World(load(files), files)
+    world = World(State.of(load(files), Ledger()), files)
     for number, step in enumerate(scenario.steps, 1):
         place = f"step {number}{f' ({step.why})' if step.why else ''}"
         _take(step, world, place)
