@@ -7,6 +7,7 @@ clock, after every step.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from functools import lru_cache
 from pathlib import Path
@@ -59,7 +60,8 @@ class Step(Frozen):
     """One thing that happens and what must come of it; only what is listed is compared.
 
     ``after`` lets time pass, ``clock`` sets the wall clock alone, by a duration that may be
-    negative. ``restart`` forgets what a generator has in memory. ``expires`` are the demands that
+    negative. ``restart`` forgets what a generator has in memory, ``config`` is laid over the
+    scenario's from here on, as by a person's commit. ``expires`` are the demands that
     the generator releases then, in order; none, where it is left out.
     """
 
@@ -67,6 +69,7 @@ class Step(Frozen):
     after: str = "0s"
     clock: str = ""
     restart: bool = False
+    config: dict[str, dict[str, Any]] = Field(default_factory=dict)
     send: dict[str, Any] | None = None
     gives: Literal["booked", "released", "unchanged"] | None = None
     refused: list[Told] | None = None
@@ -190,11 +193,19 @@ class World:
 
     def __init__(self, state: State, config: Mapping[str, str]) -> None:
         self.state = state
-        self._standing = {**_skeleton(), **config, **rendered(self.state)}
-        self.files = dict(self._standing)
+        self.files: dict[str, str] = {}
         self.clocks = Clocks()
+        self.configure(state, config)
         self._sent = 0
         self.restart()
+
+    def configure(self, state: State, config: Mapping[str, str]) -> None:
+        """Take a configuration in, and write what follows of it."""
+        self.state = replace(state, ledger=self.state.ledger)
+        empty = replace(state, ledger=Ledger())
+        self._standing = {**_skeleton(), **config, **rendered(empty)}
+        claims = {p: text for p, text in self.files.items() if ledger_format.kind_of(p)}
+        self.files = {**self._standing, **claims, **rendered(self.state)}
 
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
@@ -311,6 +322,9 @@ def run(scenario: Scenario) -> None:
     files = configuration(scenario.appdefs, scenario.config)
     world = World(State.of(load(files), Ledger()), files)
     for number, step in enumerate(scenario.steps, 1):
+        if step.config:
+            files = configuration(scenario.appdefs, _laid_over(scenario.config, step.config))
+            world.configure(State.of(load(files), Ledger()), files)
         place = f"step {number}{f' ({step.why})' if step.why else ''}"
         _take(step, world, place)
         try:

@@ -46,16 +46,27 @@ class Maker:
 
     def __init__(self, random: Random) -> None:
         self._random = random
+        self._puts: list[Goal] = []
 
     def any(self) -> Goal:
-        kind = self._random.randrange(10)
-        if kind < 4:
-            return self.put()
-        if kind < 6:
-            return self._named("renew")
-        if kind == 6:
-            return self._named("release")
-        return self._message(shutdown=kind > 7)
+        kind = self._random.randrange(20)
+        if self._puts and kind < 9:
+            return self._of_known(kind)
+        if kind < 14:
+            self._puts.append(self.put())
+            return self._puts[-1]
+        if kind < 16:
+            return self._named("release" if kind == 14 else "renew")
+        return self._message(shutdown=kind > 17)
+
+    def _of_known(self, kind: int) -> Goal:
+        """Return a renewal of what was put, the same again, the same with another lease."""
+        known = self._random.choice(self._puts[-2:])
+        if kind < 3:
+            return {key: known[key] for key in ("kind", "demand", "requesters")} | {
+                "operation": "renew"
+            }
+        return known if kind < 6 else known | {"lease": self._random.choice(LEASES[1:])}
 
     def put(self) -> Goal:
         made = self._named("put")
