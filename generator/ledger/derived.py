@@ -37,7 +37,8 @@ def with_connections(request: DemandRequest, ledger: Ledger, catalog: Catalog) -
                 continue
             wanted = _connection(app, topic.source, topic.topic, ledger)
             place = f"applications[{index}].inputs.{role}[{app.inputs[role].index(topic)}]"
-            known = next((c for c in found if c.id == wanted.id), None)
+            same = (wanted.id, wanted.source, wanted.target)
+            known = next((c for c in found if (c.id, c.source, c.target) == same), None)
             if known is None:
                 found.append(replace(wanted, because=place))
                 continue
