@@ -121,7 +121,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         The request and the faults of its form; a request with faults must not be booked.
     """
     goal, faults = sound_part(data, DemandGoal, _LISTS_OF_TEXT)
-    requesters = tuple(dict.fromkeys(goal.requesters))
+    requesters = tuple(goal.requesters)
     request = DemandRequest(
         id=goal.request or goal.demand,
         operation=Operation(goal.operation),
