@@ -144,6 +144,7 @@ class Generator:
             try:
                 self._settler.take_up(batch)
                 if not batch:
+                    self._settler.notice()
                     continue
                 self._settler.settle(batch)
                 self._settler.catch_up()

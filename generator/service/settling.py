@@ -159,6 +159,13 @@ class Settler:
             if line.publish():
                 self.snapshot = line.head
 
+    def notice(self) -> None:
+        """Take in what others published in a repository on this disk: its leases end here too."""
+        if self._repository.always_current and self._repository.tip() != self.snapshot.commit:
+            line = self._line()
+            if line.publish():
+                self.snapshot = line.head
+
     def tidy(self) -> None:
         """Every few hundred commits: a demand leaves some twenty loose objects behind."""
         if self._since_tidy >= _TIDY_EVERY:

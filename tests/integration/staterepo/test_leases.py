@@ -21,7 +21,7 @@ from staterepo_rig import Person
 from generator import settings
 from generator.demand.claim import Claim
 from generator.errors import Refused
-from generator.service import Generator
+from generator.service import Generator, settling
 from generator.staterepo import outbox
 from generator.staterepo import tree as trees
 
@@ -207,6 +207,19 @@ def test_what_another_generator_renewed_is_kept(
     assert "the state repo has moved" in caplog.text
     assert expiries(bare) == []
     assert rig.claims(bare, "edge/d")
+    rig.assert_sound(bare)
+
+
+def test_an_idle_generator_releases_what_another_process_booked(
+    bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ``demandops request`` beside ``demandops serve``."""
+    monkeypatch.setattr(settling, "_LONGEST_WAIT_S", 0.2)  # between two looks; a minute else
+    with rig.running(bare) as idle:
+        with rig.running(bare) as other:
+            rig.book(other, put("d", 1))
+        rig.wait_until(lambda: expiries(bare), "'d' is released")
+        wait_until_gone(idle, "d")
     rig.assert_sound(bare)
 
 
