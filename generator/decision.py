@@ -210,7 +210,7 @@ def _in_goals_words(
     def field(path: str) -> str:
         if request.operation.is_reference:
             return wire.wire_field(path, request, catalog.appdefs)
-        return own.field(path)
+        return own.field(path, request)
 
     return [replace(found, field=field(found.field)) for found in faults]
 
@@ -220,11 +220,12 @@ def _uncarried(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> Iter
     if not request.operation.asks:
         return
     for app in request.applications:
-        for role, topic in derived.foreign_inputs(app, catalog):
+        for foreign in derived.foreign_inputs(app, catalog):
+            topic = foreign.topic
             if not ledger.carries(app.node, topic.topic):
                 yield (
-                    f"application '{app.id}': no connection carries {role} {topic.topic} of "
-                    f"'{topic.source}' to '{app.node}'"
+                    f"application '{app.id}': no connection carries {foreign.name} {topic.topic} "
+                    f"of '{topic.source}' to '{app.node}'"
                 )
 
 

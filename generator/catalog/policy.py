@@ -13,8 +13,9 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from generator.catalog.model import DnsLabel, FileModel, Frozen
+from generator.errors import shown
 
-_DURATION = re.compile(r"(?:(\d+)d)?(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?")
+_DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
 _UNITS_S = (86_400, 3_600, 60, 1)
 _YEAR_S = 366 * 86_400
 
@@ -27,7 +28,7 @@ def seconds_of(text: str) -> int:
     """
     match = _DURATION.fullmatch(text)
     if not text or match is None:
-        raise ValueError(f"'{text}' is no duration; write one like 90s, 10m, 1h30m or 2d")
+        raise ValueError(f"{shown(text)} is no duration; write one like 90s, 10m, 1h30m or 2d")
     seconds = sum(int(part) * unit for part, unit in zip(match.groups("0"), _UNITS_S, strict=True))
     if seconds > _YEAR_S:
         raise ValueError(f"'{text}' is longer than a year; choose a shorter duration")
@@ -44,8 +45,8 @@ Patterns = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    """Tell whether a name is one of ``patterns`` (``*`` and ``?``)."""
-    return any(fnmatchcase(name, pattern) for pattern in patterns)
+    """Tell whether a name is one of ``patterns`` (``*`` and ``?``; a bracket is a bracket)."""
+    return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
 
 
 class Rule(Frozen):

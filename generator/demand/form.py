@@ -15,6 +15,9 @@ from generator import yamlio
 from generator.catalog.model import faults_of, field_path
 from generator.errors import Fault, fault
 
+_DEEPEST = 100
+"""Levels of a goal, as many as of one in YAML."""
+
 Goal = TypeVar("Goal", bound=BaseModel)
 
 
@@ -43,6 +46,10 @@ def _with_keys_of_text(
     data: object, location: tuple[int | str, ...], faults: list[Fault]
 ) -> object:
     """Return ``data`` without the entries whose key is no text, which are told."""
+    if len(location) > _DEEPEST and isinstance(data, dict | list):
+        message = f"is nested deeper than {_DEEPEST} levels; make it flatter"
+        faults.append(fault(field_path(location[:2]), message))
+        return None
     if isinstance(data, list):
         return [_with_keys_of_text(item, (*location, i), faults) for i, item in enumerate(data)]
     if not isinstance(data, dict):

@@ -7,12 +7,14 @@ The action ``demandops_interfaces/action/Demand`` and YAML of the kind ``Demand`
 from __future__ import annotations
 
 import json
+import math
 import re
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, PlainValidator
 
+from generator import yamlio
 from generator.catalog.identifiers import absolute
 from generator.catalog.model import Frozen
 from generator.catalog.policy import seconds_of
@@ -26,7 +28,7 @@ from generator.demand.request import (
     Operation,
 )
 from generator.demand.route import RouteOptions
-from generator.errors import Fault, fault
+from generator.errors import Fault, fault, shown
 from generator.settings import API_VERSION
 
 TypeName = Literal["auto", "mqtt", "zenoh", "ros"]
@@ -78,6 +80,16 @@ class GoalConnection(Frozen):
     topics: list[GoalRoute] = Field(default_factory=list)
 
 
+def _lease_form(value: object) -> object:
+    if value is None or (isinstance(value, str | int) and not isinstance(value, bool)):
+        return value
+    raise ValueError(f"must be a duration like 10m, or whole seconds, not {yamlio.brief(value)}")
+
+
+Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
+"""One validator for all that it may be: pydantic names each member of a union a field."""
+
+
 class DemandGoal(Frozen):
     """A demand. ``lease`` is a duration like ``10m``, or whole seconds."""
 
@@ -87,12 +99,14 @@ class DemandGoal(Frozen):
     demand: str = ""
     request: str = ""
     requesters: list[str] = Field(default_factory=list)
-    lease: str | int | None = None
+    lease: Lease = None
     applications: list[GoalApplication] = Field(default_factory=list)
     connections: list[GoalConnection] = Field(default_factory=list)
     answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
 
 
+_DEEPEST = 50
+"""Levels of a parameter's value: a claim's file is read to a depth of 100."""
 _LISTS_OF_TEXT = ("requesters",)
 
 
@@ -108,7 +122,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         The request and the faults of its form; a request with faults must not be booked.
     """
     goal, faults = sound_part(data, DemandGoal, _LISTS_OF_TEXT)
-    requesters = tuple(dict.fromkeys(goal.requesters))
+    requesters = tuple(goal.requesters)
     request = DemandRequest(
         id=goal.request or goal.demand,
         operation=Operation(goal.operation),
@@ -145,13 +159,19 @@ def _application(
     requesters: tuple[str, ...],
     faults: list[Fault],
 ) -> ApplicationDemand:
-    parameters = dict(app.parameters)
+    parameters: dict[str, Any] = {}
+    for name, value in app.parameters.items():
+        parameters[name] = _usable(f"{where}.parameters.{name}", value, faults)
     for name, text in app.parameters_json.items():
+        place = f"{where}.parameters_json.{name}"
+        if name in parameters:
+            faults.append(fault(place, "is given in parameters already; give it once"))
+            continue
         try:
-            parameters[name] = json.loads(text)
+            parameters[name] = _usable(place, json.loads(text), faults)
         except (ValueError, RecursionError):
             message = 'is no JSON; a text needs quotes of its own, as in "\\"fast\\""'
-            faults.append(fault(f"{where}.parameters_json.{name}", message))
+            faults.append(fault(place, message))
     return ApplicationDemand(
         id=app.id,
         appdef=app.type,
@@ -168,6 +188,26 @@ def _application(
         version=app.version,
         connect=None if app.connect == "none" else _TYPES[app.connect],
     )
+
+
+def _usable(where: str, value: object, faults: list[Fault]) -> object:
+    """Return a parameter's value; what of it no ledger could keep is noted, and left out."""
+    problem = _unkeepable(value, 0)
+    if problem:
+        faults.append(fault(where, problem))
+    return None if problem else value
+
+
+def _unkeepable(value: object, depth: int) -> str:
+    if depth > _DEEPEST:
+        return f"is nested deeper than {_DEEPEST} levels; make it flatter"
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"holds {value}, which is no finite number; give one, or leave it out"
+    if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
+        return f"holds {shown(value)}, which is no Unicode text; write whole characters"
+    parts = [*value, *value.values()] if isinstance(value, dict) else value
+    nested = parts if isinstance(parts, list) else ()
+    return next(filter(None, (_unkeepable(part, depth + 1) for part in nested)), "")
 
 
 def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> ConnectionDemand:
@@ -192,9 +232,13 @@ _NAMES = (
 )
 
 
-def field(path: str) -> str:
-    """Return the goal's name for a field of its request."""
+_OF_CONNECTION = re.compile(r"connections\[(\d+)\]")
+
+
+def field(path: str, request: DemandRequest) -> str:
+    """Return the goal's name for a field of its request; of a derived connection, its input."""
     for pattern, replacement in _NAMES:
         if pattern.match(path):
             return pattern.sub(replacement, path)
-    return path
+    of = _OF_CONNECTION.match(path)
+    return (request.connections[int(of[1])].because if of else "") or path

@@ -31,17 +31,28 @@ def faults(request: DemandRequest, catalog: Catalog) -> Iterator[Fault]:
         return
     for index, app in enumerate(request.applications):
         where = f"applications[{index}]"
-        domain = catalog.domain_of.get(app.node)
-        if domain is None:
-            continue
-        asked = (("applications", app.appdef), ("nodes", app.node))
-        yield from _unruled(where, app.requesters, domain, asked)
-        yield from _too_long(request, domain)
+        for node in _places(app, catalog):
+            domain = catalog.domain_of.get(node)
+            if domain is not None:
+                asked = (("applications", app.appdef), ("nodes", node))
+                yield from _unruled(where, app.requesters, domain, asked)
+        home = catalog.domain_of.get(app.node)
+        if home is not None:
+            yield from _too_long(request, home)
     for index, connection in enumerate(request.connections):
         yield from _connection(f"connections[{index}]", connection, catalog)
         domain = catalog.domain_of.get(connection.target)
         if domain is not None:
             yield from _too_long(request, domain)
+
+
+def _places(app: ApplicationDemand, catalog: Catalog) -> Iterable[str]:
+    """Return the nodes on which services of an application run: its own, and sources."""
+    appdef = catalog.appdefs.get(app.appdef)
+    services = appdef.services.values() if appdef else ()
+    roles = [service.each for service in services if service.placement == "source"]
+    sources = (topic.source for role in roles for topic in app.inputs.get(str(role), ()))
+    return dict.fromkeys((app.node, *sources))
 
 
 def _connection(where: str, asked: ConnectionDemand, catalog: Catalog) -> Iterator[Fault]:

@@ -87,7 +87,7 @@ class ConnectionDemand:
     """One connection of a request.
 
     ``type`` is a value of :class:`ConnectionType` or an unknown number of the wire; ``broker`` is
-    empty where it is left open.
+    empty where it is left open. ``because`` is the field of the input that a derived one is for.
     """
 
     id: str
@@ -98,6 +98,7 @@ class ConnectionDemand:
     broker: str
     requesters: tuple[str, ...]
     term: Term | None = None
+    because: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,13 +130,13 @@ class DemandRequest:
 def faults(request: DemandRequest) -> Iterator[Fault]:
     """Yield every fault of a request that shows without looking at catalog or ledger."""
     joining = request.operation.asks
-    if request.id:
+    if request.id and request.id != request.demand:  # which it is where none is given
         yield from _id("id", request.id)
     yield from _named(request)
     listing = request.operation not in (Operation.RELEASE, Operation.RENEW)
     if listing and not (request.applications or request.connections):
         yield fault(
-            "id",
+            "id" if request.operation.is_reference else "applications",
             "the request lists no application and no connection; list what it is for",
             code="empty",
         )

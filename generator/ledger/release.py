@@ -15,6 +15,7 @@ from generator.demand.claim import (
     ConnectionClaim,
     Subject,
     SubjectKind,
+    demand_id,
 )
 from generator.demand.request import (
     ApplicationDemand,
@@ -63,14 +64,15 @@ def _meant(claims: Iterable[Claim], request: str, asked: Asked) -> Claim | None:
     """Return the claim that a shutdown means, or nothing: nothing is ever released by guess."""
     claims = [claim for claim in claims if _same_ends(claim, asked)]
     requesters = set(asked.requesters)
+    made = demand_id(request, requesters)
     exact = [claim for claim in claims if set(claim.requesters) == requesters]
-    for claim in exact:
-        if claim.request == request:
-            return claim
-    if exact:
-        return exact[0] if len(exact) == 1 else None
-    wider = [claim for claim in claims if set(claim.requesters) >= requesters]
-    return wider[0] if len(wider) == 1 else None
+    meant = (
+        [claim for claim in exact if claim.demand == made]
+        or [claim for claim in exact if claim.request == request]
+        or exact
+        or [claim for claim in claims if set(claim.requesters) >= requesters]
+    )
+    return meant[0] if len(meant) == 1 else None
 
 
 def _same_ends(claim: Claim, asked: Asked) -> bool:

@@ -6,9 +6,10 @@ shared with others, follows when the demand moves its application, and goes with
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from generator.catalog.catalog import Catalog
+from generator.catalog.identifiers import topic_problem
 from generator.demand.request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -25,46 +26,65 @@ def with_connections(request: DemandRequest, ledger: Ledger, catalog: Catalog) -
     """Return the request with a connection for each input that would not arrive otherwise.
 
     One that others hold and that brings the topic already is joined; else the two nodes share one
-    connection of their own.
+    connection of their own. None is derived from a faulty input, which is told as it is.
     """
-    found = {connection.id: connection for connection in request.connections}
+    found = list(request.connections)
     brought = {
         (route.ends(connection.source, connection.target)[1], route.written)
         for connection in request.connections
         for route in connection.topics
     }
-    for app in request.applications:
+    for index, app in enumerate(request.applications):
         if app.connect is None or app.appdef not in catalog.appdefs:
             continue
-        for _, topic in foreign_inputs(app, catalog):
-            if (app.node, topic.topic) in brought:
+        for foreign in foreign_inputs(app, catalog):
+            topic = foreign.topic
+            if (app.node, topic.topic) in brought or not _sound(app, topic, catalog):
                 continue
             wanted = _connection(app, topic.source, topic.topic, ledger)
-            known = found.get(wanted.id, wanted)
+            same = (wanted.id, wanted.source, wanted.target)
+            known = next((c for c in found if (c.id, c.source, c.target) == same), None)
+            if known is None:
+                found.append(replace(wanted, because=f"applications[{index}].{foreign.field}"))
+                continue
             topics = dict.fromkeys((*known.topics, *wanted.topics))
-            found[wanted.id] = replace(known, topics=tuple(topics))
-    return replace(request, connections=tuple(found.values()))
+            found[found.index(known)] = replace(known, topics=tuple(topics))
+    return replace(request, connections=tuple(found))
 
 
-def foreign_inputs(app: ApplicationDemand, catalog: Catalog) -> list[tuple[str, InputTopic]]:
-    """Return (role, topic) of all that must be carried to the application's node.
+def _sound(app: ApplicationDemand, topic: InputTopic, catalog: Catalog) -> bool:
+    return {app.node, topic.source} <= catalog.domain_of.keys() and not topic_problem(topic.topic)
 
-    Inputs that other nodes publish, and what services at such a node make of them.
+
+@dataclass(frozen=True, slots=True)
+class ForeignInput:
+    """A topic of another node that an application needs at its own.
+
+    ``name`` is the role, or ``<service>.<output>`` of what a service at that node makes of one;
+    ``field`` is where in the application the topic behind it is listed.
     """
+
+    name: str
+    topic: InputTopic
+    field: str
+
+
+def foreign_inputs(app: ApplicationDemand, catalog: Catalog) -> list[ForeignInput]:
+    """Return all that must be carried to the application's node."""
     appdef = catalog.appdefs[app.appdef]
-    found: dict[tuple[str, InputTopic], None] = {}
     wanted = set()
     for service in appdef.services.values():
         if service.each is not None and service.placement == "application":
             wanted.add(service.each)
         wanted |= set(service.inputs.values())
-    for origin in sorted(wanted):
-        producer_name, _, output = origin.partition(".")
+    found = []
+    for name in sorted(wanted):
+        producer_name, _, output = name.partition(".")
         producer = appdef.services[producer_name] if output else None
         if producer is not None and producer.placement != "source":
             continue
-        role = str(producer.each) if producer else origin
-        for topic in app.inputs.get(role, ()):
+        role = str(producer.each) if producer else name
+        for index, topic in enumerate(app.inputs.get(role, ())):
             if topic.source == app.node:
                 continue
             carried = topic
@@ -73,8 +93,8 @@ def foreign_inputs(app: ApplicationDemand, catalog: Catalog) -> list[tuple[str, 
                     producer_name, topic.source, source=topic.source, topic=topic.topic
                 )
                 carried = InputTopic(outputs(catalog, producer, key)[output], topic.source)
-            found[origin, carried] = None
-    return list(found)
+            found.append(ForeignInput(name, carried, f"inputs.{role}[{index}]"))
+    return found
 
 
 def _connection(
@@ -82,10 +102,11 @@ def _connection(
 ) -> ConnectionDemand:
     assert app.connect is not None  # noqa: S101 - the caller has looked
     for id in ledger.bringing(app.node, topic):
-        standing = ledger.connection(id)[0]
-        route = standing.topics.get(topic)
-        if (standing.source, standing.target) == (source, app.node) and route is not None:
-            return _demand(app, id, standing.type.value, source, route)
+        for standing in ledger.connection(id):
+            route = standing.topics.get(topic)
+            ends = (standing.source, standing.target)
+            if ends == (source, app.node) and route is not None and not route.reverse:
+                return _demand(app, id, standing.type.value, source, route)
     return _demand(app, f"derived/{source}/{app.node}", app.connect, source, Route(topic, topic))
 
 

@@ -81,17 +81,13 @@ def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
 
 
 def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceRelease | None:
-    users: tuple[str, ...]
-    if key.application is not None:
-        claims = ledger.application(key.application)
-        users = (key.application,)
-    else:
-        users = tuple(
-            application
-            for application in ledger.taking(str(key.source), str(key.topic))
-            if key in keys_of(ledger, catalog, Subject(SubjectKind.APPLICATION, application))
-        )
-        claims = tuple(claim for user in users for claim in ledger.application(user))
+    named = (key.application,) if key.application is not None else None
+    users = tuple(  # an application may run elsewhere by now, or as something else
+        application
+        for application in named or ledger.taking(str(key.source), str(key.topic))
+        if key in keys_of(ledger, catalog, Subject(SubjectKind.APPLICATION, application))
+    )
+    claims = tuple(claim for user in users for claim in ledger.application(user))
     if not claims:
         return None
     appdef = _appdef(catalog, claims[0].appdef)

@@ -15,36 +15,32 @@ from generator.plan.release import ServiceKey
 
 def faults(before: Ledger, after: Ledger, changes: Changes, catalog: Catalog) -> Iterator[Fault]:
     """Yield every quota that ``changes`` go beyond; what was over it before may stay and shrink."""
-    new = [change.after for change in changes.claims if change.after and not change.before]
-    seen = set()
-    for claim in new:
-        domain = catalog.domain_of.get(_node(claim))
-        if domain is None:
-            continue
-        for requester in claim.requesters:
-            if (domain.name, requester) not in seen:
-                seen.add((domain.name, requester))
-                yield from _claims(requester, after, domain, catalog)
+    booked = [change.after for change in changes.claims if change.after]
+    holders = {(_node(claim), who) for claim in booked for who in claim.requesters}
+    domains = {
+        (found.name, who): found for node, who in holders if (found := catalog.domain_of.get(node))
+    }
+    for (_, requester), domain in sorted(domains.items(), key=lambda pair: pair[0]):
+        yield from _claims(requester, before, after, domain, catalog)
     touched = [c.after or c.before for c in changes.claims]
     for node in sorted(_nodes(claim for claim in touched if claim)):
         yield from _services(node, before, after, catalog)
 
 
 def _claims(
-    requester: str, after: Ledger, domain: AccessDomain, catalog: Catalog
+    requester: str, before: Ledger, after: Ledger, domain: AccessDomain, catalog: Catalog
 ) -> Iterator[Fault]:
     most = domain.quotas.claims_per_requester
     if most is None:
         return
-    held = [
-        claim
-        for claim in after.of_requester(requester)
-        if catalog.domain_of.get(_node(claim)) is domain
-    ]
-    if len(held) > most:
-        yield _over(
-            domain, "claimsPerRequester", most, f"'{requester}' would hold {len(held)} claims"
-        )
+    count = _held(requester, after, domain, catalog)
+    if count > most and count > _held(requester, before, domain, catalog):
+        yield _over(domain, "claimsPerRequester", most, f"'{requester}' would hold {count} claims")
+
+
+def _held(requester: str, ledger: Ledger, domain: AccessDomain, catalog: Catalog) -> int:
+    claims = ledger.of_requester(requester)
+    return sum(catalog.domain_of.get(_node(claim)) is domain for claim in claims)
 
 
 def _services(node: str, before: Ledger, after: Ledger, catalog: Catalog) -> Iterator[Fault]:

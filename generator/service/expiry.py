@@ -36,9 +36,14 @@ class LeaseClock:
         self._stepped: datetime | None = None
 
     def ended(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
-        """Return the time and the claims whose lease is over, the first to end first."""
+        """Return the time and the claims whose lease is over, the first to end first.
+
+        What of a demand has ended goes together, so none of it while some is granted more time.
+        """
         now = self._look()
-        return now, [claim for claim in ledger.ended(now) if self._is_over(claim, now)]
+        ended = ledger.ended(now)
+        granted = {claim.demand for claim in ended if not self._is_over(claim, now)}
+        return now, [claim for claim in ended if claim.demand not in granted]
 
     def pause(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next look is due: ``longest`` at most, one at least.

@@ -160,8 +160,9 @@ class Generator:
         while self._waiting.wait(self._settler.pause()):
             batch: list[Ticket] = []
             try:
-                batch += self._settler.expired()
-                if not (batch or self._waiting.anything):
+                self._settler.take_up(batch)
+                if not batch:
+                    self._settler.notice()
                     continue
                 self._settler.settle(batch)
                 self._settler.catch_up()

@@ -82,8 +82,17 @@ class Settler:
         self._giving_up.set()
         self._repository.give_up()
 
+    def take_up(self, batch: list[Ticket]) -> None:
+        """Move what waits into ``batch``, and behind it the demands whose lease ran out.
+
+        A renewal that waits was received before: it is judged first, or nothing expires yet.
+        """
+        self._waiting.take_up(batch, self._batch_limit)
+        if not self._waiting.anything:
+            batch += self.expired()
+
     def settle(self, batch: list[Ticket]) -> None:
-        """Take up what waits into ``batch``, bring it to an end, and empty the batch.
+        """Bring a batch to an end, with what comes in while the remote moves, and empty it.
 
         Raises:
             ShuttingDown: where it was given up; the demands are still in the batch.
@@ -92,7 +101,6 @@ class Settler:
         pause = _FIRST_PAUSE_S
         verdict_is_current = self._repository.always_current
         while True:
-            self._waiting.take_up(batch, self._batch_limit)
             self._waiting.dismiss_withdrawn(batch)
             try:
                 line = self._line()
@@ -121,6 +129,7 @@ class Settler:
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
             pause = min(pause * 2, _LONGEST_PAUSE_S)
+            self._waiting.take_up(batch, self._batch_limit)
 
     def pause(self) -> float:
         """Return the seconds after which to look at the leases again."""
@@ -133,8 +142,10 @@ class Settler:
         """
         now, claims = self._clock.ended(self.snapshot.state.ledger)
         since = now - timedelta(seconds=_LONGEST_WAIT_S)
-        self._tried = {demand: when for demand, when in self._tried.items() if when > since}
-        demands = dict.fromkeys(c.demand for c in claims if c.demand not in self._tried)
+        over = dict.fromkeys(claim.demand for claim in claims)
+        tried = self._tried  # what is over no more was released or renewed
+        self._tried = {d: when for d, when in tried.items() if when > since and d in over}
+        demands = [demand for demand in over if demand not in self._tried]
         requests = [
             DemandRequest(id=demand, operation=Operation.EXPIRE, demand=demand)
             for demand in demands
@@ -151,6 +162,13 @@ class Settler:
             line = self._line()
             if line.publish():
                 self._taken(line)
+
+    def notice(self) -> None:
+        """Take in what others published in a repository on this disk: its leases end here too."""
+        if self._repository.always_current and self._repository.tip() != self.snapshot.commit:
+            line = self._line()
+            if line.publish():
+                self.snapshot = line.head
 
     def tidy(self) -> None:
         """Every few hundred commits: a demand leaves some twenty loose objects behind."""

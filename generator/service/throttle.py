@@ -44,7 +44,7 @@ class Throttle:
 
     def _counted(self, key: tuple[str, str], operation: str, received: datetime) -> int:
         seen = self._seen.setdefault(key, deque())
-        while seen and received - seen[0][0] > _WINDOW:
+        while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
             seen.popleft()
         places = [known for _, known in seen]
         if operation in places:

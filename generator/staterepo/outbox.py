@@ -11,7 +11,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
 from typing import IO, Any
@@ -31,6 +31,11 @@ class Entry:
     received: str
     base: str
 
+    def line(self) -> str:
+        """Return its line of the journal; the goal is not copied, for it may be deep."""
+        record = {field.name: getattr(self, field.name) for field in fields(self)}
+        return json.dumps(record, ensure_ascii=True) + "\n"
+
 
 class Outbox:
     """The journal of one process. Not thread-safe: its user locks."""
@@ -45,7 +50,7 @@ class Outbox:
         lines = []
         for entry in entries:
             self.pending[entry.operation] = entry
-            lines.append(json.dumps(asdict(entry), ensure_ascii=True) + "\n")
+            lines.append(entry.line())
         if lines:
             self._file.write("".join(lines))
             self._sync()
@@ -78,7 +83,7 @@ class Outbox:
         fresh = self._path.with_suffix(".new")
         with fresh.open("w") as file:
             for entry in self.pending.values():
-                file.write(json.dumps(asdict(entry), ensure_ascii=True) + "\n")
+                file.write(entry.line())
             file.flush()
             os.fsync(file.fileno())
         fresh.replace(self._path)

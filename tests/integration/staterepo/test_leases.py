@@ -1,0 +1,297 @@
+"""Leases on a real repository: what ends is released by a commit, what is renewed in time is not.
+
+Leases of a second and no slack; nothing here is measured, all waits are for what has to come.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Callable
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import pygit2
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Person
+
+from generator import settings
+from generator.demand.claim import Claim
+from generator.errors import Refused
+from generator.service import Generator, settling
+from generator.staterepo import outbox
+from generator.staterepo import tree as trees
+
+DOMAINS = "policy/access-domains.yaml"
+POLICY = """\
+apiVersion: demandops/v1
+kind: AccessDomains
+domains:
+- {name: perception, namespace: perception, nodes: ["*"], leases: {slack: 0s}%s}
+"""
+
+
+def _now() -> datetime:
+    return datetime.now(timezone.utc)
+
+
+def _with_policy(repo: Path, more: str = "") -> Path:
+    """Commit a policy as a person would."""
+    git = pygit2.Repository(str(repo))
+    tip = git[git.references["refs/heads/main"].target]
+    who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
+    tree = trees.write(git, tip.peel(pygit2.Tree), {DOMAINS: POLICY % more})
+    git.create_commit("refs/heads/main", who, who, "Short leases\n", tree, [tip.id])
+    return repo
+
+
+@pytest.fixture(scope="session")
+def _leased_template(_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("leased") / "state.git"
+    return _with_policy(Path(shutil.copytree(_template, folder)))
+
+
+@pytest.fixture
+def new_repo(_leased_template: Path, tmp_path: Path) -> Callable[[str], Path]:
+    """Make further bare state repos, whose leases have no slack."""
+
+    def make(name: str) -> Path:
+        return Path(shutil.copytree(_leased_template, tmp_path / name))
+
+    return make
+
+
+def put(demand: str, lease: str | int | None = 1, who: str = "vehicle00", **more: Any) -> rig.Goal:
+    """An application and, derived, a connection that goes with it."""
+    made = {
+        "kind": "Demand",
+        "demand": demand,
+        "requesters": [who, "station00"],
+        "applications": [
+            {
+                "id": f"edge/{demand[:100]}",
+                "type": "object-detection-fusion",
+                "node": "edge",
+                "inputs": {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]},
+            }
+        ],
+    }
+    return made | ({} if lease is None else {"lease": lease}) | more
+
+
+def renew(demand: str, who: str = "vehicle00") -> rig.Goal:
+    return {"kind": "Demand", "operation": "renew", "demand": demand, "requesters": [who]}
+
+
+def held(generator: Generator, demand: str) -> tuple[Claim, ...]:
+    return generator.snapshot.state.ledger.of_demand(demand)
+
+
+def wait_until_gone(generator: Generator, demand: str) -> None:
+    rig.wait_until(lambda: not held(generator, demand), f"'{demand}' is released")
+
+
+def expiries(repo: Path) -> list[rig.Commit]:
+    return [c for c in rig.commits(repo) if c.one("Operation") == "expire"]
+
+
+def values(commit: rig.Commit, key: str) -> list[str]:
+    return [value for known, value in commit.trailers if known == key]
+
+
+def wait_for(moment: datetime) -> None:
+    rig.wait_until(lambda: _now() > moment, f"{moment} has passed")
+
+
+def ends(generator: Generator, demand: str) -> datetime:
+    return max(claim.lease.ends for claim in held(generator, demand) if claim.lease)
+
+
+def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:
+    """Have a demand wait that a generator took in and could not settle before it was killed."""
+    slot = outbox.Slot(settings.data_home(str(repo)))
+    slot.outbox.append([outbox.Entry(operation, goal, received.isoformat(), rig.tip(repo))])
+    slot.close()
+
+
+def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(address: str, bare: Path) -> None:
+    with rig.running(address) as generator:
+        rig.book(generator, put("short"), put("stays", None))
+        end = ends(generator, "short")
+        wait_until_gone(generator, "short")
+        assert held(generator, "stays")
+    (commit,) = expiries(bare)
+    assert commit.summary == "Expire edge/short, derived/vehicle00/edge"
+    assert values(commit, "Demand-Id") == ["short"]
+    assert values(commit, "Requester") == ["station00", "vehicle00"]
+    assert values(commit, "Application") == ["edge/short"]
+    assert values(commit, "Connection") == ["derived/vehicle00/edge"]
+    assert len(values(commit, "Operation-Id")) == 1
+    author, made, body = rig.git(bare, "log", "-1", "--format=%an <%ae>%n%ct%n%b", commit.id).split(
+        "\n", 2
+    )
+    assert author == "station00, vehicle00 <short@demandops.invalid>"
+    assert int(made) >= int(end.timestamp()), "released before its end"
+    told = end.strftime("%Y-%m-%d %H:%M:%S UTC")
+    assert "the lease of demand 'short' on 1 application and 1 connection in the name" in body
+    assert f"ended at {told} and was not renewed" in body.replace("\n", " ")
+    assert list(rig.books(bare)["connections"]) == ["derived/vehicle00/edge"]
+    rig.assert_sound(bare)
+
+
+def test_what_ended_while_the_generator_was_down_goes_when_it_is_back(
+    address: str, bare: Path
+) -> None:
+    with rig.running(address) as generator:
+        rig.book(generator, put("b", 2), put("a", 1), put("long", "1h"))
+        last = ends(generator, "b")
+    assert expiries(bare) == []
+    wait_for(last)
+    with rig.running(address) as generator:
+        wait_until_gone(generator, "b")
+        wait_until_gone(generator, "a")
+        assert held(generator, "long")
+    assert [values(commit, "Demand-Id") for commit in expiries(bare)] == [["a"], ["b"]]
+    rig.assert_sound(bare)
+
+
+def test_a_demand_that_is_put_again_expires_again(bare: Path) -> None:
+    with rig.running(bare) as generator:
+        for _ in range(2):
+            rig.book(generator, put("again"))
+            wait_until_gone(generator, "again")
+    assert [commit.one("Operation") for commit in rig.commits(bare)[-4:]] == ["put", "expire"] * 2
+
+
+def test_what_is_renewed_stays_and_makes_commits_of_its_ledger_alone(bare: Path) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, put("kept", 2), put("other"))
+        files = rig.git(bare, "rev-parse", "main:clusters")
+        (answer,) = rig.book(generator, renew("kept"))
+        assert answer.outcome == "booked"
+        assert rig.git(bare, "rev-parse", "main:clusters") == files
+        wait_until_gone(generator, "other")
+        rig.book(generator, put("kept", "1h"))
+    assert [values(commit, "Demand-Id") for commit in expiries(bare)] == [["other"]]
+    assert rig.commits(bare)[-1].summary.startswith("Renew edge/kept")
+    rig.assert_sound(bare)
+
+
+def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(bare: Path) -> None:
+    now = _now()
+    leave_in_outbox(bare, "op-put", put("d", 60), now - timedelta(seconds=100))
+    assert rig.restart(bare)
+    # the record says that it ended 40 s ago; the renewal came before, and no one could take it up
+    leave_in_outbox(bare, "op-renew", renew("d"), now - timedelta(seconds=50))
+    with rig.running(bare) as generator:
+        rig.wait_until(lambda: "op-renew" in rig.operations(bare), "the renewal is taken up")
+        assert held(generator, "d")
+    assert expiries(bare) == []
+
+
+def test_what_another_generator_renewed_is_kept(
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, logger="demandops")
+    with rig.running(url) as first, rig.running(url) as second:
+        rig.book(first, put("d"))
+        rig.book(second, put("d", "1h"))
+        assert held(first, "d")[0].lease != held(second, "d")[0].lease
+        rig.wait_until(
+            lambda: held(first, "d")[0].lease == held(second, "d")[0].lease,
+            "the first has tried to release it, and learnt better",
+        )
+    assert "the state repo has moved" in caplog.text
+    assert expiries(bare) == []
+    assert rig.claims(bare, "edge/d")
+    rig.assert_sound(bare)
+
+
+def test_an_idle_generator_releases_what_another_process_booked(
+    bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ``demandops request`` beside ``demandops serve``."""
+    monkeypatch.setattr(settling, "_LONGEST_WAIT_S", 0.2)  # between two looks; a minute else
+    with rig.running(bare) as idle:
+        with rig.running(bare) as other:
+            rig.book(other, put("d", 1))
+        rig.wait_until(lambda: expiries(bare), "'d' is released")
+        wait_until_gone(idle, "d")
+    rig.assert_sound(bare)
+
+
+def test_two_generators_release_once(url: str, bare: Path) -> None:
+    with rig.running(url) as first, rig.running(url) as second:
+        rig.book(first, put("d"))
+        rig.book(second, put("other", None))  # so that it knows of the first one
+        assert held(second, "d")
+        wait_until_gone(first, "d")
+        wait_until_gone(second, "d")
+    assert [values(commit, "Demand-Id") for commit in expiries(bare)] == [["d"]]
+    rig.assert_sound(bare)
+
+
+def test_a_hand_in_counts_once_though_the_remote_moved(
+    url: str, bare: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, logger="demandops")
+    _with_policy(bare, ", quotas: {demandsPerMinute: 2}")
+    person = Person(bare, tmp_path / "person")
+    with rig.running(url) as generator:
+        for number in range(2):
+            person.change({"README.md": f"Version {number}.\n"}, "Ours")
+            (answer,) = rig.book(generator, put(f"d{number}", None))
+            assert answer.outcome == "booked"
+        assert caplog.text.count("the state repo has moved") == 2
+        with pytest.raises(Refused) as refused:
+            rig.book(generator, put("d2", None))
+        assert [found.code for found in refused.value.faults] == ["quota", "quota"]
+        (answer,) = rig.book(generator, put("d2", None, requesters=["vehicle03"]))
+    assert answer.outcome == "booked"
+
+
+def test_odd_goals_are_refusals_and_no_faults_of_the_generator(
+    bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Through the outbox and a real commit, for what could break there."""
+    hostile = [
+        put("d", lease=True),
+        put("d", lease=1.5),  # type: ignore[arg-type]
+        put("d", lease=10**5000),
+        put("d", lease="9" * 5000 + "s"),
+        put("../../etc/passwd"),
+        put("d\nOperation: expire"),
+        put("d" * 1025),
+        put("d", requesters=[]),
+        put("d", requesters=[""]),
+        put("d", colour={"deep": json.loads("[" * 900 + "]" * 900)}),
+        put("d", operation="destroy"),
+        put("d", applications=[None, 7, "x", []]),
+        put("d", applications={"id": "x"}),
+        put("d", operation="release"),
+    ]
+    with rig.running(bare) as generator:
+        tip = rig.tip(bare)
+        for goal in hostile:
+            with pytest.raises(Refused):
+                rig.book(generator, goal)
+        assert rig.tip(bare) == tip
+        names = ["d" * 1024, "<a@b> (c), d", "ü" * 200, "a: b", "-rf", "#1", "🚗/🚕", "%s\\n$(x)"]
+        for name in names:
+            rig.book(generator, put(name, None, who=name))
+    assert "a fault of the generator" not in caplog.text
+    made = rig.commits(bare)[-len(names) :]
+    assert [values(commit, "Demand-Id") for commit in made] == [[name] for name in names]
+    assert [set(values(commit, "Requester")) for commit in made] == [
+        {name, "station00"} for name in names
+    ]
+    with rig.running(bare) as generator:
+        assert {claim.demand for claim in generator.snapshot.state.ledger} == set(names)
+        for name in names:
+            release = {"kind": "Demand", "operation": "release", "demand": name}
+            rig.book(generator, release | {"requesters": [name]})
+    assert rig.claims(bare) == []
+    rig.assert_sound(bare, verify_last=3)

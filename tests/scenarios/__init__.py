@@ -1,0 +1,1 @@
+"""What must come of demands, told as YAML: see ``README.md``."""

@@ -1,0 +1,413 @@
+"""Scenarios: how they are read, and a state repo in memory to run them on.
+
+Time passes only where a scenario says so. Leases are looked at as the generator does, with its own
+clock, after every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, model_validator
+
+from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.model import Frozen, parse_file
+from generator.catalog.policy import seconds_of
+from generator.decision import Decision, State, decide, rendered
+from generator.demand.request import DemandRequest, Operation
+from generator.errors import Fault, Refused
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger
+from generator.plan.bookkeeping import as_data, bookkeeping
+from generator.service.expiry import LeaseClock
+from generator.service.throttle import Throttle
+from generator.staterepo import layout
+
+HERE = Path(__file__).parent
+_APPDEFS = HERE.parent / "appdefs"
+START = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
+
+
+# ---- what a scenario says ----
+
+
+class Told(Frozen):
+    """A fault that must be told: its code, its field, and words of its message."""
+
+    code: str = "invalid"
+    file: str = ""
+    field: str = ""
+    says: list[str] = Field(default_factory=list)
+
+    def fits(self, found: Fault) -> bool:
+        words = all(word in found.message for word in self.says)
+        return (self.code, self.file, self.field) == (found.code, found.file, found.field) and words
+
+
+_CHECKS = (
+    "gives", "refused", "expires", "runs", "connections", "carries", "desired", "leases", "holds",
+    "warns",
+)  # fmt: skip
+
+
+class Step(Frozen):
+    """One thing that happens and what must come of it; only what is listed is compared.
+
+    ``after`` lets time pass, ``clock`` sets the wall clock alone, by a duration that may be
+    negative. ``restart`` forgets what a generator has in memory, ``config`` is laid over the
+    scenario's from here on, as by a person's commit. ``expires`` are the demands that
+    the generator releases then, in order; none, where it is left out.
+    """
+
+    why: str = ""
+    after: str = "0s"
+    clock: str = ""
+    restart: bool = False
+    config: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    send: dict[str, Any] | None = None
+    gives: Literal["booked", "released", "unchanged"] | None = None
+    refused: list[Told] | None = None
+    warns: list[str] | None = None
+    expires: list[str] | None = None
+    runs: dict[str, list[str]] | None = None
+    connections: dict[str, list[str]] | None = None
+    carries: dict[str, list[str]] | None = None
+    desired: list[str] | None = None
+    leases: dict[str, str] | None = None
+    holds: dict[str, list[str]] | None = None
+
+    @model_validator(mode="after")
+    def _checkable(self) -> Step:
+        if all(getattr(self, name) is None for name in _CHECKS):
+            raise ValueError(f"checks nothing; say one of {', '.join(_CHECKS)}")
+        if self.refused is not None and not self.refused:
+            raise ValueError("refused is empty; say which faults are told")
+        if self.holds is not None and not (self.holds and all(self.holds.values())):
+            raise ValueError("holds names no words to look for")
+        if self.send is not None and (self.gives is None) == (self.refused is None):
+            raise ValueError("a demand that is sent needs gives or refused, one of both")
+        if self.send is None and (self.gives or self.refused or self.desired or self.warns):
+            raise ValueError("gives, refused, desired and warns are about a demand; send one")
+        return self
+
+
+class Scenario(Frozen):
+    """A whole scenario. ``config`` is laid over what ``demandops init`` lays down.
+
+    Mappings in it are merged, all else replaces what stands. ``appdefs`` are further folders of
+    ``tests/appdefs``. Where the configuration itself is not valid, ``invalid`` lists its faults.
+    """
+
+    must: str = Field(min_length=1)
+    appdefs: list[Literal["recorder", "monitor"]] = Field(default_factory=list)
+    config: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    invalid: list[Told] | None = None
+    steps: list[Step] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _checkable(self) -> Scenario:
+        if bool(self.invalid) == bool(self.steps):
+            raise ValueError("needs steps, or what is invalid about its configuration: one of both")
+        return self
+
+
+def read(text: str, file: str) -> Scenario:
+    """Parse a scenario; raise ``InvalidInput`` where it could not fail."""
+    return parse_file(Scenario, text, file)
+
+
+def scenarios() -> dict[str, Path]:
+    return {path.stem: path for path in sorted(HERE.glob("*.yaml"))}
+
+
+# ---- the configuration ----
+
+
+@lru_cache(maxsize=1)
+def _skeleton() -> Mapping[str, str]:
+    return layout.files()
+
+
+def _laid_over(below: Any, above: Any) -> Any:
+    if not (isinstance(below, dict) and isinstance(above, dict)):
+        return above
+    return below | {key: _laid_over(below.get(key), value) for key, value in above.items()}
+
+
+def configuration(
+    appdefs: Iterable[str] = (), config: Mapping[str, Mapping[str, Any]] | None = None
+) -> dict[str, str]:
+    """Return the files of a state repo that people own."""
+    files = {p: text for p, text in _skeleton().items() if p.split("/")[0] in CONFIG_ROOTS}
+    overlays: list[tuple[str, Any]] = []
+    for name in appdefs:
+        for path in sorted((_APPDEFS / name).rglob("*")):
+            if path.is_file():
+                files[f"appdefs/{path.relative_to(_APPDEFS).as_posix()}"] = path.read_text()
+        chart = {"folder": "appdefs/recorder/charts/recorder", "version": "0.1.0"}
+        overlays += [
+            ("registry/charts.yaml", {"charts": {"recorder": chart}}),
+            ("registry/images.yaml", {"images": {
+                image: {"repository": f"ghcr.io/example/{image}", "tag": "v1"}
+                for image in ("driver", "recorder")
+            }}),
+        ]  # fmt: skip
+    for path, above in (*overlays, *(config or {}).items()):
+        below = yaml.safe_load(files[path]) if path in files else {}
+        files[path] = yaml.safe_dump(_laid_over(below, above), sort_keys=False)
+    return files
+
+
+# ---- the state repo ----
+
+
+class Clocks:
+    """A wall clock that can be set, and a steady one."""
+
+    def __init__(self) -> None:
+        self.now = START
+        self._steady = 0.0
+
+    def wall(self) -> datetime:
+        return self.now
+
+    def steady(self) -> float:
+        return self._steady
+
+    def pass_(self, seconds: float) -> None:
+        self.now += timedelta(seconds=seconds)
+        self._steady += seconds
+
+    def set_by(self, seconds: float) -> None:
+        self.now += timedelta(seconds=seconds)
+
+
+class World:
+    """A state repo in memory, and one generator at it."""
+
+    def __init__(self, state: State, config: Mapping[str, str]) -> None:
+        self.state = state
+        self.files: dict[str, str] = {}
+        self.clocks = Clocks()
+        self.configure(state, config)
+        self._sent = 0
+        self.restart()
+
+    def configure(self, state: State, config: Mapping[str, str]) -> None:
+        """Take a configuration in, and write what follows of it."""
+        self.state = replace(state, ledger=self.state.ledger)
+        empty = replace(state, ledger=Ledger())
+        self._standing = {**_skeleton(), **config, **rendered(empty)}
+        claims = {p: text for p, text in self.files.items() if ledger_format.kind_of(p)}
+        self.files = {**self._standing, **claims, **rendered(self.state)}
+
+    def restart(self) -> None:
+        """Forget all that is not in the state repo."""
+        self._lease_clock = LeaseClock(self.clocks.wall, self.clocks.steady)
+        self._throttle = Throttle()
+
+    def decide(self, goal: object) -> Decision:
+        """Decide a goal; nothing changes."""
+        self._sent += 1
+        operation, now = f"hand-in-{self._sent}", self.clocks.now
+        return decide(
+            self.state,
+            goal,
+            now,
+            self.files.get,
+            throttle=lambda request, catalog: self._throttle.faults(
+                request, catalog, operation, now
+            ),
+        )
+
+    def take(self, goal: object) -> Decision | Refused:
+        """Decide a goal and commit what comes of it, or return the refusal."""
+        before = dict(self.files)
+        try:
+            decision = self.decide(goal)
+        except Refused as refusal:
+            assert self.files == before, "a refused demand changed something"
+            return refusal
+        self.state = decision.state
+        for path, text in decision.files.items():
+            assert self.files.get(path) != text, f"a file that does not change is written: {path}"
+            if text is None:
+                del self.files[path]
+            else:
+                self.files[path] = text
+        return decision
+
+    def look(self) -> list[str]:
+        """Release what has expired, one commit for each demand; return the demands."""
+        now, claims = self._lease_clock.ended(self.state.ledger)
+        done = []
+        for demand in dict.fromkeys(claim.demand for claim in claims):
+            request = DemandRequest(id=demand, operation=Operation.EXPIRE, demand=demand)
+            taken = self.take(request)
+            assert isinstance(taken, Decision)
+            assert taken.files, f"nothing of '{demand}' was released at {now}"
+            done.append(demand)
+        return done
+
+    def books(self) -> dict[str, dict[str, Any]]:
+        """Return the bookkeeping as ``demandops bookkeeping`` prints it, without its commit."""
+        data = as_data(bookkeeping(self.state.ledger, self.state.catalog), "")
+        return {"services": data["services"], "connections": data["connections"]}
+
+    def runs(self) -> dict[str, list[str]]:
+        """Return who requests each service, which is told by what it is for."""
+        return {
+            f"{entry['service']} for {_purpose(entry)} on {entry['node']}": entry["requesters"]
+            for entry in self.books()["services"].values()
+        }
+
+    def leases(self) -> dict[str, datetime]:
+        """Return the recorded ends by demand, the last of each."""
+        found: dict[str, datetime] = {}
+        for claim in self.state.ledger:
+            if claim.lease:
+                found[claim.demand] = max(
+                    claim.lease.until, found.get(claim.demand, claim.lease.until)
+                )
+        return found
+
+    def rendered(self) -> dict[str, str]:
+        """Return what stands below ``clusters/`` because it is demanded."""
+        return {
+            path: text
+            for path, text in self.files.items()
+            if path.startswith("clusters/") and path not in self._standing
+        }
+
+    def assert_sound(self) -> None:
+        """The files say what the books say, and nothing else is there."""
+        claims = [
+            ledger_format.read(text, path)
+            for path, text in self.files.items()
+            if ledger_format.kind_of(path)
+        ]
+        assert rebuilt(claims) == self.state.ledger
+        asked = rendered(self.state)
+        there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
+        names = sorted(there.keys() ^ asked.keys())
+        assert not names, f"these are there and not asked for, or the other way round: {names}"
+        assert there == asked
+
+
+def rebuilt(claims: Iterable[Any]) -> Ledger:
+    """Return the ledger that holds ``claims``, put in one by one."""
+    ledger = Ledger()
+    for claim in claims:
+        ledger = ledger.replace(claim.key, claim)
+    return ledger
+
+
+def _purpose(entry: Mapping[str, Any]) -> str:
+    if entry["source"] is None:
+        return ", ".join(entry["applications"])
+    return f"{entry['source']} {entry['source_topic']}"
+
+
+# ---- the run ----
+
+
+def run(scenario: Scenario) -> None:
+    """Take every step and compare what the scenario says of it."""
+    files = configuration(scenario.appdefs, scenario.config)
+    world = World(State.of(load(files), Ledger()), files)
+    for number, step in enumerate(scenario.steps, 1):
+        if step.config:
+            files = configuration(scenario.appdefs, _laid_over(scenario.config, step.config))
+            world.configure(State.of(load(files), Ledger()), files)
+        place = f"step {number}{f' ({step.why})' if step.why else ''}"
+        _take(step, world, place)
+        try:
+            world.assert_sound()
+        except AssertionError as error:
+            raise AssertionError(f"{place}: {error}") from error
+
+
+def _take(step: Step, world: World, place: str) -> None:
+    world.clocks.pass_(seconds_of(step.after))
+    if step.clock:
+        sign = -1 if step.clock.startswith("-") else 1
+        world.clocks.set_by(sign * seconds_of(step.clock.removeprefix("-")))
+    if step.restart:
+        world.restart()
+    assert world.look() == (step.expires or []), f"{place}: these must expire, and no others"
+    if step.send is not None:
+        for problem in _sent(step, world.take(step.send)):
+            raise AssertionError(f"{place}: {problem}")
+    compared = {
+        "runs": world.runs,
+        "connections": lambda: _of_connections(world, "requesters"),
+        "carries": lambda: _of_connections(world, "topics"),
+        "leases": lambda: {d: _since_start(end) for d, end in sorted(world.leases().items())},
+    }
+    for name, found in compared.items():
+        wanted = getattr(step, name)
+        if wanted is not None:
+            assert found() == wanted, f"{place}: {name}"
+    for name, words in (step.holds or {}).items():
+        texts = [
+            t for path, t in world.rendered().items() if path.rsplit("/", 1)[1].startswith(name)
+        ]
+        assert len(texts) == 1, f"{place}: {len(texts)} releases are called {name}…"
+        missing = [word for word in words if word not in texts[0]]
+        assert not missing, f"{place}: {name} holds no {missing}:\n{texts[0]}"
+
+
+def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
+    """Yield what of a demand's answer is not as the step says."""
+    if isinstance(taken, Refused):
+        told = "\n".join(f"{found.code}: {found}" for found in taken.faults)
+        if step.refused is None:
+            yield f"is refused:\n{told}"
+        elif not same_faults(step.refused, taken.faults):
+            yield f"is refused otherwise:\n{told}"
+        return
+    if step.refused is not None:
+        yield f"is {taken.outcome}, but must be refused"
+    elif taken.outcome != step.gives:
+        yield f"is {taken.outcome}, but must be {step.gives}"
+    if bool(taken.files) != (taken.outcome != "unchanged"):
+        yield f"is {taken.outcome}, and makes {'a' if taken.files else 'no'} commit"
+    signs = {"start": "+", "change": "~", "stop": "-"}
+    desired = sorted(f"{signs[release.change]} {release.what}" for release in taken.releases)
+    if step.desired is not None and desired != sorted(step.desired):
+        yield f"the desired state changes otherwise: {desired}"
+    if step.warns is not None:
+        fitting = len(taken.warnings) == len(step.warns) and all(
+            words in warning for words, warning in zip(step.warns, taken.warnings, strict=False)
+        )
+        if not fitting:
+            yield f"warns of {taken.warnings}"
+
+
+def same_faults(wanted: Iterable[Told], found: Iterable[Fault]) -> bool:
+    """Tell whether each fault found is one that was expected, and the other way round."""
+    wanted, found = list(wanted), list(found)
+    return len(wanted) == len(found) and all(
+        any(told.fits(fault) for fault in found) for told in wanted
+    ) and all(any(told.fits(fault) for told in wanted) for fault in found)  # fmt: skip
+
+
+def _of_connections(world: World, what: str) -> dict[str, list[str]]:
+    return {id: entry[what] for id, entry in world.books()["connections"].items()}
+
+
+def _since_start(moment: datetime) -> str:
+    """Return a moment as the scenario's own time: ``1h30m``."""
+    rest = int((moment - START).total_seconds())
+    parts = []
+    for unit, seconds in (("h", 3600), ("m", 60), ("s", 1)):
+        count, rest = divmod(rest, seconds)
+        if count:
+            parts.append(f"{count}{unit}")
+    return "".join(parts) or "0s"

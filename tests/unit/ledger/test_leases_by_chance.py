@@ -1,0 +1,345 @@
+"""Demands put, renewed, released and left to expire in any order, as time passes and with restarts.
+
+Held against ``tests/model/leases.py``, which knows what is promised and not the program.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+from random import Random
+from types import MappingProxyType
+from typing import Any
+
+from hypothesis import given, note
+from hypothesis import strategies as st
+from model.leases import BY_MESSAGE, Goal, Promises, Subject
+from trying import chances, examples
+
+from generator.catalog.catalog import load
+from generator.catalog.identifiers import id_problem
+from generator.decision import Decision, State
+from generator.demand.claim import ApplicationClaim, Claim, ConnectionClaim
+from generator.demand.lease import LONGEST_S, Lease
+from generator.demand.request import ConnectionType, InputTopic
+from generator.demand.route import Route, united
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger
+from tests.scenarios import running
+
+SLACK_S = 30
+DOMAIN = {
+    "name": "perception",
+    "namespace": "perception",
+    "nodes": ["*"],
+    "leases": {"slack": f"{SLACK_S}s"},
+}
+FILES = running.configuration((), {"policy/access-domains.yaml": {"domains": [DOMAIN]}})
+EMPTY = State.of(load(FILES), Ledger())
+DEMANDS = ("d0", "d1", "D1", "d/2")
+PEOPLE = ("vehicle00", "vehicle01", "station00")
+LEASES = (None, 10, 60, 90)
+PAUSES = (0, 0, 1, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 3600)
+
+
+class Maker:
+    """Makes requests by chance: few demands, people and subjects, so that they meet."""
+
+    def __init__(self, random: Random) -> None:
+        self._random = random
+        self._puts: list[Goal] = []
+
+    def any(self) -> Goal:
+        kind = self._random.randrange(20)
+        if self._puts and kind < 9:
+            return self._of_known(kind)
+        if kind < 14:
+            self._puts.append(self.put())
+            return self._puts[-1]
+        if kind < 16:
+            return self._named("release" if kind == 14 else "renew")
+        return self._message(shutdown=kind > 17)
+
+    def _of_known(self, kind: int) -> Goal:
+        """Return a renewal of what was put, the same again, the same with another lease."""
+        known = self._random.choice(self._puts[-2:])
+        if kind < 3:
+            return {key: known[key] for key in ("kind", "demand", "requesters")} | {
+                "operation": "renew"
+            }
+        return known if kind < 6 else known | {"lease": self._random.choice(LEASES[1:])}
+
+    def put(self) -> Goal:
+        made = self._named("put")
+        lease = self._random.choice(LEASES)
+        if lease is not None:
+            made["lease"] = lease
+        made["applications"] = [self._application(id) for id in self._some("ab")]
+        made["connections"] = [self._connection(id) for id in self._some("xy")]
+        return made
+
+    def _named(self, operation: str) -> Goal:
+        people = self._some(PEOPLE) or [self._random.choice(PEOPLE)]
+        return {
+            "kind": "Demand",
+            "operation": operation,
+            "demand": self._random.choice(DEMANDS),
+            "requesters": people,
+        }
+
+    def _some(self, of: Any) -> list[Any]:
+        return [one for one in of if self._random.randrange(2)]
+
+    def _application(self, id: str) -> dict[str, Any]:
+        topics = [{"topic": f"/ego{number}", "source": "vehicle00"} for number in self._some("12")]
+        return {
+            "id": id,
+            "type": "object-detection-fusion",
+            # mostly the same: else all contradict each other
+            "node": self._random.choice(["edge", "edge", "edge", "cloud"]),
+            "connect": "none",
+            "inputs": {"ego_data": topics or [{"topic": "/ego3", "source": "vehicle00"}]},
+        }
+
+    def _connection(self, id: str) -> dict[str, Any]:
+        topics = [{"source": f"/{name}"} for name in self._some("pq")]
+        if not self._random.randrange(6):
+            topics = [{"source": "/p", "target": "/elsewhere"}]
+        source = "station00" if not self._random.randrange(6) else "vehicle00"
+        topics = topics or [{"source": "/r"}]
+        return {"id": id, "source": source, "target": "edge", "topics": topics}
+
+    def _message(self, *, shutdown: bool) -> Goal:
+        topics = [f"/{name}" for name in self._some("pq")]
+        topics = topics if shutdown else topics or ["/p"]
+        item = {
+            "id": self._random.choice("xy"),
+            "type": 1,
+            "requester_ids": self._some(PEOPLE) or [PEOPLE[0]],
+            "source_node_id": "vehicle00",
+            "target_node_id": "edge",
+            "source_topics": topics,
+            "target_topics": topics,
+        }
+        request = self._random.choice(["m0", "m1"])
+        return {"id": request, "shutdown": shutdown, "connections": [item]}
+
+
+Name = tuple[str, Subject]
+
+
+def name_of(claim: Claim) -> Name:
+    """Return what the model knows a claim by."""
+    by_message = f"{BY_MESSAGE}{claim.request} {sorted(claim.requesters)}"
+    demand = claim.demand if claim.demand in DEMANDS else by_message
+    return demand, (claim.subject.kind.value, claim.subject.id)
+
+
+def claims_of(world: running.World) -> dict[Name, tuple[dict[str, Any], frozenset[str]]]:
+    found = {}
+    for claim in world.state.ledger:
+        what: dict[str, Any]
+        if isinstance(claim, ApplicationClaim):
+            inputs = {
+                role: frozenset((topic.source, topic.topic) for topic in topics)
+                for role, topics in claim.inputs.items()
+            }
+            what = {"type": claim.appdef, "node": claim.node, "inputs": inputs}
+            what["parameters"] = dict(claim.parameters)
+        else:
+            what = {"source": claim.source, "target": claim.target, "topics": _names(claim)}
+        found[name_of(claim)] = what, frozenset(claim.requesters)
+    return found
+
+
+def _names(claim: ConnectionClaim) -> dict[str, str]:
+    return {source: route.target for source, route in claim.topics.items()}
+
+
+def restart(world: running.World, random: Random) -> None:
+    """Go on from the files alone, read in any order."""
+    claims = [
+        ledger_format.read(text, path)
+        for path, text in world.files.items()
+        if ledger_format.kind_of(path)
+    ]
+    random.shuffle(claims)
+    ledger = running.rebuilt(claims)
+    assert (ledger.claims, ledger.index, ledger.minutes) == (
+        world.state.ledger.claims,
+        world.state.ledger.index,
+        world.state.ledger.minutes,
+    )
+    world.state = replace(world.state, ledger=ledger)
+    world.restart()
+
+
+def assert_released(world: running.World, promises: Promises, now: int) -> None:
+    """Look at the leases: what must go goes, what may not does not, one commit a demand."""
+    before = set(claims_of(world))
+    demands = world.look()
+    assert len(demands) == len(set(demands))
+    released = before - set(claims_of(world))
+    assert promises.must_go(now) <= released <= promises.may_go(now)
+    assert {demand for demand, _ in released} == set(demands)
+    promises.gone(released)
+
+
+def assert_outcome(taken: Any, expected: str, promises: Promises) -> None:
+    outcome = taken.outcome if isinstance(taken, Decision) else "refused"
+    if (outcome, expected) == ("booked", "unchanged"):
+        assert taken.releases == ()
+        for change in taken.changes.claims:  # only the time that is recorded
+            assert change.before.lease != change.after.lease
+            assert change.before.booked == change.after.booked
+    else:
+        assert outcome == expected, taken
+
+
+def assert_recorded(world: running.World, promises: Promises) -> None:
+    """The record lags behind what was promised by the slack at most, and is never ahead."""
+    for claim in world.state.ledger:
+        demand, subject = name_of(claim)
+        promised = promises.held[demand][subject].promised
+        assert (claim.lease is None) == (promised is None)
+        if claim.lease is not None and promised is not None:
+            end = running.START + timedelta(seconds=promised)
+            assert claim.lease.until <= end <= claim.lease.ends
+
+
+@examples(90)
+@given(chances, st.integers(1, 16))
+def test_what_was_promised_is_kept(random: Random, length: int) -> None:
+    world, promises, maker = running.World(EMPTY, FILES), Promises(SLACK_S), Maker(random)
+    now = 0
+    for _ in range(length):
+        pause = random.choice(PAUSES)
+        now += pause
+        world.clocks.pass_(pause)
+        if not random.randrange(4):
+            restart(world, random)
+        note(f"at {now}:")
+        assert_released(world, promises, now)
+        goal = maker.any()
+        note(repr(goal))
+        expected = promises.take(goal, now)
+        taken = world.take(goal)
+        assert_outcome(taken, expected, promises)
+        assert claims_of(world) == promises.claims()
+        assert_recorded(world, promises)
+        if isinstance(taken, Decision) and taken.request.operation.asks:
+            again = world.take(goal)
+            assert isinstance(again, Decision)
+            assert (again.outcome, dict(again.files)) == ("unchanged", {})
+    world.assert_sound()
+    leave_all(world, promises, now)
+
+
+def leave_all(world: running.World, promises: Promises, now: int) -> None:
+    """Let every lease end and release the rest: nothing of anybody stays."""
+    world.clocks.pass_(2 * 3600)
+    assert_released(world, promises, now + 2 * 3600)
+    for claim in list(world.state.ledger):
+        if world.state.ledger.get(claim.key) is None:
+            continue  # went with another of its demand
+        release = {"kind": "Demand", "operation": "release", "demand": claim.demand}
+        world.take(release | {"requesters": list(claim.requesters)})
+    assert world.state.ledger == Ledger()
+    assert world.rendered() == {}
+    assert not [path for path in world.files if ledger_format.kind_of(path)]
+
+
+# What is written is what is read
+
+letters = st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Zs", "Zl", "Zp"])
+ids = st.text(letters, min_size=1, max_size=20).filter(lambda text: not id_problem(text))
+topics = st.from_regex(r"(/[a-z_]{1,9}){1,3}", fullmatch=True)
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(st.characters(codec="utf-8")),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.text(st.characters(codec="utf-8")), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+moments = st.datetimes(
+    datetime(2000, 1, 1), datetime(2100, 1, 1), timezones=st.sampled_from([
+        timezone.utc, timezone(timedelta(hours=5, minutes=45)), timezone(timedelta(hours=-11)),
+    ]),
+)  # fmt: skip
+leases = st.none() | st.builds(Lease, st.integers(1, LONGEST_S), st.integers(0, LONGEST_S), moments)
+people = st.sets(ids, min_size=1, max_size=3).map(lambda found: tuple(sorted(found)))
+common = {
+    "demand": ids, "request": ids, "requesters": people, "booked": moments, "lease": leases,
+}  # fmt: skip
+inputs = st.dictionaries(
+    st.sampled_from(["ego_data", "point_cloud"]),
+    st.sets(st.builds(InputTopic, topics, ids), min_size=1, max_size=3).map(
+        lambda found: tuple(sorted(found))
+    ),
+)
+applications = st.builds(
+    ApplicationClaim,
+    application=ids,
+    appdef=ids,
+    node=ids,
+    inputs=inputs.map(lambda found: MappingProxyType(dict(sorted(found.items())))),
+    parameters=st.dictionaries(ids, values, max_size=3).map(MappingProxyType),
+    version=st.just("") | st.sampled_from(["1.0.0", "1e3", "0x10", "next", "on", "2024-01-01"]),
+    **common,
+)
+routes = st.builds(Route, topics, topics, reverse=st.booleans(), qos=st.integers(0, 2))
+connections = st.builds(
+    ConnectionClaim,
+    connection=ids,
+    type=st.sampled_from([ConnectionType.MQTT, ConnectionType.ZENOH, ConnectionType.ROS]),
+    source=ids,
+    target=ids,
+    broker=st.just("") | ids,
+    topics=st.lists(routes, min_size=1, max_size=3).map(lambda r: MappingProxyType(united(r))),
+    **common,
+)
+
+
+@examples(150)
+@given(applications | connections)
+def test_a_claim_is_read_as_it_was_written(claim: Claim) -> None:
+    path = ledger_format.path_of(claim.key)
+    text = ledger_format.write(claim)
+    found = ledger_format.read(text.encode().decode(), path)
+    assert found == claim
+    assert ledger_format.write(found) == text
+    if isinstance(found, ApplicationClaim) and isinstance(claim, ApplicationClaim):
+        assert repr(sorted(found.parameters.items())) == repr(sorted(claim.parameters.items()))
+
+
+@examples(50)
+@given(st.lists(applications | connections, max_size=8), chances)
+def test_the_index_is_that_of_a_ledger_built_in_any_order(
+    claims: list[Claim], random: Random
+) -> None:
+    ledger = running.rebuilt(claims)
+    for claim in random.sample(claims, len(claims) // 2):
+        ledger = ledger.replace(claim.key, None)
+    rest = list(ledger)
+    random.shuffle(rest)
+    again = running.rebuilt(rest)
+    assert (ledger.claims, ledger.index, ledger.minutes) == (
+        again.claims,
+        again.index,
+        again.minutes,
+    )
+    ends = [claim.lease.ends for claim in rest if claim.lease]
+    assert ledger.next_end() == min(ends, default=None)
+    for now in ends:
+        gone = ledger.ended(now)
+        assert {claim.key for claim in gone} == {
+            claim.key for claim in rest if claim.lease and claim.lease.ends < now
+        }
+        assert [c.lease.ends for c in gone if c.lease] == sorted(
+            c.lease.ends for c in gone if c.lease
+        )

@@ -1,0 +1,146 @@
+"""The clock that tells which leases are over: what it does when the machine's clock is set."""
+
+from __future__ import annotations
+
+import logging
+from datetime import timedelta
+from types import MappingProxyType
+
+import pytest
+
+from generator.demand.claim import ConnectionClaim
+from generator.demand.lease import Lease
+from generator.demand.request import ConnectionType
+from generator.demand.route import Route
+from generator.ledger.ledger import Ledger
+from generator.service.expiry import LeaseClock
+from tests.scenarios.running import START, Clocks, rebuilt
+
+
+def leased(*terms: tuple[str, int, int]) -> Ledger:
+    """Return a ledger with a claim for each (demand, seconds, slack), asked for at the start."""
+    return rebuilt(
+        ConnectionClaim(
+            connection=f"{number}",
+            demand=demand,
+            request=demand,
+            requesters=("a",),
+            booked=START,
+            type=ConnectionType.MQTT,
+            source="vehicle00",
+            target="edge",
+            broker="",
+            topics=MappingProxyType({"/a": Route("/a", "/a")}),
+            lease=Lease(seconds, slack, START + timedelta(seconds=seconds)),
+        )
+        for number, (demand, seconds, slack) in enumerate(terms)
+    )
+
+
+@pytest.fixture
+def clocks() -> Clocks:
+    return Clocks()
+
+
+@pytest.fixture
+def clock(clocks: Clocks) -> LeaseClock:
+    return LeaseClock(clocks.wall, clocks.steady)
+
+
+def ended(clock: LeaseClock, ledger: Ledger) -> list[str]:
+    return [claim.demand for claim in clock.ended(ledger)[1]]
+
+
+def test_nothing_ends_before_its_slack_has_passed(clocks: Clocks, clock: LeaseClock) -> None:
+    ledger = leased(("b", 61, 0), ("a", 50, 10), ("c", 3600, 0))
+    clocks.pass_(60)
+    assert ended(clock, ledger) == []
+    clocks.pass_(0.5)
+    assert ended(clock, ledger) == ["a"]
+    clocks.pass_(0.5)
+    assert ended(clock, ledger) == ["a"]
+    clocks.pass_(0.5)
+    assert ended(clock, ledger) == ["a", "b"]
+    assert clock.ended(ledger)[0] == clocks.now
+
+
+def test_it_is_set_back_and_nothing_goes_early(clocks: Clocks, clock: LeaseClock) -> None:
+    ledger = leased(("a", 60, 0))
+    clocks.set_by(-86_400)
+    clocks.pass_(3600)
+    assert ended(clock, ledger) == []
+    assert clock.pause(ledger, 60.0) == 60.0
+
+
+@pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
+def test_it_is_set_forward_and_a_full_term_is_granted(
+    clocks: Clocks,
+    clock: LeaseClock,
+    steps: list[int],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    ledger = leased(("short", 60, 5), ("long", 600, 5))
+    for step in steps:
+        clocks.set_by(step)
+        assert ended(clock, ledger) == []
+    assert "the clock went forward by 3600 s; every lease gets its full term" in caplog.text
+    clocks.pass_(65)
+    assert ended(clock, ledger) == []
+    clocks.pass_(1)
+    assert ended(clock, ledger) == ["short"]
+    clocks.pass_(539)
+    assert ended(clock, ledger) == ["short"]
+    clocks.pass_(1)
+    assert ended(clock, ledger) == ["short", "long"]
+
+
+def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clocks, clock: LeaseClock) -> None:
+    ledger = leased(("a", 60, 0))
+    clocks.pass_(50)
+    clocks.set_by(3600)
+    clocks.pass_(50)
+    assert ended(clock, ledger) == []
+    clocks.pass_(61)
+    assert ended(clock, ledger) == ["a"]
+
+
+def test_a_machine_that_slept_grants_a_full_term(clocks: Clocks, clock: LeaseClock) -> None:
+    ledger = leased(("a", 60, 0))
+    clocks.set_by(8 * 3600)  # the steady clock stands still meanwhile
+    assert ended(clock, ledger) == []
+
+
+def test_a_clock_that_is_drawn_on_slowly_is_no_step(
+    clocks: Clocks, clock: LeaseClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    ledger = leased(("a", 60, 0))
+    for _ in range(31):
+        clocks.pass_(1)
+        clocks.set_by(1)
+        clock.pause(ledger, 60.0)
+    assert ended(clock, ledger) == ["a"]
+    assert caplog.text == ""
+
+
+def test_none_of_a_demand_goes_while_a_part_is_granted_more(
+    clocks: Clocks, clock: LeaseClock
+) -> None:
+    ledger = leased(("both", 60, 0), ("both", 600, 0), ("other", 60, 0))
+    clocks.set_by(3600)
+    assert ended(clock, ledger) == []
+    clocks.pass_(61)
+    assert ended(clock, ledger) == ["other"]
+    clocks.pass_(540)
+    assert ended(clock, ledger) == ["both", "other", "both"]
+
+
+def test_it_looks_again_when_the_first_lease_ends(clocks: Clocks, clock: LeaseClock) -> None:
+    ledger = leased(("a", 20, 10), ("b", 600, 0))
+    assert clock.pause(ledger, 60.0) == pytest.approx(30.01)
+    clocks.pass_(29.5)
+    assert clock.pause(ledger, 60.0) == 1.0
+    clocks.pass_(100)
+    assert clock.pause(ledger, 60.0) == 1.0, "what cannot be released does not keep it busy"
+    assert clock.pause(Ledger(), 60.0) == 60.0
+    assert clock.pause(leased(("b", 86_400, 0)), 60.0) == 60.0
