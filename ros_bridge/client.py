@@ -39,6 +39,8 @@ _DEPTH = 100
 _RENEW_AFTER = 1 / 3
 """Of its lease; two more attempts fit before it ends."""
 _RETRY_S = 5.0
+_UNHEARD_S = 5.0
+"""A goal is accepted within milliseconds; nobody heard one that is not within this."""
 
 
 class DemandError(Exception):
@@ -184,19 +186,36 @@ class DemandClient:
         deadline = time.monotonic() + self.timeout_s
         if not self._client.wait_for_server(timeout_sec=self.timeout_s):
             raise DemandError("no-server", f"nobody takes demands on {self._action_name}")
-        sent = self._client.send_goal_async(
-            goal, feedback_callback=lambda fb: told(fb.feedback.stage, fb.feedback.message)
-        )
-        handle = self._await(sent, deadline)
+        handle, lost = self._accepted(goal, told, deadline)
         if not handle.accepted:
             raise DemandError("rejected", "the node takes no demands now; send it again later")
         answer = self._await(handle.get_result_async(), deadline)
         result = answer.result
+        if lost and result.code == "not-held" and goal.operation == Demand.Goal.OPERATION_RELEASE:
+            return Answer("released", "", 0.0, ("released by an attempt that got lost",), "pushed")
         if answer.status != GoalStatus.STATUS_SUCCEEDED:
             raise DemandError(result.code or "aborted", result.message)
         lease_s = result.lease.sec + result.lease.nanosec / 1e9
         warnings = tuple(result.warnings)
         return Answer(result.outcome, result.commit, lease_s, warnings, result.reached)
+
+    def _accepted(self, goal: Any, told: Told, deadline: float) -> tuple[Any, bool]:  # noqa: ANN401
+        """Send a goal until the node has heard it; tell whether an attempt got lost.
+
+        A node that has not yet found this client loses its response. Sending again does no harm:
+        a demand that is put twice counts once.
+        """
+        lost = False
+        while True:
+            sent = self._client.send_goal_async(
+                goal, feedback_callback=lambda fb: told(fb.feedback.stage, fb.feedback.message)
+            )
+            try:
+                return self._await(sent, min(deadline, time.monotonic() + _UNHEARD_S)), lost
+            except DemandError:
+                if time.monotonic() >= deadline:
+                    raise
+                lost = True
 
     def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
         done = Event()

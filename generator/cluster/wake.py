@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Mapping
@@ -20,6 +21,8 @@ from generator.render.flux import domains_in_use
 log = logging.getLogger("demandops")
 
 _TIMEOUT_S = 5.0
+_SPACING_S = 1.0
+"""Two fetches within a second were seen to leave source-controller with a broken artifact."""
 _REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
 
 
@@ -32,6 +35,8 @@ class Wake:
         self._apis: dict[str, Any] = {}
         self._due = threading.Event()
         self._stopping = False
+        self._stop = threading.Event()
+        self._woken_at = -_SPACING_S
         self._thread = threading.Thread(target=self._run, name="demandops-wake", daemon=True)
         self._thread.start()
 
@@ -43,6 +48,7 @@ class Wake:
     def close(self) -> None:
         """Wake for the last push, if that is still due, and stop."""
         self._stopping = True
+        self._stop.set()
         self._due.set()  # the thread looks once more; with nothing pushed ever it just ends
         self._thread.join(2 * _TIMEOUT_S)
 
@@ -50,6 +56,9 @@ class Wake:
         stopping = False
         while not stopping:
             self._due.wait()
+            if not self._stopping:
+                self._stop.wait(self._rest_s())
+            self._woken_at = time.monotonic()
             self._due.clear()
             stopping = self._stopping
             for name, reached in self._clusters.items():
@@ -64,6 +73,10 @@ class Wake:
                         type(error).__name__,
                     )
                     self._apis.pop(name, None)
+
+    def _rest_s(self) -> float:
+        """Return how long to wait before the next wake: pushes come in swarms."""
+        return max(0.0, self._woken_at + _SPACING_S - time.monotonic())
 
     def _wake(self, name: str, reached: Reached, catalog: Catalog) -> None:
         if reached.receiver:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from tests.e2e.rig.cluster import Rig
-from tests.e2e.rig.kube import handled
+from tests.e2e.rig.kube import Manifest, handled
 from tests.e2e.rig.tools import Report
 
 from . import expected
@@ -63,18 +64,22 @@ def wake_file(folder: Path, kubeconfig: Path) -> Path:
     return file
 
 
-def limited(domain: Domain, administrator: Path, folder: Path) -> Path:
-    """A kubeconfig that may patch the domain's GitRepositories and do nothing else."""
-    rule = {
-        "apiGroups": ["source.toolkit.fluxcd.io"],
-        "resources": ["gitrepositories"],
-        "verbs": ["patch"],
-    }
+WAKER = {
+    "apiGroups": ["source.toolkit.fluxcd.io"],
+    "resources": ["gitrepositories"],
+    "verbs": ["patch"],
+}
+
+
+def limited(
+    domain: Domain, administrator: Path, folder: Path, rules: Sequence[Manifest] = (WAKER,)
+) -> Path:
+    """A kubeconfig that has these rights in the domain's namespace and no others."""
     role = {"apiGroup": _RBAC, "kind": "Role", "name": _ACCOUNT}
     subject = {"kind": "ServiceAccount", "name": _ACCOUNT, "namespace": domain.namespace}
     domain.kube.apply(
         _object("v1", "ServiceAccount", domain),
-        _object(f"{_RBAC}/v1", "Role", domain, rules=[rule]),
+        _object(f"{_RBAC}/v1", "Role", domain, rules=list(rules)),
         _object(f"{_RBAC}/v1", "RoleBinding", domain, roleRef=role, subjects=[subject]),
         _object("v1", "Secret", domain, type="kubernetes.io/service-account-token"),
     )
