@@ -110,6 +110,19 @@ def of_target(target: Target, objects: Objects) -> Health:
     return Health("healthy")
 
 
+def since(target: Target, objects: Objects) -> str:
+    """Return since when a release is as it is, as the cluster says it; empty where it does not."""
+    kind, condition = ("HelmRelease", "Ready") if target.by_helm else ("Deployment", "Available")
+    found = objects.get((kind, target.place.namespace, target.name)) or {}
+    return str(_condition(found.get("status") or {}, condition).get("lastTransitionTime", ""))
+
+
+def applied(place: Place, objects: Objects) -> str:
+    """Return the commit that an access domain's Kustomization has applied, or nothing."""
+    found = objects.get(("Kustomization", place.namespace, place.domain)) or {}
+    return _commit((found.get("status") or {}).get("lastAppliedRevision"))
+
+
 def worst(healths: list[Health]) -> Health:
     """Return the health of the whole: the least far, one that fails before one that waits."""
     return min(

@@ -66,6 +66,16 @@ class ClusterStore:
         with self._lock:
             return all((kind, namespace) in self._read for kind in _KINDS)
 
+    def read(self, namespaces: Iterable[str]) -> None:
+        """Read some namespaces once, without a watch; ``trouble`` says what went wrong."""
+        try:
+            for namespace in namespaces:
+                for kind in _KINDS:
+                    self._put(kind, namespace, self._list(kind, namespace)["items"])
+            self.trouble = ""
+        except Exception as error:
+            self.trouble = _told(error)
+
     def refresh(self, namespace: str) -> None:
         """Read releases and then their Deployments anew: watches may lag behind each other.
 
@@ -112,8 +122,7 @@ class ClusterStore:
                 self._list_and_watch(kind, namespace)
                 pause = _FIRST_PAUSE_S
             except Exception as error:  # whatever the library meets on its way to the server
-                told = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
-                self._say(told.splitlines()[0][:300])
+                self._say(_told(error))
                 self._closed.wait(pause)
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
 
@@ -183,6 +192,11 @@ class ClusterStore:
             log.warning("cluster '%s' cannot be read (%s); trying on", self.name, trouble)
         self.trouble = trouble
         self._on_change()
+
+
+def _told(error: Exception) -> str:
+    reason = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
+    return reason.splitlines()[0][:300]
 
 
 def _version(item: dict[str, Any]) -> int:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from generator.cluster.health import Place, Target
-from generator.decision import Decision
+from generator.decision import Decision, State
 from generator.demand.claim import Subject, SubjectKind
 from generator.demand.request import DemandRequest
 from generator.errors import Refused
 from generator.ledger.ledger import Ledger
-from generator.plan.planner import ReleaseKey, affected, keys_of, plan
+from generator.plan.planner import ReleaseKey, affected, all_keys, keys_of, plan
 from generator.plan.release import Release, ServiceRelease
 
 
@@ -33,6 +33,16 @@ def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
         if release is not None:
             found.append(_target(release, wanted=new is not None))
     return tuple(dict.fromkeys(found))
+
+
+def of_state(state: State) -> list[tuple[Release, Target]]:
+    """Return every release that the state asks for, by name, and what it is to come to."""
+    found = []
+    for key in all_keys(state.ledger, state.catalog):
+        release = plan(state.ledger, state.catalog, key)
+        if release is not None:
+            found.append((release, _target(release, wanted=True)))
+    return sorted(found, key=lambda pair: (pair[1].place.cluster, pair[1].name))
 
 
 def _asked(request: DemandRequest, ledger: Ledger) -> list[Subject]:

@@ -64,6 +64,10 @@ class Reader:
         """Return the id of a commit; the newest where no revision is given."""
         return str(snapshots.commit_of(self._repository.objects, revision or self._tip).id)
 
+    def includes(self, commit: str, other: str) -> bool:
+        """Tell whether ``commit`` is ``other`` or comes after it."""
+        return self._repository.includes(commit, other)
+
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import threading
 import time
@@ -19,7 +20,7 @@ from tests.e2e.rig.cluster import Rig
 from .conftest import CLUSTER, MakeWorld
 from .test_wake import limited, wake_file
 from .view import Domain
-from .world import World
+from .world import World, demandops
 
 TIMEOUT_S = 60.0
 SHORT_S = 6.0
@@ -85,8 +86,24 @@ def test_answered_at_healthy_when_it_is_and_at_gone_when_it_is(
         assert held.answer is not None and held.answer.reached == "healthy"
         assert told[-2:] == ["reconciled", "healthy"]
         assert domain.applied() == held.commit
+    domain.wait_applied(world.tip())  # the release, which was answered at pushed
     answer = asker.put("d", [FUSION], answer="healthy")
     assert answer.outcome == "booked"
+    file = str(world.folder / "clusters.yaml")
+    told_json = demandops(
+        world.folder,
+        "status",
+        "--state-repo",
+        world.push_url,
+        "--clusters",
+        file,
+        "--output",
+        "json",
+    )
+    status = json.loads(told_json)
+    assert {row["health"] for row in status["releases"]} == {"healthy"}
+    assert {row["seen"] for row in status["releases"]} == {status["commit"]} == {answer.commit}
+    assert all(row["since"] for row in status["releases"]) and len(status["releases"]) == 4
     gone = asker.send({"operation": "release", "demand": "d", "answer": "healthy"})
     assert gone.reached == "healthy"
     assert domain.find("HelmRelease") == [] and domain.find("Deployment") == []

@@ -1,0 +1,138 @@
+"""``demandops status``: what the clusters have made of the desired state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.table import Table
+
+from generator.cli.output import (
+    console,
+    errors,
+    output_option,
+    print_json,
+    progress,
+    state_repo_option,
+)
+from generator.cluster import access
+from generator.cluster.health import Health, Target, applied, of_place, of_target, since
+from generator.cluster.store import ClusterStore
+from generator.plan.release import Release, ServiceRelease
+from generator.service import targets
+from generator.staterepo import reader
+from generator.staterepo.reader import Reader
+
+_SHORT = 10
+
+
+@click.command()
+@state_repo_option
+@click.option(
+    "--clusters",
+    "access_file",
+    envvar="DEMANDOPS_CLUSTERS",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="How the clusters are reached; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
+)
+@output_option
+def status(state_repo: str, access_file: Path | None, output: str) -> None:
+    """Show for each release what is desired, what its cluster has seen, and how it is."""
+    clusters = access.read(access_file).clusters if access_file else {}
+    with reader.opened(state_repo) as repo:
+        with progress("reading the ledger") as tell:
+            snapshot = repo.snapshot(progress=tell)
+        found = targets.of_state(snapshot.state)
+        stores = _read(clusters, [target for _, target in found])
+        commit = str(snapshot.commit)
+        rows = [_row(release, target, commit, stores, repo) for release, target in found]
+    if output == "json":
+        print_json({"commit": commit, "releases": rows})
+        return
+    console().print(_table(rows))
+    console().print(f"desired: {commit}")
+    if not clusters:
+        errors.print("no access to the clusters, so nothing is known of them: give --clusters FILE")
+
+
+def _read(
+    clusters: Mapping[str, access.Reached], found: Iterable[Target]
+) -> dict[str, ClusterStore]:
+    """Read all clusters at once: one that is away holds up no other."""
+    namespaces: dict[str, set[str]] = {}
+    for target in found:
+        namespaces.setdefault(target.place.cluster, set()).add(target.place.namespace)
+    stores = {
+        name: ClusterStore(name, reached, lambda: None)
+        for name, reached in clusters.items()
+        if reached.kubeconfig and name in namespaces
+    }
+    with ThreadPoolExecutor(max(len(stores), 1)) as pool:
+        list(pool.map(lambda store: store.read(sorted(namespaces[store.name])), stores.values()))
+    return stores
+
+
+def _row(
+    release: Release,
+    target: Target,
+    commit: str,
+    stores: Mapping[str, ClusterStore],
+    repo: Reader,
+) -> dict[str, Any]:
+    health, seen, when = _seen(target, commit, stores, repo)
+    return {
+        "release": target.name,
+        "what": _what(release),
+        "node": release.node.id,
+        "cluster": target.place.cluster,
+        "domain": target.place.domain,
+        "seen": seen or None,
+        "health": health.state if seen or health.object else "unknown",
+        "since": when or None,
+        "failing": health.failing,
+        "object": health.object or None,
+        "reason": health.reason or None,
+    }
+
+
+def _seen(
+    target: Target, commit: str, stores: Mapping[str, ClusterStore], repo: Reader
+) -> tuple[Health, str, str]:
+    store = stores.get(target.place.cluster)
+    if store is None:
+        return Health("waiting", "no access to this cluster"), "", ""
+    if store.trouble:
+        reason = f"cannot be read: {store.trouble}"
+        return Health("waiting", reason, f"cluster {store.name}"), "", ""
+    objects = store.objects()
+    health = of_place(target.place, commit, objects, repo.includes)
+    if health.state != "waiting":
+        health = of_target(target, objects)
+    return health, applied(target.place, objects), since(target, objects)
+
+
+def _what(release: Release) -> str:
+    if isinstance(release, ServiceRelease):
+        return release.key.service
+    return "connection"
+
+
+def _table(rows: Iterable[dict[str, Any]]) -> Table:
+    table = Table("Release", "What", "Node", "Cluster", "Seen", "Health", "Since", "Reason")
+    for row in rows:
+        reason = f"{row['object']}: {row['reason']}" if row["object"] else row["reason"] or ""
+        table.add_row(
+            row["release"],
+            row["what"],
+            row["node"],
+            row["cluster"],
+            (row["seen"] or "")[:_SHORT],
+            "failing" if row["failing"] else row["health"],
+            row["since"] or "",
+            reason,
+        )
+    return table
