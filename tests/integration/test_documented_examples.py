@@ -15,10 +15,11 @@ from click.testing import CliRunner
 
 from generator.catalog.catalog import CONFIG_ROOTS, load
 from generator.cli.main import cli
-from generator.decision import State, decide, explain
+from generator.decision import State, decide, explain, rendered
 from generator.errors import Refused
 from generator.ledger.ledger import Ledger
 from generator.plan.bookkeeping import as_data, bookkeeping
+from generator.render.check import check_files
 from generator.staterepo import layout
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -94,6 +95,16 @@ def test_the_policy_of_the_documentation_refuses_as_it_says(
     said = explain(refused.value)
     assert said == block("policy.md", start).strip()
     assert decided(on, demand()).outcome == "booked"
+
+
+def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
+    policy = block("policy.md", "apiVersion: demandops/v1\nkind: AccessDomains")
+    on = state(**{"policy/access-domains.yaml": policy})
+    files = rendered(on)
+    check_files(dict(files))  # against the schema of Kubernetes
+    kinds = [item["kind"] for item in yaml.safe_load_all(files["bootstrap/c-its.yaml"]) if item]
+    assert kinds.count("NetworkPolicy") == 1
+    assert "NetworkPolicy" not in rendered(state())["bootstrap/c-its.yaml"]
 
 
 def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:

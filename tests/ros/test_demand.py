@@ -135,6 +135,15 @@ def test_a_refusal_names_code_field_and_remedy(serve: Serve, client: DemandClien
     assert served.bookkeeping()["connections"]["link"]["topics"] == ["/a", "/b"]
 
 
+def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(
+    serve: Serve, client: DemandClient
+) -> None:
+    serve()
+    answer = client.put("d", connections=[LINK], answer="healthy")
+    assert (answer.outcome, answer.reached) == ("booked", "pushed")
+    assert answer.warnings == ("answered at pushed: this node has no access to the clusters",)
+
+
 def test_numbers_that_the_message_does_not_define_are_refused_with_their_field(
     serve: Serve, ros_domain: int
 ) -> None:

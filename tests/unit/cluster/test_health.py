@@ -1,0 +1,153 @@
+"""What objects say about releases, told from objects as the API gives them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from generator.cluster.health import Health, Place, Target, of_place, of_target, since, worst
+
+PLACE = Place("c-its", "perception", "ns")
+SERVICE = Target(PLACE, "od-edge", by_helm=True)
+CLIENT = Target(PLACE, "mqtt-a", by_helm=False)
+GONE = Target(PLACE, "od-edge", by_helm=True, wanted=False)
+
+
+def condition(kind: str, status: str, message: str = "") -> dict[str, str]:
+    at = "2026-05-04T12:00:00Z"
+    return {"type": kind, "status": status, "message": message, "lastTransitionTime": at}
+
+
+def kustomization(applied: str = "", attempted: str = "", *conditions: Any) -> dict[str, Any]:
+    status = {"lastAppliedRevision": applied and f"main@sha1:{applied}"}
+    status["lastAttemptedRevision"] = attempted and f"main@sha1:{attempted}"
+    spec = {"sourceRef": {"name": "demandops"}}
+    return {"metadata": {}, "spec": spec, "status": status | {"conditions": list(conditions)}}
+
+
+def release(*conditions: Any, generation: int = 2, observed: int = 2) -> dict[str, Any]:
+    status = {"observedGeneration": observed, "conditions": list(conditions)}
+    return {"metadata": {"generation": generation}, "status": status}
+
+
+def deployment(name: str, *conditions: Any, of: str = "", **status: Any) -> dict[str, Any]:
+    labels = {"helm.toolkit.fluxcd.io/name": of} if of else {}
+    metadata = {"name": name, "namespace": "ns", "generation": 3, "labels": labels}
+    whole = {"observedGeneration": 3, "updatedReplicas": 2, "availableReplicas": 2}
+    found = whole | status | {"conditions": list(conditions)}
+    return {"metadata": metadata, "spec": {"replicas": 2}, "status": found}
+
+
+def after(commit: str, other: str) -> bool:
+    """Commits are named by letters, in order."""
+    return commit >= other
+
+
+@pytest.mark.parametrize(
+    ("found", "state", "reason", "failing"),
+    [
+        (None, "waiting", "is not there; apply bootstrap/", False),
+        (kustomization("a", "a"), "waiting", "has not applied the commit yet", False),
+        (kustomization("b", "b"), "reconciled", "", False),
+        (kustomization("c", "c"), "reconciled", "", False),
+        (kustomization("a", "b", condition("Ready", "False", "no such kind")), "waiting",
+         "no such kind", True),
+        (kustomization("a", "a", condition("Ready", "False", "of an older commit")), "waiting",
+         "has not applied the commit yet", False),
+    ],
+)  # fmt: skip
+def test_an_access_domain_is_as_far_as_its_kustomization(
+    found: dict[str, Any] | None, state: str, reason: str, failing: bool
+) -> None:
+    objects = {("Kustomization", "ns", "perception"): found} if found else {}
+    health = of_place(PLACE, "b", objects, after)
+    assert (health.state, health.failing) == (state, failing)
+    assert reason in health.reason
+
+
+def test_a_source_that_cannot_be_fetched_is_the_reason() -> None:
+    source = {"metadata": {}, "status": {"conditions": [condition("Ready", "False", "no route")]}}
+    objects = {
+        ("Kustomization", "ns", "perception"): kustomization("a", "a"),
+        ("GitRepository", "ns", "demandops"): source,
+    }
+    health = of_place(PLACE, "b", objects, after)
+    assert health == Health("waiting", "no route", "GitRepository ns/demandops", failing=True)
+
+
+READY = condition("Ready", "True", "installed")
+
+
+@pytest.mark.parametrize(
+    ("objects", "state", "reason", "failing"),
+    [
+        ({}, "reconciled", "is not there yet", False),
+        ({"r": release()}, "reconciled", "is being installed", False),
+        ({"r": release(READY, observed=1)}, "reconciled", "installed", False),
+        ({"r": release(condition("Ready", "False", "no lidar"))}, "reconciled", "no lidar", True),
+        ({"r": release(READY)}, "healthy", "", False),
+        ({"r": release(READY), "d": deployment("x", of="od-edge")}, "healthy", "", False),
+        ({"r": release(READY), "d": deployment("x", of="od-edge", availableReplicas=1)},
+         "reconciled", "1 of 2 replicas are available", False),
+        ({"r": release(READY), "d": deployment("x", of="od-edge", updatedReplicas=1)},
+         "reconciled", "2 of 2 replicas are available", False),
+        ({"r": release(READY), "d": deployment("x", of="od-edge", observedGeneration=2)},
+         "reconciled", "available", False),
+        ({"r": release(READY), "d": deployment("x", of="other", availableReplicas=0)},
+         "healthy", "", False),
+        ({"r": release(READY), "d": deployment("x", condition("ReplicaFailure", "True", "quota"),
+                                               of="od-edge", availableReplicas=0)},
+         "reconciled", "quota", True),
+    ],
+)  # fmt: skip
+def test_a_service_is_healthy_when_helm_and_all_its_deployments_are(
+    objects: dict[str, Any], state: str, reason: str, failing: bool
+) -> None:
+    keys = {"r": ("HelmRelease", "ns", "od-edge"), "d": ("Deployment", "ns", "x")}
+    found = {keys[short]: item for short, item in objects.items()}
+    health = of_target(SERVICE, found)
+    assert (health.state, health.failing) == (state, failing)
+    assert reason in health.reason
+
+
+def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
+    key = ("Deployment", "ns", "mqtt-a")
+    assert of_target(CLIENT, {}).state == "reconciled"
+    assert of_target(CLIENT, {key: deployment("mqtt-a")}).state == "healthy"
+    assert of_target(CLIENT, {key: deployment("mqtt-a", availableReplicas=0)}).state == "reconciled"
+
+
+def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
+    helm = {("HelmRelease", "ns", "od-edge"): release(READY)}
+    left = {("Deployment", "ns", "x"): deployment("x", of="od-edge")}
+    assert of_target(GONE, helm).state == "reconciled"
+    assert of_target(GONE, left).state == "reconciled"
+    assert of_target(GONE, {}).state == "healthy"
+
+
+def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
+    slow, failed = Health("reconciled", "slow"), Health("reconciled", "failed", failing=True)
+    assert worst([Health("healthy"), slow, failed]) == failed
+    assert worst([Health("healthy"), slow, Health("waiting")]) == Health("waiting")
+    assert worst([]).state == "healthy"
+
+
+def test_since_when_is_the_cluster_s_to_say() -> None:
+    found = {("HelmRelease", "ns", "od-edge"): release(READY)}
+    assert since(SERVICE, found) == "2026-05-04T12:00:00Z"
+    assert since(CLIENT, found) == ""
+
+
+@pytest.mark.parametrize(
+    ("state", "level", "reached"),
+    [
+        ("waiting", "pushed", True),
+        ("waiting", "reconciled", False),
+        ("reconciled", "reconciled", True),
+        ("reconciled", "healthy", False),
+        ("healthy", "reconciled", True),
+    ],
+)
+def test_levels_are_in_order(state: Any, level: Any, reached: bool) -> None:
+    assert Health(state).reaches(level) is reached

@@ -1,0 +1,57 @@
+"""Following what no cluster can tell: a cluster that is away, one without access."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from generator.cluster.access import Reached
+from generator.cluster.health import Place, Target
+from generator.cluster.status import Status
+
+KUBECONFIG = """
+apiVersion: v1
+kind: Config
+clusters: [{name: c, cluster: {server: "http://127.0.0.1:1"}}]
+users: [{name: u, user: {}}]
+contexts: [{name: x, context: {cluster: c, user: u}}]
+current-context: x
+"""
+
+
+def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: Path) -> None:
+    file = tmp_path / "kubeconfig"
+    file.write_text(KUBECONFIG)
+    status = Status({"away": Reached(kubeconfig=file)}, lambda commit, other: True)
+    try:
+        target = Target(Place("away", "d", "ns"), "r", by_helm=True)
+        start = time.monotonic()
+        health = status.follow("a" * 40, [target], "healthy", timeout=0.5).result(30)
+        assert time.monotonic() - start >= 0.5
+        assert (health.state, health.object) == ("waiting", "cluster away")
+        assert health.reason.startswith("cannot be read: ")
+        # what asks nothing of that cluster does not wait for it
+        assert status.follow("a" * 40, [], "healthy", timeout=60).result(30).state == "healthy"
+    finally:
+        status.close()
+
+
+def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
+    status = Status({"w": Reached(receiver="https://h/hook")}, lambda commit, other: True)
+    try:
+        assert status.reaches([Place("w", "d", "n"), Place("x", "d", "n")]) == (
+            "no access to cluster w, x"
+        )
+        assert status.reaches([]) == ""
+    finally:
+        status.close()
+
+
+def test_closing_answers_what_is_still_followed(tmp_path: Path) -> None:
+    file = tmp_path / "kubeconfig"
+    file.write_text(KUBECONFIG)
+    status = Status({"away": Reached(kubeconfig=file)}, lambda commit, other: True)
+    target = Target(Place("away", "d", "ns"), "r", by_helm=True)
+    followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
+    status.close()
+    assert followed.result(10).state == "waiting"
