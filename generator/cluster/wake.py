@@ -10,7 +10,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
 from typing import Any
 
@@ -21,6 +21,7 @@ from generator.render.flux import domains_in_use
 log = logging.getLogger("demandops")
 
 _TIMEOUT_S = 5.0
+_FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
 """Two fetches within a second were seen to leave source-controller with a broken artifact."""
 _REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
@@ -53,26 +54,44 @@ class Wake:
         self._thread.join(2 * _TIMEOUT_S)
 
     def _run(self) -> None:
-        stopping = False
-        while not stopping:
-            self._due.wait()
+        missed: set[str] = set()
+        pause: float | None = None
+        while True:
+            fresh = self._due.wait(pause)
+            self._due.clear()
             if not self._stopping:
                 self._stop.wait(self._rest_s())
             self._woken_at = time.monotonic()
-            self._due.clear()
             stopping = self._stopping
-            for name, reached in self._clusters.items():
-                if self._catalog is None:
-                    break
-                try:
-                    self._wake(name, reached, self._catalog)
-                except Exception as error:
+            if fresh:
+                missed, pause = set(self._clusters), _FIRST_RETRY_S
+            elif pause is not None:
+                pause *= 2
+            missed = self._wake_all(missed, told=not fresh)
+            if stopping:
+                return
+            if not missed or pause is None or pause > _LONGEST_RETRY_S:
+                missed, pause = set(), None
+
+    def _wake_all(self, names: Iterable[str], told: bool) -> set[str]:
+        """Wake clusters; return those that did not answer, and log it the first time."""
+        missed = set()
+        for name in sorted(names):
+            if self._catalog is None:
+                break
+            try:
+                self._wake(name, self._clusters[name], self._catalog)
+            except Exception as error:
+                missed.add(name)
+                self._apis.pop(name, None)
+                if not told:
                     log.warning(
-                        "cluster '%s' was not woken (%s); it fetches at its interval",
+                        "cluster '%s' was not woken (%s); trying on for a minute, then it fetches "
+                        "at its interval",
                         name,
                         type(error).__name__,
                     )
-                    self._apis.pop(name, None)
+        return missed
 
     def _rest_s(self) -> float:
         """Return how long to wait before the next wake: pushes come in swarms."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -59,7 +60,7 @@ def receiver() -> Iterator[tuple[str, list[str]]]:
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             heard.append(self.path)
-            self.send_response(200)
+            self.send_response(503 if "fail" in self.path and len(heard) == 1 else 200)
             self.end_headers()
 
         def log_message(self, format: str, *args: object) -> None:
@@ -101,3 +102,18 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
     assert heard
     assert "cluster 'away' was not woken (URLError)" in caplog.text
     assert "secret" not in caplog.text
+
+
+def test_a_cluster_that_did_not_answer_is_tried_again(receiver: tuple[str, list[str]]) -> None:
+    """The receiver answers with a failure at first."""
+    url, heard = receiver
+    state, _ = start("experiment")
+    waker = wake.Wake({"c-its": access.Reached(receiver=f"{url}?fail=1")})
+    try:
+        waker(state.catalog)
+        end = time.monotonic() + 30
+        while len(heard) < 2:
+            assert time.monotonic() < end, "it is not woken again"
+            time.sleep(0.05)
+    finally:
+        waker.close()
