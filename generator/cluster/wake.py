@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 from generator.catalog.catalog import Catalog
 from generator.catalog.model import DnsLabel, FileModel, Frozen, parse_file
 from generator.errors import InvalidInput, fault
-from generator.render.flux import domains_in_use
+from generator.render.paths import domains_in_use
 
 log = logging.getLogger("demandops")
 
