@@ -30,6 +30,9 @@ CACHE_VARIABLE = "DEMANDOPS_E2E_CACHE"
 
 Report = Callable[[str], None]
 
+_ARGOCD = "github.com/argoproj/argo-cd/v3"
+_CRD_FOLDERS = ("config/crd/bases", "manifests/crds")  # Flux's, Argo CD's
+
 
 @dataclass(frozen=True)
 class Tool:
@@ -63,6 +66,7 @@ TOOLS = {
         _flux("kustomize-controller"),
         _flux("helm-controller"),
         Tool("helm", "helm", "helm.sh/helm/v4/cmd/helm"),
+        Tool("argocd", "argocd", f"{_ARGOCD}/cmd", crds_of=_ARGOCD),
     )
 }
 
@@ -181,9 +185,10 @@ def _build(tool: Tool, go: gobuild.Go, entry: Path, say: Report) -> None:
 
 def _copy_crds(module: Path, target: Path) -> None:
     target.mkdir()
-    sources = sorted((module / "config" / "crd" / "bases").glob("*.yaml"))
+    found = (path for folder in _CRD_FOLDERS for path in (module / folder).glob("*.yaml"))
+    sources = sorted(path for path in found if path.name != "kustomization.yaml")
     if not sources:
-        raise RigError(f"{module}: no CRDs in config/crd/bases; has the module moved them?")
+        raise RigError(f"{module}: no CRDs in {' or '.join(_CRD_FOLDERS)}; have they moved?")
     for source in sources:
         (target / source.name).write_bytes(source.read_bytes())  # without the read-only mode
 
