@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.e2e.common import expected
+from tests.e2e.common.expected import DETECTION, FUSION, source_end, target_end
 from tests.e2e.rig.kube import Manifest
 
-from . import expected
-from .expected import DETECTION, FUSION, source_end, target_end
 from .view import Domain
 from .world import World
 

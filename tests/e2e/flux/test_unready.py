@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.e2e.common import expected
+from tests.e2e.common.expected import STANDING
 from tests.e2e.rig.cluster import Rig
 
-from . import expected
-from .expected import STANDING
 from .world import World
 
 PATIENCE_S = 60.0  # Helm's own is five minutes

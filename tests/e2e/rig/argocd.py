@@ -85,14 +85,14 @@ def components(
 def _redis(port: int, folder: Path) -> Component:
     program = shutil.which(REDIS)
     if program is None:
-        raise RigError(f"`{REDIS}` is not on PATH: install Redis (Debian: the package redis-server)")
+        raise RigError(
+            f"`{REDIS}` is not on PATH: install Redis (Debian: the package redis-server)"
+        )
     argv = [program, "--bind", LOOPBACK, "--port", str(port), "--dir", str(folder)]
     return Component(REDIS, (*argv, "--save", "", "--appendonly", "no"), accepts(port))
 
 
-def _part(
-    name: str, binary: Path, arguments: list[str], environment: dict[str, str]
-) -> Component:
+def _part(name: str, binary: Path, arguments: list[str], environment: dict[str, str]) -> Component:
     port = free_port()  # of its health; the controller's is on all addresses, it has no flag
     return Component(
         name,

@@ -37,8 +37,9 @@ Gitops = Literal["flux", "argocd"]
 class Rig:
     """One cluster; several can run at once, each with ports and a folder of its own.
 
-    `nodes` are node ids, `gitops` is the controller that runs there. `git_of` shares another rig's Git server, so that two clusters read one
-    state repo. `credentials` (user, password) makes the Git server ask for them. `arguments` adds
+    `nodes` are node ids, `gitops` is the controller that runs there. `git_of` shares another
+    rig's Git server, so that two clusters read one state repo. `credentials` (user, password)
+    makes the Git server ask for them. `arguments` adds
     to a controller's command line, by its name. `folder` is where data and logs go (a
     temporary folder by default, removed at the end unless a test failed or E2E_KEEP is set).
     """
