@@ -1,4 +1,4 @@
-"""Waking Flux after a push, so that it fetches at once instead of at its next interval.
+"""Waking Flux or Argo CD after a push, so that it fetches at once, not at its next interval.
 
 Optional, and never in the way: a cluster that does not answer is logged and left to its interval.
 Which clusters, and how each is reached, stands in a file of the operator's that is not part of
@@ -18,15 +18,18 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from generator.catalog.catalog import Catalog
+from generator.catalog.catalog import Catalog, Repository
 from generator.catalog.model import DnsLabel, FileModel, Frozen, parse_file
+from generator.catalog.policy import AccessDomain
 from generator.errors import InvalidInput, fault
+from generator.render.argocd import project_of
 from generator.render.paths import domains_in_use
 
 log = logging.getLogger("demandops")
 
 _TIMEOUT_S = 5.0
 _REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
+_REFRESH = "argocd.argoproj.io/refresh"
 
 
 class Reached(Frozen):
@@ -116,13 +119,7 @@ class Wake:
             if cluster != name:
                 continue
             self._api(name, reached).patch_namespaced_custom_object(
-                "source.toolkit.fluxcd.io",
-                "v1",
-                domain.namespace,
-                "gitrepositories",
-                catalog.repository.source,
-                {"metadata": {"annotations": {_REQUESTED_AT: now}}},
-                _request_timeout=_TIMEOUT_S,
+                *_asked(domain, catalog.repository, now), _request_timeout=_TIMEOUT_S
             )
 
     def _api(self, name: str, reached: Reached) -> Any:  # noqa: ANN401
@@ -132,3 +129,18 @@ class Wake:
             loaded = config.new_client_from_config(str(reached.kubeconfig), reached.context)
             self._apis[name] = client.CustomObjectsApi(loaded)
         return self._apis[name]
+
+
+def _asked(
+    domain: AccessDomain, repository: Repository, now: str
+) -> tuple[str, str, str, str, str, dict[str, Any]]:
+    """Return which object of a domain is asked to look, and the patch that asks it."""
+    if repository.gitops == "argocd" and repository.argocd:
+        where = ("argoproj.io", "v1alpha1", repository.argocd.namespace, "applications")
+        return *where, project_of(domain, repository), _annotated(_REFRESH, "normal")
+    where = ("source.toolkit.fluxcd.io", "v1", domain.namespace, "gitrepositories")
+    return *where, repository.source, _annotated(_REQUESTED_AT, now)
+
+
+def _annotated(name: str, value: str) -> dict[str, Any]:
+    return {"metadata": {"annotations": {name: value}}}
