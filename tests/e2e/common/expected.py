@@ -90,3 +90,8 @@ def _end(node: str, name: str) -> Iterator[tuple[str, str]]:
 
 def _deployed(node: str, name: str) -> tuple[str, str]:
     return f"Deployment {name}", f"pod of {name} on {node}, ready"
+
+
+def unscheduled(lines: frozenset[str]) -> frozenset[str]:
+    """The same with the edge's pods waiting for a node."""
+    return frozenset(line.replace(" on edge, ready", " on no node, not ready") for line in lines)
