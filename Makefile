@@ -7,10 +7,10 @@ STAMP  := $(VENV)/.setup-done
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test e2e check format golden bench wheel clean
+.PHONY: help setup demo test e2e e2e-argocd check format golden bench wheel clean
 
 help:  ## Show what there is to make
-	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(STAMP)  ## Make .venv with everything in it, the ROS 2 interfaces included
 	@$(PY) ros_bridge/interfaces/build.py
@@ -31,9 +31,13 @@ demo: setup  ## Play the paper's experiment: eight demands over ROS 2 become eig
 test: setup  ## Run all tests but the end-to-end ones
 	@$(PY) -m pytest -n auto --dist loadfile tests/unit tests/golden tests/integration tests/ros
 
-e2e: setup  ## Run the end-to-end tests on a real cluster (docs/e2e.md)
-	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools; fi
-	@$(PY) -m pytest -p no:cacheprovider tests/e2e -x -q
+e2e: setup  ## Run the end-to-end tests on a real cluster with Flux (docs/e2e.md)
+	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools --for flux; fi
+	@$(PY) -m pytest -p no:cacheprovider tests/e2e --ignore tests/e2e/argocd -x -q
+
+e2e-argocd: setup  ## Run them with Argo CD
+	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools --for argocd; fi
+	@$(PY) -m pytest -p no:cacheprovider tests/e2e/argocd -x -q
 
 check: setup  ## Format, lint, types, imports and tests
 	@$(PY) -m ruff format --check .

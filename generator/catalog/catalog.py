@@ -55,26 +55,43 @@ CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs")
 """The top-level entries of a state repo that people own and the catalog is made from."""
 
 
+GitUrl = Annotated[
+    str, StringConstraints(pattern=r"^(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+$")
+]
+
+
 class Flux(Frozen):
     """How the clusters' Flux reaches this repo: the GitRepository of each access domain."""
 
-    url: Annotated[
-        str, StringConstraints(pattern=r"^(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+$")
-    ]
+    url: GitUrl
     interval: Annotated[
         str, StringConstraints(pattern=r"^(\d+h)?(\d+m)?(\d+s)?$", min_length=2)
     ] = "1m"
     secret: DnsLabel | None = None
 
 
+class ArgoCd(Frozen):
+    """How the clusters' Argo CD reaches this repo, and the namespace it runs in.
+
+    Credentials are Argo CD's own: a Secret of that namespace that names the URL.
+    """
+
+    url: GitUrl
+    namespace: DnsLabel = "argocd"
+
+
 class Repository(FileModel):
-    """``demandops.yaml``: what the whole state repo has in common."""
+    """``demandops.yaml``: what the whole state repo has in common.
+
+    The section of the controller that is not chosen may stand there too, and waits.
+    """
 
     kind: Literal["StateRepository"]
-    gitops: Literal["flux"]
+    gitops: Literal["flux", "argocd"]
     render_version: int = Field(alias="renderVersion", ge=1)
     source: DnsLabel = "demandops"
-    flux: Flux
+    flux: Flux | None = None
+    argocd: ArgoCd | None = None
 
 
 _ANY = Repository(
@@ -139,6 +156,13 @@ def load(files: Mapping[str, str]) -> Catalog:
             f"is {repository.render_version}, but this generator renders version "
             f"{RENDER_VERSION}; update the generator",
         )
+    if repository and getattr(repository, repository.gitops) is None:
+        reading.tell(
+            ROOT_FILE,
+            repository.gitops,
+            f"is missing, but gitops is {repository.gitops}; add it with the url that the "
+            "clusters fetch this repo from",
+        )
     nodes = reading.listed(NODES_FILE, NodesFile, "nodes", Node, "id")
     domains = reading.listed(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
     catalog = Catalog(
@@ -202,6 +226,7 @@ def cross_check(catalog: Catalog, reading: Reading) -> None:
         _check_inventory,
         _check_topics,
         _check_namespaces,
+        _check_controllers_namespace,
         _check_charts,
         _check_services,
         _check_wire_types,
@@ -251,6 +276,18 @@ def _check_namespaces(catalog: Catalog, reading: Reading) -> None:
                 DOMAINS_FILE,
                 f"domains[{reading.place(DOMAINS_FILE, domain.name)}].namespace",
                 f"'{domain.namespace}' is the namespace of '{other}' already; give each its own",
+            )
+
+
+def _check_controllers_namespace(catalog: Catalog, reading: Reading) -> None:
+    argocd = catalog.repository.argocd if catalog.repository.gitops == "argocd" else None
+    for domain in catalog.domains.values():
+        if argocd and domain.namespace == argocd.namespace:
+            reading.tell(
+                DOMAINS_FILE,
+                f"domains[{reading.place(DOMAINS_FILE, domain.name)}].namespace",
+                f"'{domain.namespace}' is Argo CD's own, where whoever may write an Application "
+                "may do all that Argo CD may; choose another",
             )
 
 

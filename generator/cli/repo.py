@@ -22,7 +22,7 @@ from generator.staterepo import checkout, layout, reader
 @click.argument("directory", type=click.Path(path_type=Path), metavar="DIR")
 @click.option(
     "--gitops",
-    type=click.Choice(["flux"]),
+    type=click.Choice(["flux", "argocd"]),
     default="flux",
     show_default=True,
     help="The controller that reads the state repo.",
@@ -44,7 +44,8 @@ from generator.staterepo import checkout, layout, reader
 def init(directory: Path, gitops: str, bare: bool, url: str, output: str) -> None:
     """Lay down a new state repo: the skeleton, the application definitions and a first commit.
 
-    To make a cluster follow it, with Flux installed there:
+    To make a cluster follow it, with Flux or Argo CD installed there (docs/flux.md,
+    docs/argocd.md say how):
 
         git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
     """

@@ -21,6 +21,7 @@ from generator.cli.output import (
 from generator.cluster import access
 from generator.cluster.health import Health, Target, applied, of_place, of_target, since
 from generator.cluster.store import ClusterStore
+from generator.errors import StateRepoError
 from generator.plan.release import Release, ServiceRelease
 from generator.service import targets
 from generator.staterepo import reader
@@ -47,6 +48,9 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
         with progress("reading the ledger") as tell:
             snapshot = repo.snapshot(progress=tell)
         found = targets.of_state(snapshot.state)
+        gitops = snapshot.state.catalog.repository.gitops
+        if gitops != "flux":
+            raise StateRepoError(f"what {gitops} makes of the state repo is not read yet")
         stores = _read(clusters, [target for _, target in found])
         commit = str(snapshot.commit)
         rows = [_row(release, target, commit, stores, repo) for release, target in found]

@@ -1,4 +1,4 @@
-"""Waking Flux after a push, so that it fetches at once instead of at its next interval.
+"""Waking Flux or Argo CD after a push, so that it fetches at once, not at its next interval.
 
 Optional, and never in the way: a cluster that does not answer is logged and left to its interval.
 """
@@ -14,9 +14,11 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
 from typing import Any
 
-from generator.catalog.catalog import Catalog
+from generator.catalog.catalog import Catalog, Repository
+from generator.catalog.policy import AccessDomain
 from generator.cluster.access import Reached
-from generator.render.flux import domains_in_use
+from generator.render.argocd import project_of
+from generator.render.paths import domains_in_use
 
 log = logging.getLogger("demandops")
 
@@ -25,6 +27,7 @@ _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
 """Two fetches within a second were seen to leave source-controller with a broken artifact."""
 _REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
+_REFRESH = "argocd.argoproj.io/refresh"
 
 
 class Wake:
@@ -107,13 +110,7 @@ class Wake:
             if cluster != name:
                 continue
             self._api(name, reached).patch_namespaced_custom_object(
-                "source.toolkit.fluxcd.io",
-                "v1",
-                domain.namespace,
-                "gitrepositories",
-                catalog.repository.source,
-                {"metadata": {"annotations": {_REQUESTED_AT: now}}},
-                _request_timeout=_TIMEOUT_S,
+                *_asked(domain, catalog.repository, now), _request_timeout=_TIMEOUT_S
             )
 
     def _api(self, name: str, reached: Reached) -> Any:  # noqa: ANN401
@@ -122,3 +119,18 @@ class Wake:
 
             self._apis[name] = client.CustomObjectsApi(reached.client())
         return self._apis[name]
+
+
+def _asked(
+    domain: AccessDomain, repository: Repository, now: str
+) -> tuple[str, str, str, str, str, dict[str, Any]]:
+    """Return which object of a domain is asked to look, and the patch that asks it."""
+    if repository.gitops == "argocd" and repository.argocd:
+        where = ("argoproj.io", "v1alpha1", repository.argocd.namespace, "applications")
+        return *where, project_of(domain, repository), _annotated(_REFRESH, "normal")
+    where = ("source.toolkit.fluxcd.io", "v1", domain.namespace, "gitrepositories")
+    return *where, repository.source, _annotated(_REQUESTED_AT, now)
+
+
+def _annotated(name: str, value: str) -> dict[str, Any]:
+    return {"metadata": {"annotations": {name: value}}}

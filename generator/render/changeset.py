@@ -17,9 +17,10 @@ from generator.ledger import format as ledger_format
 from generator.ledger.ledger import ClaimChange, Ledger
 from generator.plan.planner import ReleaseKey, plan
 from generator.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
-from generator.render import flux
+from generator.render import gitops
 from generator.render.check import check_files
 from generator.render.engine import Engine
+from generator.render.paths import path_of
 
 Change = Literal["start", "change", "stop"]
 
@@ -73,11 +74,11 @@ def of_change(
     releases = []
     for key in keys:
         old, new = _plan_leniently(before, catalog, key), plan(after, catalog, key)
-        old_path = flux.path_of(old) if old else None
-        new_path = flux.path_of(new) if new else None
+        old_path = path_of(old) if old else None
+        new_path = path_of(new) if new else None
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
-        text = flux.render(new, catalog, engine) if new else None
+        text = gitops.render(new, catalog, engine) if new else None
         standing = read(new_path) if new_path else None
         if new_path and text != standing:
             files[new_path] = text
@@ -93,11 +94,11 @@ def render_all(
     ledger: Ledger, catalog: Catalog, engine: Engine, keys: Iterable[ReleaseKey]
 ) -> dict[str, str]:
     """Return every generated file below ``clusters/`` that ledger and catalog ask for."""
-    files = flux.standing_files(catalog, engine)
+    files = gitops.standing_files(catalog, engine)
     for key in keys:
         release = plan(ledger, catalog, key)
         if release is not None:
-            files[flux.path_of(release)] = flux.render(release, catalog, engine)
+            files[path_of(release)] = gitops.render(release, catalog, engine)
     return files
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pygit2
 
 from generator import yamlio
-from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.catalog import CONFIG_ROOTS, ROOT_FILE, load
 from generator.decision import State, rendered
 from generator.errors import StateRepoError
 from generator.ledger.ledger import Ledger
@@ -28,10 +28,11 @@ def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
     """
     found = _read(data_folder("skeleton"), "")
     found |= _read(data_folder("appdefs"), "appdefs/")
-    root = found["demandops.yaml"].replace("gitops: flux\n", f"gitops: {gitops}\n")
+    roots = {"flux": found.pop(ROOT_FILE), "argocd": found.pop("demandops.argocd.yaml")}
+    root = roots[gitops]
     if url:
         root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {yamlio.scalar(url)}", root)
-    found["demandops.yaml"] = root
+    found[ROOT_FILE] = root
     catalog = load({p: text for p, text in found.items() if p.split("/")[0] in CONFIG_ROOTS})
     return found | rendered(State.of(catalog, Ledger()))
 

@@ -28,12 +28,14 @@ CASES = (
     "mqtt-secured",
     "zenoh",
     "ros",
+    "argocd-experiment",
+    "argocd-charts-from-registries",
 )
 
 
 def requests_of(case: str) -> list[Path]:
     """Return the request files of a case, in order; the experiment's are the example's."""
-    folder = EXPERIMENT if case == "experiment" else HERE / case / "requests"
+    folder = EXPERIMENT if case.endswith("experiment") else HERE / case / "requests"
     return sorted(folder.glob("*.yaml"))
 
 

@@ -69,6 +69,20 @@ class TestInit:
         ).stdout
         assert demandops("check", folder).code == 0
 
+    def test_a_state_repo_for_argo_cd(self, demandops: Run, tmp_path: Path) -> None:
+        folder = tmp_path / "state"
+        url = "https://git.example/own.git"
+        ran = demandops("init", folder, "--gitops", "argocd", "--url", url, "--output", "json")
+        assert ran.json()["gitops"] == "argocd"
+        assert demandops("check", folder).code == 0
+        assert not (folder / "demandops.argocd.yaml").exists()
+        root = yaml.safe_load((folder / "demandops.yaml").read_text())
+        assert (root["gitops"], root["argocd"]) == ("argocd", {"url": url})
+        found = yaml.safe_load_all((folder / "bootstrap" / "c-its.yaml").read_text())
+        kinds = [item["kind"] for item in found]
+        assert kinds[-2:] == ["AppProject", "Application"]
+        assert "GitRepository" not in kinds
+
     def test_an_empty_folder_is_used(self, demandops: Run, tmp_path: Path) -> None:
         folder = tmp_path / "state"
         folder.mkdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -82,6 +83,69 @@ def test_a_receiver_is_called_after_a_push(receiver: tuple[str, list[str]]) -> N
     waker(state.catalog)
     waker.close()
     assert set(heard) == {"/hook/abc"}
+
+
+@pytest.fixture
+def api(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, bytes]]]]:
+    """A server that takes every patch, and a kubeconfig for it."""
+    heard: list[tuple[str, bytes]] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_PATCH(self) -> None:
+            heard.append((self.path, self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(200)
+            self.send_header("Content-Type", "application/json")
+            self.end_headers()
+            self.wfile.write(b"{}")
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Say nothing."""
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    cluster = {"server": f"http://127.0.0.1:{server.server_port}"}
+    config = {
+        "apiVersion": "v1",
+        "kind": "Config",
+        "current-context": "c",
+        "clusters": [{"name": "c", "cluster": cluster}],
+        "users": [{"name": "u", "user": {}}],
+        "contexts": [{"name": "c", "context": {"cluster": "c", "user": "u"}}],
+    }
+    kubeconfig = tmp_path / "kubeconfig"
+    kubeconfig.write_text(json.dumps(config))
+    yield kubeconfig, heard
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("case", "path", "annotation"),
+    [
+        (
+            "experiment",
+            "/apis/source.toolkit.fluxcd.io/v1/namespaces/perception/gitrepositories/demandops",
+            b"reconcile.fluxcd.io/requestedAt",
+        ),
+        (
+            "argocd-experiment",
+            "/apis/argoproj.io/v1alpha1/namespaces/argocd/applications/demandops-perception",
+            b"argocd.argoproj.io/refresh",
+        ),
+    ],
+)
+def test_the_object_that_fetches_is_annotated(
+    api: tuple[Path, list[tuple[str, bytes]]], case: str, path: str, annotation: bytes
+) -> None:
+    kubeconfig, heard = api
+    state, _ = start(case)
+    waker = wake.Wake({"c-its": access.Reached(kubeconfig=kubeconfig)})
+    waker(state.catalog)
+    waker.close()
+    assert {asked for asked, _ in heard} == {path}
+    assert annotation in heard[0][1]
 
 
 def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:

@@ -7,24 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.rig.capture import uncaptured
+from tests.e2e.common.expected import NODES, STANDING
+from tests.e2e.common.ros import Client
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
-from tests.ros_domain import reserved
 
-from .expected import NODES, STANDING
-from .ros import Client
 from .world import World
 
 CLUSTER = "c-its"
 NAMESPACE = "perception"  # of the skeleton's access domain
 
 MakeWorld = Callable[[], World]
-
-
-@pytest.fixture(scope="session")
-def say(request: pytest.FixtureRequest) -> Report:
-    return uncaptured(request.config)
 
 
 @pytest.fixture(scope="session")
@@ -40,20 +33,6 @@ def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
         if cluster.existing:
             cluster.kube.delete("Namespace", NAMESPACE)
         cluster.stop(failed=request.session.testsfailed > failed)
-
-
-@pytest.fixture(scope="session")
-def ros_domain() -> Iterator[int]:
-    """A ROS domain for this process, so that nothing else answers."""
-    with reserved() as domain:
-        yield domain
-
-
-@pytest.fixture(scope="session")
-def client(ros_domain: int) -> Iterator[Client]:
-    made = Client(ros_domain)
-    yield made
-    made.close()
 
 
 @pytest.fixture(scope="module")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from tests.e2e.common.golden import golden
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Manifest
 
@@ -18,7 +18,7 @@ from .conftest import NAMESPACE
 
 ROOT = Path(__file__).resolve().parents[3]
 CHARTS = ROOT / "appdefs" / "object-detection-fusion" / "charts"
-GOLDEN = ROOT / "tests" / "golden"
+
 
 # Every corner that a person may set and no golden case does.
 _COMMON: dict[str, dict[str, Any]] = {
@@ -76,7 +76,7 @@ def test_every_golden_release_gives_what_the_server_takes(
     rig: Rig, namespace: str, tmp_path: Path
 ) -> None:
     seen = 0
-    for number, manifest in enumerate(golden()):
+    for number, manifest in enumerate(golden("flux")):
         if manifest["kind"] != "HelmRelease":
             continue
         given = tmp_path / f"{number}.json"
@@ -90,7 +90,7 @@ def test_every_golden_release_gives_what_the_server_takes(
 
 
 def test_the_server_takes_every_golden_manifest(rig: Rig, namespace: str) -> None:
-    manifests = list(golden())
+    manifests = list(golden("flux"))
     kinds = {manifest["kind"] for manifest in manifests}
     assert {"HelmRelease", "HelmChart", "Kustomization", "Deployment", "Role"} <= kinds
     rig.kube.apply(*manifests, dry_run=True)
@@ -99,7 +99,7 @@ def test_the_server_takes_every_golden_manifest(rig: Rig, namespace: str) -> Non
 @pytest.mark.parametrize("kind", ["Deployment", "GitRepository", "HelmRelease", "Kustomization"])
 def test_the_server_does_look(rig: Rig, namespace: str, kind: str) -> None:
     """The dry run means something: a field that does not exist is not taken."""
-    broken = copy.deepcopy(next(item for item in golden() if item["kind"] == kind))
+    broken = copy.deepcopy(next(item for item in golden("flux") if item["kind"] == kind))
     broken["spec"]["interwal"] = "1m"
     with pytest.raises(Exception, match="field not declared in schema"):
         rig.kube.apply(broken, dry_run=True)
@@ -114,15 +114,3 @@ def templated(rig: Rig, chart: str, values: Path, release: str) -> list[Manifest
     for manifest in made:
         manifest["metadata"].setdefault("namespace", NAMESPACE)
     return made
-
-
-def golden() -> Iterator[Manifest]:
-    """Every manifest of the golden folders that a cluster gets, each once."""
-    seen: set[str] = set()
-    for folder in ("bootstrap", "clusters"):
-        for file in sorted(GOLDEN.glob(f"*/expected/*/{folder}/**/*.yaml")):
-            for manifest in yaml.safe_load_all(file.read_text()):
-                text = json.dumps(manifest, sort_keys=True)
-                if manifest and text not in seen:
-                    seen.add(text)
-                    yield manifest

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import pytest
 import yaml
 
+from tests.e2e.common import expected
+from tests.e2e.common.expected import NODES, STANDING, STEPS, VEHICLES
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from . import expected
 from .conftest import CLUSTER, NAMESPACE, MakeWorld
-from .expected import NODES, STANDING, STEPS, VEHICLES
 from .relay import Relay
 from .view import SOURCE, Domain
 from .world import World

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from tests.e2e.common import expected
+from tests.e2e.common.expected import STEPS
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from . import expected
-from .expected import STEPS
 from .world import World
 
 Act = Callable[[World, dict[str, Any]], None]

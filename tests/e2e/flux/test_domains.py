@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
+from tests.e2e.common import expected
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
 
-from . import expected
 from .view import Domain
 from .world import World
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from tests.e2e.common import expected
+from tests.e2e.common.expected import FUSION, STEPS
+from tests.e2e.common.timing import Table
 from tests.e2e.rig.tools import Report
 
-from . import expected
-from .expected import FUSION, STEPS
-from .timing import Table
 from .world import World
 
 

@@ -15,12 +15,13 @@ import pytest
 import yaml
 
 from ros_bridge.client import DemandClient, DemandError
+from tests.e2e.common.staterepo import demandops
 from tests.e2e.rig.cluster import Rig
 
 from .conftest import CLUSTER, MakeWorld
 from .test_wake import limited, wake_file
 from .view import Domain
-from .world import World, demandops
+from .world import World
 
 TIMEOUT_S = 60.0
 SHORT_S = 6.0

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import yaml
 
+from tests.e2e.common import expected
+from tests.e2e.common.byhand import asked_by, change_image, empty, pod_template, wait_for
+from tests.e2e.common.expected import DETECTION, FUSION, source_end, target_end
 from tests.e2e.rig.kube import Manifest
 
-from . import expected
-from .expected import DETECTION, FUSION, source_end, target_end
 from .view import Domain
 from .world import World
 
@@ -101,44 +100,7 @@ def names(items: list[Manifest]) -> set[str]:
     return {item["metadata"]["name"] for item in items}
 
 
-def asked_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
-    """The same applications and connections, demanded for somebody else."""
-    requesters = {"requester_ids": [vehicle, "station00"]}
-    apps = [
-        app | {"object_detection_fusion_app": app["object_detection_fusion_app"] | requesters}
-        for app in goal["apps"]
-    ]
-    connections = [connection | requesters for connection in goal["connections"]]
-    return goal | {"apps": apps, "connections": connections}
-
-
 def looked(domain: Domain, chart: str) -> str:
     """The commit that a HelmChart was last held against."""
     status: dict[str, str] = domain.get("HelmChart", chart)["status"]
     return status.get("observedSourceArtifactRevision", "")
-
-
-def pod_template(domain: Domain, deployment: str) -> dict[str, Any]:
-    template: dict[str, Any] = domain.get("Deployment", deployment)["spec"]["template"]
-    return template
-
-
-def change_image(domain: Domain, deployment: str) -> None:
-    containers = pod_template(domain, deployment)["spec"]["containers"]
-    containers[0]["image"] = "example.invalid/other:1"
-    body = {"spec": {"template": {"spec": {"containers": containers}}}}
-    domain.kube.patch("Deployment", deployment, body, domain.namespace)
-    changed = pod_template(domain, deployment)["spec"]["containers"][0]["image"]
-    assert changed == "example.invalid/other:1"
-
-
-def empty(domain: Domain, config: str, key: str) -> None:
-    domain.kube.patch("ConfigMap", config, {"data": {key: "by hand"}}, domain.namespace)
-    assert domain.get("ConfigMap", config)["data"] == {key: "by hand"}
-
-
-def wait_for(domain: Domain, template: dict[str, Any], data: dict[str, str], *names: str) -> None:
-    """Wait until a Deployment's pods and a ConfigMap's content are as they were."""
-    deployment, config = names
-    domain.kube.wait("the image", lambda: pod_template(domain, deployment) == template)
-    domain.kube.wait("the content", lambda: domain.get("ConfigMap", config)["data"] == data)

@@ -10,14 +10,14 @@ from typing import Any
 
 import yaml
 
+from tests.e2e.common import expected
+from tests.e2e.common.expected import STANDING
+from tests.e2e.common.timing import Table, Times
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Manifest, handled
 from tests.e2e.rig.tools import Report
 
-from . import expected
 from .conftest import CLUSTER, MakeWorld
-from .expected import STANDING
-from .timing import Table, Times
 from .view import SOURCE, Domain
 from .world import World
 

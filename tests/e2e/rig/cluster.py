@@ -1,4 +1,4 @@
-"""The one class that a test needs: a cluster with Flux, fake nodes and a Git server.
+"""The one class that a test needs: a cluster with Flux or Argo CD, fake nodes and a Git server.
 
     with Rig("edge", nodes=["edge"]) as rig:
         rig.kube.apply(...)
@@ -19,8 +19,9 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
+from typing import Literal
 
-from . import flux, githttp, kwok, pki, settings, tools
+from . import argocd, flux, githttp, kwok, pki, settings, tools
 from .controlplane import ControlPlane
 from .errors import RigError
 from .kube import Kube
@@ -30,13 +31,16 @@ from .workdir import Workdir
 
 KEEP_VARIABLE = "E2E_KEEP"
 
+Gitops = Literal["flux", "argocd"]
+
 
 class Rig:
     """One cluster; several can run at once, each with ports and a folder of its own.
 
-    `nodes` are node ids. `git_of` shares another rig's Git server, so that two clusters read one
-    state repo. `credentials` (user, password) makes the Git server ask for them. `arguments` adds
-    to a Flux controller's command line, by its name. `folder` is where data and logs go (a
+    `nodes` are node ids, `gitops` is the controller that runs there. `git_of` shares another
+    rig's Git server, so that two clusters read one state repo. `credentials` (user, password)
+    makes the Git server ask for them. `arguments` adds
+    to a controller's command line, by its name. `folder` is where data and logs go (a
     temporary folder by default, removed at the end unless a test failed or E2E_KEEP is set).
     """
 
@@ -47,6 +51,7 @@ class Rig:
         self,
         name: str = "rig",
         *,
+        gitops: Gitops = "flux",
         nodes: Iterable[str] = (),
         git_of: Rig | None = None,
         credentials: tuple[str, str] | None = None,
@@ -54,7 +59,7 @@ class Rig:
         folder: Path | None = None,
         report: tools.Report | None = None,
     ) -> None:
-        self.name = name
+        self.name, self.gitops = name, gitops
         self.timings: dict[str, float] = {}
         self.existing = settings.existing(name)
         self._initial, self._git_of, self._credentials = list(nodes), git_of, credentials
@@ -206,16 +211,18 @@ class Rig:
         self._git_url, self._push_url = existing.git_url, existing.push_url
         work = self._work = Workdir(self.name, self._folder)
         self.kube = Kube(existing.kubeconfig, work.path / "discovery.json")
-        for kind in ("GitRepository", "Kustomization", "HelmRelease"):
+        controller = argocd if self.gitops == "argocd" else flux
+        for kind in controller.KINDS:
             try:
                 self.kube.find(kind)
             except Exception as error:
-                remedy = "install Flux (source-, kustomize- and helm-controller) there first"
-                raise RigError(f"{existing.kubeconfig}: no {kind}s: {error}; {remedy}") from error
+                raise RigError(
+                    f"{existing.kubeconfig}: no {kind}s: {error}; {controller.REMEDY}"
+                ) from error
 
     def _start_own(self) -> None:
         clock = _Clock(self.timings)
-        self._binaries = tools.ensure(report=self._report)
+        self._binaries = tools.ensure(tools.needed_with(self.gitops), self._report)
         clock.lap("tools")
         work = self._work = Workdir(self.name, self._folder)
         running = self._processes = Processes(work.logs, work.environment())
@@ -229,15 +236,17 @@ class Rig:
         self.kubeconfig = pki.write_kubeconfig(path, self.name, plane.server, certificates)
         self.kube = Kube(self.kubeconfig, work.path / "discovery.json", self.check)
         self.kube.install_crds(tools.crd_files(self._binaries))
-        namespace = {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": flux.NAMESPACE}}
-        self.kube.apply(namespace)
-        clock.lap("Flux's CRDs")
+        controller = argocd if self.gitops == "argocd" else flux
+        metadata = {"name": controller.NAMESPACE}
+        self.kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": metadata})
+        self.kube.apply(*(argocd.settings() if self.gitops == "argocd" else ()))
+        clock.lap("CRDs and settings")
         running.start_together(
             [
                 plane.controller_manager(path),
                 plane.scheduler(path),
                 kwok.component(self._binaries["kwok"], path),
-                *flux.components(self._binaries, work.path, path, self._arguments),
+                *controller.components(self._binaries, work.path, path, self._arguments),
             ]
         )
         # Until the controller manager has made it, a namespace admits no pods.

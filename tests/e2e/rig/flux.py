@@ -14,6 +14,8 @@ from .processes import Component
 
 NAMESPACE = "flux-system"
 LOCKED_DOWN = ("--no-cross-namespace-refs=true", "--default-service-account=default")
+KINDS = ("GitRepository", "Kustomization", "HelmRelease")
+REMEDY = "install Flux (source-, kustomize- and helm-controller) there first"
 CONTROLLERS = ("source-controller", "kustomize-controller", "helm-controller")
 
 

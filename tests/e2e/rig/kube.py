@@ -28,6 +28,8 @@ Seen = TypeVar("Seen")
 _MANAGER = "demandops-e2e"
 _POLL_SECONDS = 0.1
 _VERSIONS = {
+    "Application": "argoproj.io/v1alpha1",
+    "AppProject": "argoproj.io/v1alpha1",
     "GitRepository": "source.toolkit.fluxcd.io/v1",
     "HelmChart": "source.toolkit.fluxcd.io/v1",
     "HelmRelease": "helm.toolkit.fluxcd.io/v2",

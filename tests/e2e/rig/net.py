@@ -62,6 +62,19 @@ def answers(port: int, path: str, authority: Path | None = None) -> Probe:
     return probe
 
 
+def accepts(port: int) -> Probe:
+    """Ready once the port takes connections."""
+
+    def probe() -> str | None:
+        try:
+            socket.create_connection((LOOPBACK, port), timeout=5).close()
+        except OSError as error:
+            return f"{LOOPBACK}:{port}: {error}"
+        return None
+
+    return probe
+
+
 def _bindable(port: int) -> bool:
     with socket.socket() as attempt:
         try:

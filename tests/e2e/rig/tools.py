@@ -3,7 +3,8 @@
 First stage of the rig: everything above takes the paths that `ensure` returns. A wrapper module
 under `tests/e2e/tools/` pins each program, so that `go.sum` covers all of it. A cache entry is
 named after the digest of all that decides its bytes; it appears by one rename, so an entry that
-exists is whole. `python -m tests.e2e.rig.tools` builds all and prints how long each took.
+exists is whole. `python -m tests.e2e.rig.tools` builds all and prints how long each took, with
+`--for flux` or `--for argocd` what a rig with that controller takes.
 """
 
 from __future__ import annotations
@@ -30,6 +31,9 @@ CACHE_VARIABLE = "DEMANDOPS_E2E_CACHE"
 
 Report = Callable[[str], None]
 
+_ARGOCD = "github.com/argoproj/argo-cd/v3"
+_CRD_FOLDERS = ("config/crd/bases", "manifests/crds")  # Flux's, Argo CD's
+
 
 @dataclass(frozen=True)
 class Tool:
@@ -39,11 +43,12 @@ class Tool:
     wrapper: str
     package: str
     crds_of: str = ""  # the Go module whose CRDs are copied next to the program
+    gitops: str = ""  # the one controller that it is needed with, where it is not for all
 
 
 def _flux(name: str) -> Tool:
     module = f"github.com/fluxcd/{name}"
-    return Tool(name, name, module, crds_of=module)
+    return Tool(name, name, module, crds_of=module, gitops="flux")
 
 
 def _kubernetes(name: str) -> Tool:
@@ -63,6 +68,7 @@ TOOLS = {
         _flux("kustomize-controller"),
         _flux("helm-controller"),
         Tool("helm", "helm", "helm.sh/helm/v4/cmd/helm"),
+        Tool("argocd", "argocd", f"{_ARGOCD}/cmd", crds_of=_ARGOCD, gitops="argocd"),
     )
 }
 
@@ -86,6 +92,11 @@ def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> 
             if not entries[name].is_dir():  # another run may have built it while we waited
                 _build(TOOLS[name], go, entries[name], _prefixed(say, place, len(missing), name))
     return {name: entries[name] / name for name in wanted}
+
+
+def needed_with(gitops: str) -> list[str]:
+    """Names of the programs of a rig with this GitOps controller."""
+    return [tool.name for tool in TOOLS.values() if tool.gitops in ("", gitops)]
 
 
 def crd_files(binaries: dict[str, Path]) -> list[Path]:
@@ -181,9 +192,10 @@ def _build(tool: Tool, go: gobuild.Go, entry: Path, say: Report) -> None:
 
 def _copy_crds(module: Path, target: Path) -> None:
     target.mkdir()
-    sources = sorted((module / "config" / "crd" / "bases").glob("*.yaml"))
+    found = (path for folder in _CRD_FOLDERS for path in (module / folder).glob("*.yaml"))
+    sources = sorted(path for path in found if path.name != "kustomization.yaml")
     if not sources:
-        raise RigError(f"{module}: no CRDs in config/crd/bases; has the module moved them?")
+        raise RigError(f"{module}: no CRDs in {' or '.join(_CRD_FOLDERS)}; have they moved?")
     for source in sources:
         (target / source.name).write_bytes(source.read_bytes())  # without the read-only mode
 
@@ -198,8 +210,11 @@ def _to_stderr(text: str) -> None:
 
 def _main() -> int:
     start = time.monotonic()
+    names = sys.argv[1:]
+    if names and names[0] == "--for":
+        names = [name for gitops in names[1:] for name in needed_with(gitops)]
     try:
-        paths = ensure(sys.argv[1:] or None)
+        paths = ensure(names or None)
     except RigError as error:
         print(error, file=sys.stderr)
         return 1

@@ -33,6 +33,13 @@ def _move_broker(person: Person) -> str:
     return person.edit(BROKERS, "service-mqtt-broker-edge", "broker-of-the-edge")
 
 
+def _choose_argocd(person: Person) -> str:
+    url = "https://git.example/state.git"
+    return person.edit(
+        "demandops.yaml", "gitops: flux\n", f"gitops: argocd\nargocd:\n  url: {url}\n"
+    )
+
+
 def _add_node(person: Person) -> str:
     return person.edit(NODES, "  - id: cloud\n", "  - id: tram07\n    type: vehicle\n"
                        "    cluster: c-its\n  - id: cloud\n")  # fmt: skip
@@ -119,6 +126,21 @@ def test_an_edited_inventory_is_carried_out_before_the_next_demand(
     assert all(path.startswith("clusters/") for path in changed.splitlines())
     assert "broker-of-the-edge" in rig.git(bare, "show", follow.id)
     assert "broker-of-the-edge" in rig.git(bare, "show", f"main:{BROKERS}")
+    rig.assert_sound(bare)
+
+
+@RUNNING
+def test_another_gitops_controller_has_everything_rendered_anew_in_one_commit(
+    address: str, bare: Path, person: Person, running: bool
+) -> None:
+    _around(address, running, [goal(1)], lambda: _choose_argocd(person), [goal(2)])
+    assert _kinds(bare) == ["join", "person", "follow", "join"]
+    *_, follow, _ = rig.commits(bare)
+    generated = rig.git(bare, "ls-tree", "-r", "--name-only", follow.id, "bootstrap", "clusters")
+    texts = [rig.git(bare, "show", f"{follow.id}:{path}") for path in generated.splitlines()]
+    assert any("kind: Application" in text for text in texts)
+    assert not any("fluxcd.io" in text for text in texts)
+    assert "_charts" not in generated
     rig.assert_sound(bare)
 
 

@@ -6,6 +6,7 @@ of the edit, ``{next}`` for the one after it, and ``…`` at the end for a remed
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 
 import pytest
@@ -13,6 +14,7 @@ from asking import brokers, configuration, edited, skeleton
 
 from generator.catalog.catalog import load
 from generator.errors import InvalidInput
+from generator.staterepo import layout
 
 ROOT = "demandops.yaml"
 CLUSTERS = "inventory/clusters.yaml"
@@ -126,7 +128,13 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     ),
     # demandops.yaml
     "a controller that is not known": (
-        ROOT, "gitops: flux", "gitops: helm", ["gitops: is 'helm', but must be 'flux'"],
+        ROOT, "gitops: flux", "gitops: helm",
+        ["gitops: is 'helm', but must be 'flux' or 'argocd'"],
+    ),
+    "a controller without its section": (
+        ROOT, "gitops: flux", "gitops: argocd",
+        ["argocd: is missing, but gitops is argocd; add it with the url that the clusters fetch "
+         "this repo from"],
     ),
     "a newer generator's rendering": (
         ROOT, "renderVersion: 1", "renderVersion: 2",
@@ -449,6 +457,42 @@ def test_a_mistake_is_told_with_file_field_and_remedy(name: str) -> None:
 )
 def test_a_file_that_holds_nothing_of_use(path: str, content: str | None, message: str) -> None:
     assert faults({path: content}) == [f"{path}: {message}"]
+
+
+class TestArgoCd:
+    """What is asked of a state repo that Argo CD reads."""
+
+    @staticmethod
+    def root(**section: object) -> dict[str, str | None]:
+        text = layout.files("argocd")[ROOT]
+        url = "  url: https://git.example/fleet/state-repo.git\n"
+        assert url in text
+        return {ROOT: text.replace(url, f"  {json.dumps(section)}\n")}
+
+    def test_a_url_is_enough(self) -> None:
+        catalog = load(configuration(self.root(url="https://git.example/state.git")))
+        assert catalog.repository.argocd
+        assert catalog.repository.argocd.namespace == "argocd"
+
+    def test_the_other_controllers_section_may_stay(self) -> None:
+        text = skeleton()[ROOT] + "argocd:\n  url: https://git.example/state.git\n"
+        assert load(configuration({ROOT: text})).repository.gitops == "flux"
+
+    def test_a_section_without_its_url(self) -> None:
+        assert faults(self.root(namespace="argo")) == [f"{ROOT}: argocd.url: is missing; add it"]
+
+    def test_a_field_of_fluxs(self) -> None:
+        found = faults(self.root(url="https://git.example/state.git", interval="1m"))
+        assert found == [
+            f"{ROOT}: argocd.interval: is not a field here; remove it or mend its spelling"
+        ]
+
+    def test_a_domain_in_argo_cds_own_namespace(self) -> None:
+        root = self.root(url="https://git.example/state.git", namespace="perception")
+        assert faults(root) == [
+            f"{DOMAINS}: domains[0].namespace: 'perception' is Argo CD's own, where whoever may "
+            "write an Application may do all that Argo CD may; choose another"
+        ]
 
 
 class TestNodes:

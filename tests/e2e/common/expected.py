@@ -73,7 +73,7 @@ def _of_row(row: str, rows: dict[str, list[str]]) -> Iterator[tuple[str, str]]:
         yield from _end("edge", target_end(node))
         return
     name = FUSION if kind == "object-fusion" else DETECTION[subject]
-    yield from (("edge", line) for line in (f"HelmRelease {name}", *_deployed("edge", name)))
+    yield from (("edge", line) for line in (f"release {name}", *_deployed("edge", name)))
     if kind == "object-fusion":
         yield from (("edge", f"ConfigMap {name}-{part}") for part in ("params", "watcher"))
         for node in rows[row]:
@@ -90,3 +90,8 @@ def _end(node: str, name: str) -> Iterator[tuple[str, str]]:
 
 def _deployed(node: str, name: str) -> tuple[str, str]:
     return f"Deployment {name}", f"pod of {name} on {node}, ready"
+
+
+def unscheduled(lines: frozenset[str]) -> frozenset[str]:
+    """The same with the edge's pods waiting for a node."""
+    return frozenset(line.replace(" on edge, ready", " on no node, not ready") for line in lines)

@@ -1,0 +1,40 @@
+"""The controller that the state repo is written for: Flux or Argo CD, as ``demandops.yaml`` says.
+
+What is the same for both is here: a service's Helm values, and connections, which are plain
+manifests.
+"""
+
+from __future__ import annotations
+
+from generator.catalog.catalog import Catalog
+from generator.plan.release import Release, ServiceRelease
+from generator.render import argocd, connections, flux
+from generator.render.engine import Engine
+from generator.render.values import values_of
+
+
+def render(release: Release, catalog: Catalog, engine: Engine) -> str:
+    """Return the one file of a release.
+
+    Raises:
+        InvalidInput: where an appdef's values template fails or its values break the chart's
+            schema.
+    """
+    if not isinstance(release, ServiceRelease):
+        return connections.render(release, catalog, engine)
+    values = values_of(release, catalog, engine)
+    if catalog.repository.gitops == "argocd":
+        return argocd.render(release, values, catalog.repository, engine)
+    return flux.render(release, values, engine)
+
+
+def standing_files(catalog: Catalog, engine: Engine) -> dict[str, str]:
+    """Return the files that stay when nothing is demanded.
+
+    For each cluster what makes its controller follow the repo; for each access domain on it a
+    placeholder: Git drops empty folders, and a missing folder makes Flux and Argo CD fail instead
+    of pruning.
+    """
+    if catalog.repository.gitops == "argocd":
+        return argocd.standing_files(catalog, engine)
+    return flux.standing_files(catalog, engine)

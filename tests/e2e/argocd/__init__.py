@@ -1,0 +1,1 @@
+"""The same chain with Argo CD in Flux's place."""

@@ -1,0 +1,179 @@
+"""An access domain reaches its own namespace and nothing else, whatever is committed to its folder.
+
+Each case is what a mistake or somebody with write access there might commit.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tests.e2e.common import expected
+from tests.e2e.rig.argocd import NAMESPACE as CONTROL
+from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.kube import Manifest
+
+from .world import World
+
+NEIGHBOUR = "neighbour"
+FILE = "clusters/c-its/perception/edge/foreign.yaml"
+IN_CLUSTER = "https://kubernetes.default.svc"
+_RBAC = "rbac.authorization.k8s.io"
+
+SlipIn = Callable[[Manifest], None]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def neighbour(rig: Rig) -> Iterator[None]:
+    """A namespace that is nobody's, and a project that may do everything, in Argo CD's namespace.
+
+    The project is what an installation has by the name `default`.
+    """
+    rig.kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NEIGHBOUR}})
+    anywhere = {"server": "*", "namespace": "*"}
+    account = {**anywhere, "defaultServiceAccount": "default"}
+    spec = {
+        "sourceRepos": ["*"],
+        "destinations": [anywhere],
+        "destinationServiceAccounts": [account],
+        "clusterResourceWhitelist": [{"group": "*", "kind": "*"}],
+    }
+    rig.kube.apply(object_("argoproj.io/v1alpha1", "AppProject", "default", CONTROL, spec=spec))
+    yield
+    rig.kube.delete("AppProject", "default", CONTROL)
+    rig.kube.delete("Namespace", NEIGHBOUR)
+
+
+@pytest.fixture
+def slip_in(world: World) -> Iterator[SlipIn]:
+    """Commit a manifest to the domain's folder; it goes again at the end."""
+
+    def push(manifest: Manifest) -> None:
+        commit = world.push({FILE: json.dumps(manifest)})
+        world.domain.wake()
+        world.domain.wait_fetched(commit)
+
+    yield push
+    world.tip()  # the clone is as the remote has it
+    if FILE in world.person.git("ls-files").split():
+        world.push({FILE: None})
+    world.domain.wake()
+    world.domain.wait_applied(world.tip())
+
+
+def object_(version: str, kind: str, name: str, namespace: str = "", **rest: Any) -> Manifest:
+    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
+    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}
+
+
+def application(world: World, *, project: str, into: str, namespace: str) -> Manifest:
+    """A release of the detection's chart, of a project, into a namespace."""
+    source = {
+        "repoURL": world.rig.git_url(world.name),
+        "path": "appdefs/object-detection-fusion/charts/object-detection",
+        "targetRevision": "main",
+    }
+    spec = {
+        "project": project,
+        "source": source,
+        "destination": {"server": IN_CLUSTER, "namespace": into},
+        "syncPolicy": {"automated": {}},
+    }
+    return object_("argoproj.io/v1alpha1", "Application", "foreign", namespace, spec=spec)
+
+
+def binding(kind: str, namespace: str = "") -> Manifest:
+    """Administrator's rights for the domain's account."""
+    account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
+    role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
+    return object_(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])
+
+
+REFUSED = {
+    "a foreign namespace": (
+        object_("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}),
+        "namespace neighbour is not permitted in project 'demandops-perception'",
+    ),
+    "a kind of the whole cluster": (
+        object_("v1", "Namespace", "foreign"),
+        "resource :Namespace is not permitted in project",
+    ),
+    "a binding for the whole cluster": (
+        binding("ClusterRoleBinding"),
+        "ClusterRoleBinding is not permitted in project",
+    ),
+    "more rights in its own namespace": (
+        binding("RoleBinding", "perception"),
+        "attempting to grant RBAC permissions not currently held",
+    ),
+    "a kind that no release is made of": (
+        object_("v1", "Service", "foreign", "perception", spec={"ports": [{"port": 80}]}),
+        "resource :Service is not permitted in project",
+    ),
+    "a project": (
+        object_("argoproj.io/v1alpha1", "AppProject", "foreign", "perception", spec={}),
+        "AppProject is not permitted in project",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_it_is_refused_and_what_runs_goes_on(world: World, slip_in: SlipIn, name: str) -> None:
+    manifest, reason = REFUSED[name]
+    domain = world.domain
+    world.follow(world.demand(expected.demand(1)), expected.after(1))
+    slip_in(manifest)
+    domain.kube.wait(
+        f"the refusal of {name}", lambda: reason in domain.trouble(domain.name, CONTROL)
+    )
+    assert domain.lines() == expected.after(1)
+    if manifest["metadata"].get("namespace") != "perception":
+        namespace = manifest["metadata"].get("namespace", "")
+        assert (
+            domain.kube.get(
+                manifest["kind"], manifest["metadata"]["name"], namespace, manifest["apiVersion"]
+            )
+            is None
+        )
+
+
+def test_a_release_cannot_name_another_project(world: World, slip_in: SlipIn) -> None:
+    slip_in(application(world, project="default", into=NEIGHBOUR, namespace="perception"))
+    domain = world.domain
+    domain.kube.wait(
+        "the refusal", lambda: "to use project" in domain.trouble("foreign", "perception")
+    )
+    assert domain.kube.find("Deployment", NEIGHBOUR) == []
+
+
+def test_a_release_cannot_leave_its_namespace(world: World, slip_in: SlipIn) -> None:
+    project = world.domain.name
+    slip_in(application(world, project=project, into=NEIGHBOUR, namespace="perception"))
+    domain = world.domain
+    domain.kube.wait(
+        "the refusal", lambda: "do not match" in domain.trouble("foreign", "perception")
+    )
+    assert domain.kube.find("Deployment", NEIGHBOUR) == []
+
+
+def test_no_application_in_argo_cds_own_namespace(world: World, slip_in: SlipIn) -> None:
+    slip_in(application(world, project="default", into=NEIGHBOUR, namespace=CONTROL))
+    domain = world.domain
+    domain.kube.wait(
+        "the refusal",
+        lambda: "namespace argocd is not permitted" in domain.trouble(domain.name, CONTROL),
+    )
+    assert domain.kube.get("Application", "foreign", CONTROL) is None
+    assert domain.kube.find("Deployment", NEIGHBOUR) == []
+
+
+def test_a_later_commit_is_applied_once_the_refused_manifest_is_gone(
+    world: World, slip_in: SlipIn
+) -> None:
+    """With the next demand the generator takes the file out, and Argo CD tries that commit."""
+    world.follow(world.demand(expected.demand(1)), expected.after(1))
+    slip_in(object_("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}))
+    world.step(2, expected.after(2))

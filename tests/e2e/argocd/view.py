@@ -1,0 +1,111 @@
+"""One access domain on one cluster that Argo CD keeps: its folder's Application and its releases.
+
+It reads the API and asks Argo CD to look; it changes nothing that Argo CD or a release owns.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from tests.e2e.common.namespace import Namespace, name_of
+from tests.e2e.rig.argocd import NAMESPACE
+from tests.e2e.rig.errors import RigError
+from tests.e2e.rig.kube import Kube, Manifest
+
+_REFRESH = "argocd.argoproj.io/refresh"
+
+
+class Domain(Namespace):
+    """The domain's namespace on one cluster; the Application over its folder is called `name`."""
+
+    RELEASE = "Application"
+
+    def __init__(self, kube: Kube, namespace: str, name: str) -> None:
+        super().__init__(kube, namespace)
+        self.name = name
+
+    # --- looking ----------------------------------------------------------------------------
+
+    def releases(self) -> dict[str, Any]:
+        """What is asked for of every release, by its name: all but what Argo CD notes there."""
+        return {name_of(item): item["spec"] for item in self.find("Application")}
+
+    def fetched(self) -> str:
+        """The commit that the folder was last compared with."""
+        return str(self._sync().get("revision", ""))
+
+    def applied(self) -> str:
+        """The commit that the folder was found to be applied from, once nothing is under way."""
+        found = self._folder()
+        under_way = bool(found.get("operation"))
+        return self.fetched() if self._sync().get("status") == "Synced" and not under_way else ""
+
+    def trouble(self, name: str, namespace: str) -> str:
+        """What Argo CD says against an Application; empty where nothing."""
+        status = (self.kube.get("Application", name, namespace) or {}).get("status") or {}
+        told = [condition["message"] for condition in status.get("conditions") or []]
+        operation = status.get("operationState") or {}
+        if operation.get("phase") not in (None, "Succeeded"):
+            told.append(f"{operation['phase']}: {operation.get('message', '')}")
+            results = (operation.get("syncResult") or {}).get("resources") or []
+            told += [
+                f"{item['kind']} {item['name']}: {item['message']}"
+                for item in results
+                if item.get("status") not in ("Synced", "Pruned", None)
+            ]
+        return "; ".join(told)
+
+    # --- waiting ----------------------------------------------------------------------------
+
+    def wake(self) -> None:
+        """Ask for a look at the folder now; what changes there wakes its releases."""
+        self.refresh(self.name, NAMESPACE)
+
+    def refresh(self, name: str, namespace: str = "") -> None:
+        """Ask for a look at one Application now, and wait until it was taken."""
+        namespace = namespace or self.namespace
+        body = {"metadata": {"annotations": {_REFRESH: "normal"}}}
+        self.kube.patch("Application", name, body, namespace)
+
+        def taken() -> bool:
+            found = self.kube.get("Application", name, namespace) or {"metadata": {}}
+            return _REFRESH not in (found["metadata"].get("annotations") or {})
+
+        self.kube.wait(f"Application {namespace}/{name} to be looked at", taken)
+
+    def wait_fetched(self, commit: str) -> float:
+        """Wait until the folder was compared with a commit; returns when it was seen."""
+        self._wait_for(f"{commit[:10]} to be fetched", commit, fetched=True)
+        return time.monotonic()
+
+    def wait_applied(self, commit: str) -> float:
+        """Wait until the folder is applied from a commit; returns when it was seen."""
+        self._wait_for(f"{commit[:10]} to be applied", commit, fetched=False)
+        return time.monotonic()
+
+    def wait_releases_synced(self) -> None:
+        """Wait until every release is as its Application asks."""
+
+        def synced() -> bool:
+            states = [item.get("status", {}).get("sync", {}) for item in self.find("Application")]
+            return all(state.get("status") == "Synced" for state in states)
+
+        self.kube.wait("all releases to be Synced", synced)
+
+    # --- inside -----------------------------------------------------------------------------
+
+    def _folder(self) -> Manifest:
+        return self.kube.get("Application", self.name, NAMESPACE) or {}
+
+    def _sync(self) -> dict[str, Any]:
+        return dict((self._folder().get("status") or {}).get("sync") or {})
+
+    def _wait_for(self, what: str, commit: str, *, fetched: bool) -> None:
+        look = self.fetched if fetched else self.applied
+        try:
+            self.kube.wait(what, lambda: look() == commit)
+        except RigError as error:
+            told = [self.trouble(self.name, NAMESPACE)]
+            told += [self.trouble(name, self.namespace) for name in self.releases()]
+            raise AssertionError(f"{error}; {'; '.join(filter(None, told))}") from error

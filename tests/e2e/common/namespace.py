@@ -1,0 +1,170 @@
+"""One access domain's namespace on one cluster, as tests look at it: names, pods, versions.
+
+It reads the API and changes nothing. What is particular to a GitOps controller is added by the
+`view` beside that controller's tests.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar
+
+import yaml
+
+from tests.e2e.rig.errors import RigError
+from tests.e2e.rig.kube import Kube, Manifest
+from tests.e2e.rig.kwok import NODE_ID_LABEL
+
+from .expected import FUSION
+
+_INSTANCE = "app.kubernetes.io/instance"
+
+# What can be in a domain's namespace by way of us; events, leases and the like are left out.
+_OF_RELEASES = (
+    "ConfigMap",
+    "Deployment",
+    "Pod",
+    "ReplicaSet",
+    "Role",
+    "RoleBinding",
+    "Secret",
+    "ServiceAccount",
+)
+_OTHERS = ("Job", "Service")
+
+
+class Namespace:
+    """The namespace; a service's release is an object of the kind `RELEASE`."""
+
+    RELEASE: ClassVar[str]
+    OWN: ClassVar[tuple[str, ...]] = ()  # further kinds of the controller's own
+    STEADY: ClassVar[tuple[str, ...]] = ()  # those that a commit about something else leaves alone
+
+    def __init__(self, kube: Kube, namespace: str) -> None:
+        self.kube, self.namespace = kube, namespace
+        self._node_ids: dict[str, str] = {}
+
+    # --- looking ----------------------------------------------------------------------------
+
+    def get(self, kind: str, name: str) -> Manifest:
+        """An object that must be there."""
+        found = self.kube.get(kind, name, self.namespace)
+        assert found is not None, f"{kind} {self.namespace}/{name} is not there"
+        return found
+
+    def find(self, kind: str, instance: str = "") -> list[Manifest]:
+        """The namespace's objects of a kind, or those of one release."""
+        selector = f"{_INSTANCE}={instance}" if instance else ""
+        return self.kube.find(kind, self.namespace, selector)
+
+    def lines(self) -> frozenset[str]:
+        """What is there, in the words of `expected`."""
+        found = [f"release {name_of(item)}" for item in self.find(self.RELEASE)]
+        found += [f"Deployment {name_of(item)}" for item in self.find("Deployment")]
+        for config in self.find("ConfigMap"):
+            found.append(f"ConfigMap {name_of(config)}")
+            if name_of(config) == f"{FUSION}-params":
+                found += [f"fusion takes {topic}" for topic in fusion_inputs(config)]
+        found += [self._pod_line(pod) for pod in self.find("Pod")]
+        repeated = {line for line in found if found.count(line) > 1}
+        return frozenset(found) | {f"twice: {line}" for line in repeated}
+
+    def inventory(self) -> frozenset[str]:
+        """Kind and name of everything in the namespace, whoever made it."""
+        kinds = (*_OF_RELEASES, *_OTHERS, self.RELEASE, *self.OWN)
+        return frozenset(f"{kind} {name_of(item)}" for kind in kinds for item in self.find(kind))
+
+    def versions(self) -> dict[str, str]:
+        """The resourceVersion of every object that a release is or owns."""
+        return {
+            f"{kind} {name_of(item)}": item["metadata"]["resourceVersion"]
+            for kind in (*_OF_RELEASES, *self.STEADY)
+            for item in self.find(kind)
+        }
+
+    def identity(self, name: str) -> tuple[object, ...]:
+        """What changes when the pods of a Deployment are restarted, or were about to be."""
+        metadata = self.get("Deployment", name)["metadata"]
+        pods = sorted(pod["metadata"]["uid"] for pod in self.find("Pod", name))
+        sets = sorted(item["metadata"]["uid"] for item in self.find("ReplicaSet", name))
+        return metadata["uid"], metadata["generation"], *pods, *sets
+
+    # --- waiting ----------------------------------------------------------------------------
+
+    def wait_lines(self, wanted: frozenset[str], timeout: float = 60.0) -> float:
+        """Wait until there is exactly what is wanted; returns when it was seen."""
+        return self._wait_same(self.lines, wanted, timeout)
+
+    def wait_inventory(self, wanted: frozenset[str], timeout: float = 60.0) -> None:
+        """Wait until the namespace holds exactly what it held when `inventory` was asked."""
+        self._wait_same(self.inventory, wanted, timeout)
+
+    def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
+        """Wait until no release's object has changed for a while; returns the versions."""
+        seen, since = self.versions(), time.monotonic()
+
+        def quiet() -> bool:
+            nonlocal seen, since
+            now = self.versions()
+            if now != seen:
+                seen, since = now, time.monotonic()
+            return time.monotonic() - since > seconds
+
+        self.kube.wait("the releases to come to rest", quiet, 60)
+        return seen
+
+    # --- inside -----------------------------------------------------------------------------
+
+    def _wait_same(
+        self, look: Callable[[], frozenset[str]], wanted: frozenset[str], timeout: float
+    ) -> float:
+        seen: list[frozenset[str]] = [frozenset()]
+
+        def same() -> bool:
+            seen[0] = look()
+            return seen[0] == wanted
+
+        try:
+            self.kube.wait("exactly what is wanted", same, timeout)
+        except RigError as error:
+            raise AssertionError(f"{error}\n{_difference(wanted, seen[0])}") from error
+        return time.monotonic()
+
+    def _status(self, kind: str, name: str) -> dict[str, Any]:
+        found = self.kube.get(kind, name, self.namespace) or {}
+        return dict(found.get("status") or {})
+
+    def _pod_line(self, pod: Manifest) -> str:
+        instance = (pod["metadata"].get("labels") or {}).get(_INSTANCE, name_of(pod))
+        conditions = pod.get("status", {}).get("conditions") or []
+        ready = any(c["type"] == "Ready" and c["status"] == "True" for c in conditions)
+        state = "going" if pod["metadata"].get("deletionTimestamp") else "not ready"
+        state = "ready" if ready and state != "going" else state
+        return f"pod of {instance} on {self._node_id(pod['spec'].get('nodeName'))}, {state}"
+
+    def _node_id(self, node: str | None) -> str:
+        if node is None:
+            return "no node"
+        if node not in self._node_ids:
+            found = self.kube.get("Node", node) or {"metadata": {}}
+            labels = found["metadata"].get("labels") or {}
+            self._node_ids[node] = labels.get(NODE_ID_LABEL, f"{node} without label")
+        return self._node_ids[node]
+
+
+def fusion_inputs(config: Manifest) -> list[str]:
+    """The topics that the fusion's ConfigMap tells it to take."""
+    (parameters,) = yaml.safe_load(config["data"]["params.yml"]).values()
+    inputs = parameters["ros__parameters"]["additional_inputs"]
+    return [topic for topic in inputs["topics_egodata"] + inputs["topics_objectlist"] if topic]
+
+
+def name_of(item: Manifest) -> str:
+    """An object's name."""
+    return str(item["metadata"]["name"])
+
+
+def _difference(wanted: Iterable[str], found: Iterable[str]) -> str:
+    lines = [f"  missing: {line}" for line in sorted(set(wanted) - set(found))]
+    return "\n".join(lines + [f"  too much: {line}" for line in sorted(set(found) - set(wanted))])

@@ -1,0 +1,155 @@
+"""A state repo of its own and the generator that writes it.
+
+The generator is a real `demandops serve` that pushes to the rig's Git server by smart HTTP.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tests.e2e.rig import launch
+from tests.e2e.rig.clone import Clone
+from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.errors import RigError
+
+from .ros import Client, Sent
+
+_READY = "taking demands on"
+_START_S = 60.0
+
+
+class Generator:
+    """A `demandops serve` process, which can be killed and started again."""
+
+    def __init__(self, state_repo: str, folder: Path, ros_domain: int, client: Client) -> None:
+        self.log = folder / "generator.log"
+        self._client = client
+        self._folder = folder
+        self._command = ["-m", "generator.cli.main", "serve", "--state-repo", state_repo]
+        self._environment = environment(folder) | {"ROS_DOMAIN_ID": str(ros_domain)}
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self, *arguments: str) -> None:
+        """Start it and wait until it takes goals. It ends with this process, whatever ends that."""
+        command = launch.command(sys.executable, *self._command, *arguments)
+        with self.log.open("ab") as log:
+            told = log.tell()
+            self._process = subprocess.Popen(
+                command,
+                env=self._environment,
+                cwd=self._folder,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+        deadline = time.monotonic() + _START_S
+        while not (_READY in self._said(told) and self._client.reaches_a_node()):
+            ended = self._process.poll() is not None
+            if ended or time.monotonic() > deadline:
+                raise RigError(f"the generator takes no demands; {self.log}:\n{self._said(told)}")
+            time.sleep(0.05)
+
+    def kill(self) -> None:
+        """End it as a crash would."""
+        assert self._process is not None
+        self._process.kill()
+        self._process.wait(10)
+
+    def stop(self) -> None:
+        """End it in order, or at once where it does not."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(10)
+            except subprocess.TimeoutExpired:
+                self.kill()
+
+    def _said(self, since: int) -> str:
+        return self.log.read_bytes()[since:].decode(errors="replace")
+
+
+class StateRepo:
+    """A state repo in use, written for the controller of the rig that it is on."""
+
+    def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
+        self.rig, self.client, self.folder = rig, client, folder
+        self.name = f"state-{uuid.uuid4().hex[:8]}.git"
+        self.push_url = rig.push_url(self.name)
+        bare = folder / "state.git"
+        url = rig.git_url(self.name)
+        demandops(folder, "init", str(bare), "--bare", "--gitops", rig.gitops, "--url", url)
+        _git(bare, "push", "--quiet", self.push_url, "main")
+        self.person = Clone(self.push_url, folder / "person")
+        self.generator = Generator(self.push_url, folder, ros_domain, client)
+
+    def file(self, path: str) -> str:
+        """A file as the remote has it."""
+        self._pull()
+        return (self.person.folder / path).read_text()
+
+    def tip(self) -> str:
+        """The commit that the remote is at."""
+        self._pull()
+        return self.person.git("rev-parse", "HEAD").strip()
+
+    def changed_by(self, commit: str) -> list[str]:
+        """The paths that a commit changed."""
+        self._pull()
+        return self.person.git("show", "--name-only", "--format=", commit).split()
+
+    def commits_since(self, commit: str) -> int:
+        """How many commits the remote has on top of one."""
+        self._pull()
+        return int(self.person.git("rev-list", "--count", f"{commit}..HEAD"))
+
+    def push(self, files: Mapping[str, str | None], message: str = "by hand") -> str:
+        """Change files as a person would; returns the commit."""
+        self._pull()
+        return self.person.push(files, message)
+
+    def demand(self, goal: dict[str, Any]) -> Sent:
+        """Send a goal that must succeed."""
+        sent = self.client.call(goal)
+        assert sent.status == "succeeded", sent.message
+        return sent
+
+    def _pull(self) -> None:
+        self.person.git("fetch", "--quiet", "origin", "main")
+        self.person.git("reset", "--quiet", "--hard", "FETCH_HEAD")
+
+
+def demandops(folder: Path, *arguments: str) -> str:
+    """Run the command line with its data in `folder`."""
+    command = [sys.executable, "-m", "generator.cli.main", *arguments]
+    done = subprocess.run(
+        command,
+        env=environment(folder),
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, f"demandops {' '.join(arguments)}: {done.stderr}"
+    return done.stdout
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """The environment of our own processes: data and logs in `folder`, loopback only."""
+    return {
+        **os.environ,
+        "DEMANDOPS_DATA_HOME": str(folder / "data"),
+        "GIT_TERMINAL_PROMPT": "0",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(folder / "ros-log"),
+    }
+
+
+def _git(repository: Path, *arguments: str) -> None:
+    subprocess.run(["git", *arguments], cwd=repository, check=True, capture_output=True)
