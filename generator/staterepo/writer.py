@@ -7,6 +7,7 @@ again on the new tip.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
@@ -17,7 +18,7 @@ from pygit2 import Oid, Signature
 
 from generator.decision import Decision, State, consequence, rendered
 from generator.demand.claim import Subject
-from generator.errors import Fault, InvalidInput
+from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
 from generator.staterepo import history, message
@@ -27,6 +28,7 @@ from generator.staterepo.remote import StateRepository
 from generator.staterepo.snapshot import Advance, Progress, Snapshot
 
 _ATTEMPTS = 5
+_PAUSE_S = 0.02
 
 
 class Line:
@@ -136,12 +138,14 @@ class Line:
                 made = self._objects.create_commit(
                     None, author, committer, text, tree, [self.head.commit]
                 )
+                self._tree = snapshots.commit_of(self._objects, made).tree
                 break
-            except (OSError, pygit2.GitError):
-                # git's housekeeping removes a folder of loose objects just as one is put there
+            except (OSError, pygit2.GitError, KeyError, StateRepoError):
+                # git's housekeeping removes a folder of loose objects just as one is put there,
+                # or moves one into a pack just as it is looked for
                 if attempt == _ATTEMPTS:
                     raise
-        self._tree = snapshots.commit_of(self._objects, made).tree
+                time.sleep(_PAUSE_S * attempt)
         return made
 
     def publish(self) -> bool:

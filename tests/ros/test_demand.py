@@ -115,8 +115,8 @@ def test_a_third_type_of_application_is_demanded_with_yaml_alone(
         assert books["commit"] == it.commit
     assert served.bookkeeping()["services"] == {}
     assert operations(state)[-2:] == ["put", "release"]
-    # the node may not have found the client's subscription to feedback from the start
-    assert stages == ["admitted", "booked", "committed", "pushed"][4 - len(stages) :]
+    # an action client may miss feedback at the start, and forgets it once it has the result
+    assert stages == [s for s in ("admitted", "booked", "committed", "pushed") if s in stages]
 
 
 def test_a_refusal_names_code_field_and_remedy(serve: Serve, client: DemandClient) -> None:
