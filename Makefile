@@ -36,7 +36,7 @@ e2e: setup  ## Run the end-to-end tests on a real cluster with Flux (docs/e2e.md
 	@$(PY) -m pytest -p no:cacheprovider tests/e2e --ignore tests/e2e/argocd -x -q
 
 e2e-argocd: setup  ## Run them with Argo CD
-	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools --for argocd; fi
+	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools; fi
 	@$(PY) -m pytest -p no:cacheprovider tests/e2e/argocd -x -q
 
 check: setup  ## Format, lint, types, imports and tests

@@ -28,6 +28,7 @@ def settings() -> list[Manifest]:
     """What both parts read from the API before they start: the lock-down of docs/argocd.md."""
     labels = {"app.kubernetes.io/part-of": "argocd"}
     return [
+        {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}},
         {
             "apiVersion": "v1",
             "kind": "ConfigMap",

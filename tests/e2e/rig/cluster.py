@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Literal
 
 from . import argocd, flux, githttp, kwok, pki, settings, tools
@@ -33,15 +33,17 @@ KEEP_VARIABLE = "E2E_KEEP"
 
 Gitops = Literal["flux", "argocd"]
 
+_PARTS: dict[Gitops, ModuleType] = {"flux": flux, "argocd": argocd}
+
 
 class Rig:
     """One cluster; several can run at once, each with ports and a folder of its own.
 
-    `nodes` are node ids, `gitops` is the controller that runs there. `git_of` shares another
-    rig's Git server, so that two clusters read one state repo. `credentials` (user, password)
-    makes the Git server ask for them. `arguments` adds
-    to a controller's command line, by its name. `folder` is where data and logs go (a
-    temporary folder by default, removed at the end unless a test failed or E2E_KEEP is set).
+    `nodes` are node ids, `gitops` is the controller that runs there, and `beside` another one.
+    `git_of` shares another rig's Git server, so that two clusters read one state repo.
+    `credentials` (user, password) makes the Git server ask for them. `arguments` adds to a
+    controller's command line, by its name. `folder` is where data and logs go (a temporary folder
+    by default, removed at the end unless a test failed or E2E_KEEP is set).
     """
 
     kube: Kube
@@ -52,6 +54,7 @@ class Rig:
         name: str = "rig",
         *,
         gitops: Gitops = "flux",
+        beside: Gitops | None = None,
         nodes: Iterable[str] = (),
         git_of: Rig | None = None,
         credentials: tuple[str, str] | None = None,
@@ -60,6 +63,7 @@ class Rig:
         report: tools.Report | None = None,
     ) -> None:
         self.name, self.gitops = name, gitops
+        self._controllers = tuple(dict.fromkeys([gitops, beside or gitops]))
         self.timings: dict[str, float] = {}
         self.existing = settings.existing(name)
         self._initial, self._git_of, self._credentials = list(nodes), git_of, credentials
@@ -211,18 +215,18 @@ class Rig:
         self._git_url, self._push_url = existing.git_url, existing.push_url
         work = self._work = Workdir(self.name, self._folder)
         self.kube = Kube(existing.kubeconfig, work.path / "discovery.json")
-        controller = argocd if self.gitops == "argocd" else flux
-        for kind in controller.KINDS:
-            try:
-                self.kube.find(kind)
-            except Exception as error:
-                raise RigError(
-                    f"{existing.kubeconfig}: no {kind}s: {error}; {controller.REMEDY}"
-                ) from error
+        for controller in self._controllers:
+            kinds, remedy = _PARTS[controller].KINDS, _PARTS[controller].REMEDY
+            for kind in kinds:
+                try:
+                    self.kube.find(kind)
+                except Exception as error:
+                    where = existing.kubeconfig
+                    raise RigError(f"{where}: no {kind}s: {error}; {remedy}") from error
 
     def _start_own(self) -> None:
         clock = _Clock(self.timings)
-        self._binaries = tools.ensure(tools.needed_with(self.gitops), self._report)
+        self._binaries = tools.ensure(tools.needed_with(*self._controllers), self._report)
         clock.lap("tools")
         work = self._work = Workdir(self.name, self._folder)
         running = self._processes = Processes(work.logs, work.environment())
@@ -236,17 +240,22 @@ class Rig:
         self.kubeconfig = pki.write_kubeconfig(path, self.name, plane.server, certificates)
         self.kube = Kube(self.kubeconfig, work.path / "discovery.json", self.check)
         self.kube.install_crds(tools.crd_files(self._binaries))
-        controller = argocd if self.gitops == "argocd" else flux
-        metadata = {"name": controller.NAMESPACE}
-        self.kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": metadata})
-        self.kube.apply(*(argocd.settings() if self.gitops == "argocd" else ()))
+        parts = [_PARTS[controller] for controller in self._controllers]
+        for part in parts:
+            self.kube.apply(*part.settings())
         clock.lap("CRDs and settings")
         running.start_together(
             [
                 plane.controller_manager(path),
                 plane.scheduler(path),
                 kwok.component(self._binaries["kwok"], path),
-                *controller.components(self._binaries, work.path, path, self._arguments),
+                *(
+                    component
+                    for part in parts
+                    for component in part.components(
+                        self._binaries, work.path, path, self._arguments
+                    )
+                ),
             ]
         )
         # Until the controller manager has made it, a namespace admits no pods.

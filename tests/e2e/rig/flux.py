@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .kube import Manifest
 from .net import LOOPBACK, answers, free_port
 from .processes import Component
 
@@ -17,6 +18,11 @@ LOCKED_DOWN = ("--no-cross-namespace-refs=true", "--default-service-account=defa
 KINDS = ("GitRepository", "Kustomization", "HelmRelease")
 REMEDY = "install Flux (source-, kustomize- and helm-controller) there first"
 CONTROLLERS = ("source-controller", "kustomize-controller", "helm-controller")
+
+
+def settings() -> list[Manifest]:
+    """What must be there before they start."""
+    return [{"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}}]
 
 
 def components(

@@ -4,7 +4,7 @@ First stage of the rig: everything above takes the paths that `ensure` returns. 
 under `tests/e2e/tools/` pins each program, so that `go.sum` covers all of it. A cache entry is
 named after the digest of all that decides its bytes; it appears by one rename, so an entry that
 exists is whole. `python -m tests.e2e.rig.tools` builds all and prints how long each took, with
-`--for flux` or `--for argocd` what a rig with that controller takes.
+`--for flux` what a rig with that controller takes.
 """
 
 from __future__ import annotations
@@ -94,9 +94,9 @@ def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> 
     return {name: entries[name] / name for name in wanted}
 
 
-def needed_with(gitops: str) -> list[str]:
-    """Names of the programs of a rig with this GitOps controller."""
-    return [tool.name for tool in TOOLS.values() if tool.gitops in ("", gitops)]
+def needed_with(*gitops: str) -> list[str]:
+    """Names of the programs of a rig with these GitOps controllers."""
+    return [tool.name for tool in TOOLS.values() if tool.gitops in ("", *gitops)]
 
 
 def crd_files(binaries: dict[str, Path]) -> list[Path]:
@@ -212,7 +212,7 @@ def _main() -> int:
     start = time.monotonic()
     names = sys.argv[1:]
     if names and names[0] == "--for":
-        names = [name for gitops in names[1:] for name in needed_with(gitops)]
+        names = needed_with(*names[1:])
     try:
         paths = ensure(names or None)
     except RigError as error:

@@ -1,0 +1,135 @@
+"""A state repo goes over from Flux to Argo CD and back as docs/argocd.md says; every pod stays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import yaml
+
+from tests.e2e.common import expected
+from tests.e2e.common.expected import NODES, STANDING
+from tests.e2e.common.ros import Client
+from tests.e2e.flux import view as flux_view
+from tests.e2e.flux.world import World as FluxWorld
+from tests.e2e.rig.argocd import NAMESPACE as CONTROL
+from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.tools import Report
+
+from .conftest import CLUSTER
+from .view import Domain
+
+FLUXS = ("HelmRelease", "Kustomization", "HelmChart", "GitRepository")
+SUSPENDED = {"spec": {"suspend": True}}
+
+
+@pytest.fixture(scope="module")
+def both(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
+    """A cluster with both controllers."""
+    failed = request.session.testsfailed
+    rig = Rig("both", gitops="flux", beside="argocd", nodes=NODES, report=say)
+    rig.start()
+    try:
+        yield rig
+    finally:
+        rig.stop(failed=request.session.testsfailed > failed)
+
+
+def test_every_pod_stays_there_and_back(
+    both: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    world = FluxWorld(both, tmp_path_factory.mktemp("world"), ros_domain, client)
+    try:
+        flux = world.bootstrap(CLUSTER, both)
+        world.generator.start()
+        flux.wait_lines(STANDING)
+        world.step(1, expected.after(1))
+        flux.wait_releases_ready()
+        before = pods(flux)
+
+        from_flux(flux)
+        argocd = to_argocd(world)
+        argocd.wait_lines(expected.after(2))
+        forget_flux(flux)
+        assert {name: pods(argocd)[name] for name in before} == before
+        sent = world.demand(expected.demand(3))
+        argocd.wake()
+        argocd.wait_applied(sent.commit)
+        argocd.wait_lines(expected.after(3))
+        argocd.wait_releases_synced()
+
+        before = pods(argocd)
+        forget_argocd(argocd)
+        to_flux(world)
+        flux.wait_lines(expected.after(4))
+        flux.wait_releases_ready()
+        assert {name: pods(flux)[name] for name in before} == before
+        for step in (5, 6, 7, 8):
+            world.step(step, expected.after(step))
+    finally:
+        world.generator.stop()
+
+
+def pods(domain: Domain | flux_view.Domain) -> dict[str, tuple[object, ...]]:
+    """A Deployment and its pods, by its name.
+
+    Its generation does not count: to apply it as another may write out what was a default.
+    """
+    found = {}
+    for item in domain.find("Deployment"):
+        uid, _, *below = domain.identity(item["metadata"]["name"])
+        found[item["metadata"]["name"]] = (uid, *below)
+    return found
+
+
+def from_flux(domain: flux_view.Domain) -> None:
+    """Suspend what would remove the releases."""
+    for kind in ("Kustomization", "HelmRelease"):
+        for item in domain.find(kind):
+            domain.kube.patch(kind, item["metadata"]["name"], SUSPENDED, domain.namespace)
+
+
+def to_argocd(world: FluxWorld) -> Domain:
+    """Choose Argo CD, have the next demand render everything anew, and let Argo CD follow."""
+    root = world.file("demandops.yaml").replace("gitops: flux\n", "gitops: argocd\n")
+    url = world.rig.git_url(world.name)
+    world.push({"demandops.yaml": f"{root}argocd:\n  url: {url}\n"})
+    sent = world.demand(expected.demand(2))
+    manifests = list(yaml.safe_load_all(world.file(f"bootstrap/{CLUSTER}.yaml")))
+    world.rig.kube.apply(*manifests)
+    folder = manifests[-1]
+    destination = folder["spec"]["destination"]["namespace"]
+    domain = Domain(world.rig.kube, destination, folder["metadata"]["name"])
+    domain.wait_applied(sent.commit)
+    domain.wait_releases_synced()
+    return domain
+
+
+def forget_flux(domain: flux_view.Domain) -> None:
+    """Delete Flux's objects, which remove nothing while suspended, and Helm's notes."""
+    for kind in FLUXS:
+        for item in domain.find(kind):
+            name = item["metadata"]["name"]
+            domain.kube.delete(kind, name, domain.namespace)
+            domain.kube.wait_gone(kind, name, domain.namespace)
+    for secret in domain.find("Secret"):
+        if secret["type"] == "helm.sh/release.v1":
+            domain.kube.delete("Secret", secret["metadata"]["name"], domain.namespace)
+
+
+def forget_argocd(domain: Domain) -> None:
+    """Delete the Applications without what they hold: the folder's first, or it restores them."""
+    found = [(domain.name, CONTROL), *((name, domain.namespace) for name in domain.releases())]
+    for name, namespace in found:
+        domain.kube.patch("Application", name, {"metadata": {"finalizers": None}}, namespace)
+        domain.kube.delete("Application", name, namespace)
+        domain.kube.wait_gone("Application", name, namespace)
+    domain.kube.delete("AppProject", domain.name, CONTROL)
+
+
+def to_flux(world: FluxWorld) -> None:
+    """Choose Flux, have the next demand render everything anew, and let Flux follow."""
+    root = world.file("demandops.yaml").replace("gitops: argocd\n", "gitops: flux\n")
+    world.push({"demandops.yaml": root})
+    world.demand(expected.demand(4))
+    world.bootstrap(CLUSTER, world.rig)
