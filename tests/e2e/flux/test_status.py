@@ -170,32 +170,22 @@ def test_what_the_controller_refuses_is_told_in_its_words(
     """A chart that cannot be installed; the goal says which release, and what Helm says of it."""
     started(world, world.folder / "clusters.yaml", SHORT_S)
     chart = "appdefs/object-detection-fusion/charts/object-detection/templates/deployment.yaml"
-    text = world.file(chart)
-    world.push({chart: text + '{{ fail "no lidar here" }}\n'})
     versions = {
         "appdefs/object-detection-fusion/charts/object-detection/Chart.yaml": "version: ",
         "registry/charts.yaml": "charts/object-detection\n    version: ",
     }
-    world.push(
-        {
-            path: world.file(path).replace(f"{before}0.1.0", f"{before}0.1.1")
-            for path, before in versions.items()
-        }
-    )
+    whole = {path: world.file(path) for path in (chart, *versions)}
+    broken = {
+        path: whole[path].replace(f"{before}0.1.0", f"{before}0.1.1")
+        for path, before in versions.items()
+    }
+    world.push({**broken, chart: whole[chart] + '{{ fail "no lidar here" }}\n'})
     with pytest.raises(DemandError) as caught:
         asker.put("d", [FUSION], answer="healthy")
     assert caught.value.code == "not-healthy"
     assert "HelmRelease perception/od-edge-vehicle00: " in str(caught.value)
     assert "no lidar here" in str(caught.value)
-    world.push(
-        {
-            chart: text,
-            **{
-                path: world.file(path).replace(f"{before}0.1.1", f"{before}0.1.2")
-                for path, before in versions.items()
-            },
-        }
-    )
+    world.push(dict(whole))
     started(world, world.folder / "clusters.yaml", TIMEOUT_S)
     assert asker.put("d", [FUSION], answer="healthy").reached == "healthy"
     asker.release("d")
