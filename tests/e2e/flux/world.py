@@ -67,7 +67,11 @@ class World(StateRepo):
             for kind, name in (("Kustomization", domain.name), ("GitRepository", SOURCE)):
                 kube.delete(kind, name, namespace)
                 kube.wait_gone(kind, name, namespace)
-            kube.wait("the releases to go", lambda d=domain: d.find("HelmRelease") == [])
+            for kind in (
+                "HelmRelease",
+                "HelmChart",
+            ):  # what is going would take its successor along
+                kube.wait(f"each {kind} to go", lambda d=domain, k=kind: d.find(k) == [])
         for kube, item in self._wide:
             kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
         self.domains.clear()
