@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from threading import Event, Thread
 from typing import Any
 
@@ -77,7 +78,7 @@ class BookkeepingTopic:
             commit = str(snapshot.commit)
             text = json.dumps(as_data(books, commit), ensure_ascii=False)
             message = BookkeepingMessage(commit=commit, bookkeeping_json=text)
-            self._in_executor(lambda told=message: self._publish(told))  # type: ignore[misc]
+            self._in_executor(partial(self._publish, message))
             took = time.monotonic() - start
             self._closed.wait(max(_SHORTEST_PAUSE_S, took * _SHARE))
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from generator.cluster.access import Reached
 from generator.cluster.health import (
@@ -143,7 +144,7 @@ class Status:
             if health.reaches(one.level) or last:
                 self._answer(one, health)
             elif time.monotonic() > one.deadline:
-                self._beside(one, lambda one, told=health: self._give_up(one, told))  # type: ignore[misc]
+                self._beside(one, partial(self._give_up, health=health))
 
     def _beside(self, one: _Followed, work: Callable[[_Followed], None]) -> None:
         """Ask a cluster in a thread of its own, for it may not answer."""

@@ -159,16 +159,18 @@ class Settler:
     def catch_up(self) -> None:
         """Try again what people changed and could not be carried out: a release may allow it."""
         if self.snapshot.problems:
-            line = self._line()
-            if line.publish():
-                self._taken(line)
+            self._take_in()
 
     def notice(self) -> None:
         """Take in what others published in a repository on this disk: its leases end here too."""
         if self._repository.always_current and self._repository.tip() != self.snapshot.commit:
-            line = self._line()
-            if line.publish():
-                self.snapshot = line.head
+            self._take_in()
+
+    def _take_in(self) -> None:
+        """Bring the snapshot to the newest tip, and publish what follows from people's changes."""
+        line = self._line()
+        if line.publish():
+            self._taken(line)
 
     def tidy(self) -> None:
         """Every few hundred commits: a demand leaves some twenty loose objects behind."""
