@@ -10,10 +10,10 @@ import click
 from pydantic import BaseModel
 
 from generator.catalog.appdef import ApplicationDefinition
-from generator.catalog.catalog import Repository
 from generator.catalog.inventory import BrokersFile, ClustersFile, NodesFile
 from generator.catalog.policy import AccessDomainsFile
 from generator.catalog.registry import ChartsFile, ImagesFile
+from generator.catalog.repository import Repository
 from generator.cli.output import console
 from generator.cluster.access import AccessFile
 from generator.demand.own import DemandGoal

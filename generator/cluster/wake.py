@@ -14,8 +14,9 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
 from typing import Any
 
-from generator.catalog.catalog import Catalog, Repository
+from generator.catalog.catalog import Catalog
 from generator.catalog.policy import AccessDomain
+from generator.catalog.repository import Repository
 from generator.cluster.access import Reached
 from generator.render.argocd import project_of
 from generator.render.paths import domains_in_use

@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from generator.catalog.catalog import Catalog, Repository
+from generator.catalog.catalog import Catalog
 from generator.catalog.policy import AccessDomain
+from generator.catalog.repository import Repository
 from generator.plan.release import ServiceRelease
 from generator.render.engine import Engine
 from generator.render.paths import (

@@ -33,7 +33,7 @@ from generator.service.ticket import Receipt, Ticket
 from generator.service.waiting import TAKEN_BACK, Waiting
 from generator.staterepo import history, writer
 from generator.staterepo import snapshot as snapshots
-from generator.staterepo.remote import PushDenied, RemoteAway, StateRepository
+from generator.staterepo.repository import PushDenied, RemoteAway, StateRepository
 from generator.staterepo.snapshot import Snapshot
 
 log = logging.getLogger("demandops")

@@ -14,7 +14,8 @@ import pygit2
 from pygit2 import Commit, Repository
 
 from generator import yamlio
-from generator.catalog.catalog import CONFIG_ROOTS, Catalog, load
+from generator.catalog.catalog import CONFIG_ROOTS, Catalog
+from generator.catalog.loading import load
 from generator.decision import State, rehearse, rendered
 from generator.errors import Fault, InvalidInput, StateRepoError, fault
 from generator.ledger import format as ledger_format

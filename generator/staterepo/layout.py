@@ -11,7 +11,9 @@ from pathlib import Path
 import pygit2
 
 from generator import yamlio
-from generator.catalog.catalog import CONFIG_ROOTS, ROOT_FILE, load
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.loading import load
+from generator.catalog.repository import ROOT_FILE
 from generator.decision import State, rendered
 from generator.errors import StateRepoError
 from generator.ledger.ledger import Ledger

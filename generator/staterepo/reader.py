@@ -17,6 +17,7 @@ from generator.settings import GENERATED_ROOTS, RENDER_VERSION
 from generator.staterepo import history, remote
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
+from generator.staterepo.address import is_url
 from generator.staterepo.history import LogEntry
 from generator.staterepo.outbox import Slot
 from generator.staterepo.snapshot import Progress, Snapshot
@@ -45,7 +46,7 @@ class Reader:
         """
         self._slot: Slot | None = None
         folder = Path()
-        if remote.is_url(address):
+        if is_url(address):
             self._slot = Slot(settings.data_home(address) / "reader")
             folder = self._slot.folder
         try:

@@ -15,8 +15,9 @@ from pygit2.enums import SortMode
 from rpds import HashTrieMap
 
 from generator import yamlio
-from generator.catalog.catalog import CONFIG_ROOTS, ROOT_FILE, Catalog
-from generator.catalog.catalog import load as load_catalog
+from generator.catalog.catalog import CONFIG_ROOTS, Catalog
+from generator.catalog.loading import load as load_catalog
+from generator.catalog.repository import ROOT_FILE
 from generator.decision import State, rehearse
 from generator.demand.claim import Claim, ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError

@@ -24,7 +24,7 @@ from generator.settings import GENERATED_ROOTS
 from generator.staterepo import history, message
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
-from generator.staterepo.remote import StateRepository
+from generator.staterepo.repository import StateRepository
 from generator.staterepo.snapshot import Advance, Progress, Snapshot
 
 _ATTEMPTS = 5

@@ -15,7 +15,8 @@ from typing import Any
 import pygit2
 
 from generator import yamlio
-from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.loading import load
 from generator.decision import State, admit, rendered
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger, apply

@@ -12,7 +12,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from generator import yamlio
-from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.loading import load
 from generator.decision import State, decide, rendered
 from generator.ledger.ledger import Ledger
 from generator.staterepo import layout

@@ -13,7 +13,8 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.loading import load
 from generator.cli.main import cli
 from generator.decision import State, decide, explain, rendered
 from generator.errors import Refused

@@ -16,7 +16,8 @@ from typing import Any, Literal
 import yaml
 from pydantic import Field, model_validator
 
-from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.loading import load
 from generator.catalog.model import Frozen, parse_file
 from generator.catalog.policy import seconds_of
 from generator.decision import Decision, State, decide, rendered

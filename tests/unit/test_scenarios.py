@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from generator.catalog.catalog import load
+from generator.catalog.loading import load
 from generator.errors import InvalidInput
 from tests.scenarios import running
 

@@ -15,7 +15,8 @@ from typing import Any
 
 import pytest
 
-from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.loading import load
 from generator.decision import State
 from generator.ledger.ledger import Ledger
 from generator.staterepo import layout

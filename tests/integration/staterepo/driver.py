@@ -20,8 +20,9 @@ from concurrent.futures import Future
 from typing import Any
 
 from generator.service import Generator, Receipt
+from generator.staterepo.cloned import ClonedRepository
+from generator.staterepo.embedded import EmbeddedRepository
 from generator.staterepo.outbox import Outbox
-from generator.staterepo.remote import ClonedRepository, EmbeddedRepository
 from generator.staterepo.writer import Line
 
 Demand = dict[str, Any]

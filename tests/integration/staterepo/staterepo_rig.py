@@ -22,7 +22,8 @@ from typing import Any
 
 import pygit2
 
-from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.loading import load
 from generator.decision import State, decide
 from generator.ledger.ledger import Ledger
 from generator.plan.bookkeeping import as_data, bookkeeping

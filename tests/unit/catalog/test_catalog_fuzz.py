@@ -10,7 +10,7 @@ import pytest
 import yaml
 from asking import FAST, configuration, skeleton
 
-from generator.catalog.catalog import load
+from generator.catalog.loading import load
 from generator.decision import State, rehearse
 from generator.errors import InvalidInput
 from generator.ledger.ledger import Ledger

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import pytest
 from asking import brokers, configuration, edited, skeleton
 
-from generator.catalog.catalog import load
+from generator.catalog.loading import load
 from generator.errors import InvalidInput
 from generator.staterepo import layout
 

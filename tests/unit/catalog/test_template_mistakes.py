@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from asking import Books, configuration, perception, skeleton
 
-from generator.catalog.catalog import load
+from generator.catalog.loading import load
 from generator.decision import State, rehearse
 from generator.errors import InvalidInput
 from generator.ledger.ledger import Ledger

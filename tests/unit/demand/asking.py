@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 import yaml
 
-from generator.catalog.catalog import CONFIG_ROOTS, Catalog, load
+from generator.catalog.catalog import CONFIG_ROOTS, Catalog
+from generator.catalog.loading import load
 from generator.decision import Decision, State, decide, rendered
 from generator.errors import Refused
 from generator.ledger.ledger import Ledger

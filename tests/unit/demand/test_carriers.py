@@ -9,7 +9,7 @@ import pytest
 import yaml
 from asking import NOW, Books, configuration, connection, goal, skeleton
 
-from generator.catalog.catalog import load
+from generator.catalog.loading import load
 from generator.decision import State
 from generator.demand.request import ConnectionType
 from generator.errors import Refused

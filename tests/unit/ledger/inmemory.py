@@ -9,7 +9,8 @@ from typing import Any
 
 from model.books import Goal, in_model_words, object_lists
 
-from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.loading import load
 from generator.decision import Decision, State, decide
 from generator.errors import Refused
 from generator.ledger.ledger import Ledger

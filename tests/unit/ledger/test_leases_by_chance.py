@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from model.leases import BY_MESSAGE, Goal, Promises, Subject
 from trying import chances, examples
 
-from generator.catalog.catalog import load
 from generator.catalog.identifiers import id_problem
+from generator.catalog.loading import load
 from generator.decision import Decision, State
 from generator.demand.claim import ApplicationClaim, Claim, ConnectionClaim
 from generator.demand.lease import LONGEST_S, Lease

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "demand"))
 from asking import NOW, skeleton
 from test_carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, state
 
-from generator.catalog.catalog import load
+from generator.catalog.loading import load
 from generator.decision import State, rendered
 from generator.demand.claim import Subject, SubjectKind
 from generator.demand.route import Route

@@ -13,7 +13,8 @@ from typing import Any
 import pygit2
 import pytest
 
-from generator.catalog.catalog import CONFIG_ROOTS, load
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.loading import load
 from generator.decision import Decision, State, decide
 from generator.ledger.ledger import Ledger
 from generator.staterepo import layout

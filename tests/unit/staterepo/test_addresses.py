@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from generator.errors import StateRepoError
-from generator.staterepo import remote
-from generator.staterepo.remote import connect, is_url, without_secrets
+from generator.staterepo.address import is_url, without_secrets
+from generator.staterepo.remote import connect
+from generator.staterepo.repository import RemoteAway
 
 URLS = [
     "https://example.org/state.git",
@@ -144,7 +145,7 @@ def test_secrets_are_taken_out_of_whatever_is_shown(text: str, wanted: str) -> N
 
 
 def test_neither_address_nor_error_shows_a_token(tmp_path: Path) -> None:
-    with pytest.raises(remote.RemoteAway) as error:
+    with pytest.raises(RemoteAway) as error:
         connect("http://token-s3cr3t@127.0.0.1:9/state.git", tmp_path / "data")
     assert "s3cr3t" not in str(error.value)
     assert str(error.value).startswith("http://127.0.0.1:9/state.git cannot be fetched: ")

@@ -1,0 +1,183 @@
+"""A state repo behind a URL: a bare clone, and git itself to fetch and push."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import git
+import pygit2
+from pygit2 import Oid, Repository
+
+from generator.errors import StateRepoError
+from generator.settings import MAIN_BRANCH
+from generator.staterepo.address import without_secrets
+from generator.staterepo.repository import (
+    ENVIRONMENT,
+    MAIN,
+    TIMEOUT_S,
+    PushDenied,
+    RemoteAway,
+    StateRepository,
+)
+
+_REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
+_BEHIND = re.compile(r"\[rejected\]")
+_REMOTE_SAYS = re.compile(r"remote: ?(.*)")
+_REFUSED = re.compile(r"\[remote rejected\] \((.*)\)")
+_PASSING = re.compile(r"lock|failed to update ref|incorrect old value")
+_NO_RIGHT = re.compile(r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE)
+
+Say = Callable[[str], None]
+
+log = logging.getLogger("demandops")
+
+
+class ClonedRepository(StateRepository):
+    """A bare clone of a remote; clone, fetch and push run git itself, with the user's set-up."""
+
+    def __init__(self, url: str, folder: Path, say: Say, patient: bool) -> None:
+        self.address = without_secrets(url)
+        self._url = url
+        self._folder = folder
+        self._given_up = False
+        self._talking: subprocess.Popen[bytes] | None = None
+        for lock in folder.rglob("*.lock"):  # the folder is ours alone: a killed process left it
+            lock.unlink(missing_ok=True)
+        if not self._is_sound():
+            self._clone(say)
+        self._git = git.Repo(folder)
+        self.objects = Repository(str(folder))
+        try:
+            self.refresh()
+        except RemoteAway as error:
+            if not patient:
+                raise
+            log.warning("%s; going on from what was fetched last", error)
+
+    def _is_sound(self) -> bool:
+        """Tell whether the clone of an earlier run can be used (a crash may have cut it off)."""
+        try:
+            repo = Repository(str(self._folder))
+            target = repo.references[_REMOTE_MAIN].target
+            return isinstance(repo[target], pygit2.Commit)
+        except (pygit2.GitError, KeyError):
+            return False
+
+    def _clone(self, say: Say) -> None:
+        say(f"cloning {self.address}")
+        if self._folder.exists():
+            shutil.rmtree(self._folder)
+        self._folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = self._folder.with_name(self._folder.name + ".partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        with git.Repo.init(partial, bare=True) as repo:
+            with repo.config_writer() as config:
+                config.set_value('remote "origin"', "url", self._url)
+            partial.joinpath("config").chmod(0o600)
+            self._fetch(repo)
+        partial.rename(self._folder)
+
+    def _fetch(self, repo: git.Repo) -> None:
+        try:
+            # told here, not configured: a push that outlives a killed generator moves nothing here
+            spec = f"+{MAIN}:{_REMOTE_MAIN}"
+            self._talk(repo, "fetch", "--no-tags", "--quiet", "origin", spec)
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+            if "couldn't find remote ref" in text:
+                raise StateRepoError(
+                    f"{self.address} has no branch '{MAIN_BRANCH}'; push one made by "
+                    "`demandops init DIR`"
+                ) from None
+            raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
+
+    def tip(self) -> Oid:
+        """Return the remote's commit as of the last fetch or push."""
+        target = self.objects.references[_REMOTE_MAIN].target
+        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
+        return target
+
+    def refresh(self) -> Oid:
+        """Fetch and return the remote's commit."""
+        self._fetch(self._git)
+        return self.tip()
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Push ``commit``; the remote takes it only on top of what it has."""
+        try:
+            lease = f"--force-with-lease={MAIN}:{expected}"  # forces nothing: commit is on top
+            spec = f"{commit}:{MAIN}"
+            self._talk(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
+        except git.GitCommandError as error:
+            text = without_secrets(f"{error.stdout}\n{error.stderr}")
+            tip = self.refresh()
+            if tip == commit or self.objects.descendant_of(tip, commit):
+                return True  # it was taken, and the answer got lost
+            if tip != expected or _BEHIND.search(text):
+                return False
+            raise self._why_not(text) from None
+        self.objects.references.create(_REMOTE_MAIN, commit, force=True)
+        return True
+
+    def _talk(self, repo: git.Repo, *command: str) -> None:
+        if self._given_up:
+            raise RemoteAway(f"{self.address} was given up")
+        with repo.git.custom_environment(**ENVIRONMENT):
+            guard = repo.git.execute(  # kept: it ends the process when it goes
+                [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
+                as_process=True,
+                start_new_session=True,
+            )
+        process = guard.proc
+        assert process is not None  # noqa: S101 - it was started just now
+        self._talking = process
+        if self._given_up:  # between the first look and now
+            self.give_up()
+        try:
+            out, err = process.communicate(timeout=TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            out, err = process.communicate()
+        finally:
+            self._talking = None
+        if process.returncode:
+            raise git.GitCommandError(list(command), process.returncode, err, out)
+
+    def give_up(self) -> None:
+        """End what git is waiting for, and start nothing more."""
+        self._given_up = True
+        process = self._talking
+        if process is not None:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGTERM)
+
+    def _why_not(self, text: str) -> StateRepoError:
+        """Tell a push that can be tried again from one that is denied."""
+        refused = _REFUSED.search(text)
+        if refused and not _PASSING.search(refused[1]):
+            said = " ".join(line.strip(" '") for line in _REMOTE_SAYS.findall(text)).strip()
+            reason = f"{refused[1]}: {said}" if said else refused[1]
+            return PushDenied(f"{self.address} takes no push: {reason}")
+        if _NO_RIGHT.search(text):
+            return PushDenied(f"{self.address} takes no push: {_last_line(text)}")
+        reason = refused[1] if refused else _last_line(text)
+        return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
+
+    @property
+    def always_current(self) -> bool:
+        """Say no: the remote may have moved since the last fetch."""
+        return False
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
+    fatal = [line for line in lines if line.startswith(("fatal:", "error:", "remote:", "!"))]
+    return (fatal or lines or ["git gave no reason"])[-1]

@@ -1,0 +1,95 @@
+"""A state repo as the writer sees it: objects to read and write, and a tip that moves forward only.
+
+There are two kinds, one on this disk and one behind a URL; :mod:`generator.staterepo.remote`
+chooses.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from contextlib import suppress
+
+import git
+import pygit2
+from pygit2 import Oid, Repository
+
+from generator.errors import StateRepoError
+from generator.settings import MAIN_BRANCH
+
+MAIN = f"refs/heads/{MAIN_BRANCH}"
+TIMEOUT_S = 120
+ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
+
+
+class RemoteAway(StateRepoError):
+    """The remote did not answer; what is kept in the outbox goes there when it is back."""
+
+
+class PushDenied(StateRepoError):
+    """The remote answers and takes no push (a hook, a protected branch, missing rights)."""
+
+
+class StateRepository(ABC):
+    """A state repo: objects to read and write, and a tip that moves forward only."""
+
+    objects: Repository
+    address: str
+
+    @abstractmethod
+    def tip(self) -> Oid:
+        """Return the newest published commit that is known here, without asking anybody."""
+
+    @abstractmethod
+    def refresh(self) -> Oid:
+        """Ask where the state repo is now and return its newest commit.
+
+        Raises:
+            RemoteAway: where it cannot be reached.
+        """
+
+    @abstractmethod
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Make ``commit`` the tip if the tip is ``expected``, durably; else return false.
+
+        Raises:
+            RemoteAway, PushDenied: where it could not be published for another reason.
+        """
+
+    def includes(self, commit: str, other: str) -> bool:
+        """Tell whether ``commit`` is ``other`` or comes after it; false for one not known here.
+
+        May be called from any thread: it opens the objects anew.
+        """
+        if commit == other:
+            return True
+        try:
+            return Repository(self.objects.path).descendant_of(commit, other)
+        except (pygit2.GitError, KeyError, ValueError):
+            return False
+
+    def give_up(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
+        """End what is under way with a remote; nothing where there is none."""
+
+    def tidy(self) -> None:
+        """Let git pack loose objects, if there are many; it does so in a process of its own."""
+        with suppress(git.GitCommandError), git.Repo(self.objects.path) as repo:
+            _git(repo, "gc", "--auto", "--quiet")
+
+    @property
+    @abstractmethod
+    def always_current(self) -> bool:
+        """Tell whether :meth:`tip` can never be behind (a repository on this disk)."""
+
+
+def _git(repo: git.Repo, *command: str) -> None:
+    """Run a git command that talks to the remote.
+
+    In a session of its own: Ctrl-C goes to every process of the terminal, and must not cut off a
+    push that the generator is waiting for.
+    """
+    with repo.git.custom_environment(**ENVIRONMENT):
+        repo.git.execute(
+            [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
+            kill_after_timeout=TIMEOUT_S,
+            start_new_session=True,
+        )
