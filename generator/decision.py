@@ -19,7 +19,9 @@ from generator.demand.claim import Subject
 from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from generator.errors import Fault, InvalidInput, Refused
 from generator.ledger import ledger as booking
+from generator.ledger import restore
 from generator.ledger.ledger import Changes, Ledger
+from generator.ledger.restore import Restoration
 from generator.plan import derived, quota
 from generator.plan.clients import is_bridged
 from generator.plan.planner import affected, all_keys
@@ -30,12 +32,13 @@ from generator.render.engine import Engine
 _SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
 Stage = Literal["admitted", "booked"]
-Outcome = Literal["booked", "released", "unchanged"]
+Outcome = Literal["booked", "released", "restored", "unchanged"]
 
 _OUTCOMES: dict[Operation, Outcome] = {
     Operation.SHUTDOWN: "released",
     Operation.RELEASE: "released",
     Operation.EXPIRE: "released",
+    Operation.ROLLBACK: "restored",
 }
 
 Throttle = Callable[[DemandRequest, Catalog], Iterable[Fault]]
@@ -100,6 +103,10 @@ def decide(
         InvalidInput: where the state repo's own files keep a valid demand from being rendered.
     """
     request = goal if isinstance(goal, DemandRequest) else admit(state, goal, throttle)
+    if isinstance(request, Restoration):
+        impossible = list(restore.faults(request, state.ledger, state.catalog))
+        if impossible:
+            raise Refused(impossible)
     on_stage("admitted")
     try:
         ledger, changes = booking.apply(state.ledger, request, now)

@@ -20,7 +20,7 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from generator.cli.output import errors, progress
+from generator.cli.output import errors, progress, signing_option
 from generator.cluster import access, wake
 from generator.cluster.status import Status
 from generator.service import Generator
@@ -70,8 +70,11 @@ class _ToRos(logging.Handler):
     help="How the clusters are reached, to wake them after a push and to hear what came of a "
     "demand; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
 )
+@signing_option
 @click.pass_context
-def serve(ctx: click.Context, state_repo: str | None, access_file: Path | None) -> None:
+def serve(
+    ctx: click.Context, state_repo: str | None, access_file: Path | None, signing_key: Path | None
+) -> None:
     """Run the ROS 2 node that takes demands over the actions DeploymentRequest and Demand.
 
     Everything after --ros-args goes to ROS. Parameters: action_name (of DeploymentRequest),
@@ -96,6 +99,7 @@ def serve(ctx: click.Context, state_repo: str | None, access_file: Path | None) 
                 progress=tell,
                 on_published=waker,
                 with_targets=bool(clusters),
+                signing_key=signing_key,
             )
         status = Status(clusters, generator.includes) if clusters else None
         _run(generator, settings, status)

@@ -13,7 +13,18 @@ from importlib.metadata import EntryPoint, entry_points
 import click
 
 from generator import __version__
-from generator.cli import repo, request, schema, status, views
+from generator.cli import (
+    diff,
+    log,
+    repo,
+    request,
+    rollback,
+    schema,
+    status,
+    verify,
+    views,
+    why,
+)
 from generator.cli.output import errors
 from generator.errors import DemandOpsError, InvalidInput
 
@@ -71,10 +82,12 @@ def cli(verbose: bool) -> None:
 cli.add_command(repo.init)
 cli.add_command(request.request)
 cli.add_command(views.bookkeeping)
-cli.add_command(views.log)
-cli.add_command(views.diff)
+cli.add_command(why.why)
+cli.add_command(log.log)
+cli.add_command(diff.diff)
+cli.add_command(rollback.rollback)
 cli.add_command(repo.check)
-cli.add_command(repo.verify)
+cli.add_command(verify.verify)
 cli.add_command(schema.schema)
 cli.add_command(status.status)
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 from rich.console import Console
 from rich.progress import Progress as Bar
+
+from generator.errors import Fault
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -26,6 +29,12 @@ def _console(stderr: bool) -> Console:
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _WIDE
     return Console(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
+
+
+SIGNS = {"start": "+", "change": "~", "stop": "-"}
+"""How a release that starts, changes or stops is marked."""
+
+REV_HELP = "A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h"
 
 
 class _Errors:
@@ -48,6 +57,12 @@ def console() -> Console:
     return _console(stderr=False)
 
 
+def warn_of(problems: Iterable[Fault]) -> None:
+    """Tell files that are not valid, for which their last valid version was taken."""
+    for found in problems:
+        errors.print(f"warning: {found} (its last valid version is taken)")
+
+
 def print_json(data: object) -> None:
     """Print ``data`` as JSON."""
     click.echo(json.dumps(data, indent=2, ensure_ascii=False))
@@ -61,6 +76,16 @@ state_repo_option = click.option(
     metavar="URL_OR_DIR",
     help="The state repo: a folder with a bare repository, or a URL that git clones "
     "[env: DEMANDOPS_STATE_REPO].",
+)
+
+signing_option = click.option(
+    "--signing-key",
+    "signing_key",
+    envvar="DEMANDOPS_SIGNING_KEY",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Sign the commits with this SSH key: a private key without a passphrase, or the public "
+    "one of a key that an agent holds; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
 )
 
 output_option = click.option(

@@ -1,4 +1,4 @@
-"""``demandops init``, ``check`` and ``verify``: the state repo itself."""
+"""``demandops init`` and ``check``: the state repo itself."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from generator.cli.output import (
     errors,
     output_option,
     print_json,
-    progress,
-    state_repo_option,
+    signing_option,
 )
-from generator.staterepo import checkout, layout, reader
+from generator.staterepo import checkout, layout
+from generator.staterepo.signing import Signer
 
 
 @click.command()
@@ -40,8 +40,11 @@ from generator.staterepo import checkout, layout, reader
     help="Where the clusters will fetch the state repo from (https or ssh); it stands in "
     "demandops.yaml and can be changed there.",
 )
+@signing_option
 @output_option
-def init(directory: Path, gitops: str, bare: bool, url: str, output: str) -> None:
+def init(
+    directory: Path, gitops: str, bare: bool, url: str, signing_key: Path | None, output: str
+) -> None:
     """Lay down a new state repo: the skeleton, the application definitions and a first commit.
 
     To make a cluster follow it, with Flux or Argo CD installed there (docs/flux.md,
@@ -49,7 +52,14 @@ def init(directory: Path, gitops: str, bare: bool, url: str, output: str) -> Non
 
         git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
     """
-    commit = layout.init(directory, datetime.now(timezone.utc), bare=bare, gitops=gitops, url=url)
+    commit = layout.init(
+        directory,
+        datetime.now(timezone.utc),
+        bare=bare,
+        gitops=gitops,
+        url=url,
+        signer=Signer(signing_key) if signing_key else None,
+    )
     if output == "json":
         print_json({"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare})
         return
@@ -107,49 +117,4 @@ def check(directory: Path, base: str | None, output: str) -> None:
             for path in found.outdated:
                 console().print(f"  {path}")
     if found.faults:
-        click.get_current_context().exit(1)
-
-
-@click.command()
-@click.argument("revisions", required=False, metavar="[REV|A..B]")
-@state_repo_option
-@output_option
-def verify(revisions: str | None, state_repo: str, output: str) -> None:
-    """Render the ledger of commits again and compare the bytes with what was committed."""
-    verdicts = []
-    with reader.opened(state_repo) as repo, progress("rendering again") as tell:
-        commits = repo.revisions(revisions)
-        for done, commit in enumerate(commits):
-            tell(done, len(commits))
-            verdicts.append(repo.verify(commit))
-    broken = [verdict for verdict in verdicts if not verdict.holds]
-    if output == "json":
-        print_json(
-            [
-                {
-                    "commit": verdict.commit,
-                    "summary": verdict.summary,
-                    "holds": verdict.holds,
-                    "skipped": verdict.skipped or None,
-                    "fault": verdict.fault or None,
-                    "differing": list(verdict.differing),
-                }
-                for verdict in verdicts
-            ]
-        )
-    else:
-        out = console()
-        for verdict in verdicts:
-            word = "skipped" if verdict.skipped else "holds" if verdict.holds else "DIFFERS"
-            note = f" ({verdict.skipped})" if verdict.skipped else ""
-            out.print(f"{verdict.commit[:10]} {word}{note}  {verdict.summary}")
-            if verdict.fault:
-                out.print(f"    its books cannot be rendered any more: {verdict.fault}")
-            for path in verdict.differing:
-                out.print(f"    {path}")
-        skipped = sum(bool(verdict.skipped) for verdict in verdicts)
-        hold = len(verdicts) - len(broken) - skipped
-        note = f", {skipped} skipped" if skipped else ""
-        out.print(f"{hold} of {len(verdicts)} commits hold{note}")
-    if broken:
         click.get_current_context().exit(1)

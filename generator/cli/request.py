@@ -13,19 +13,19 @@ import click
 
 from generator import yamlio
 from generator.cli.output import (
+    SIGNS,
     console,
     errors,
     output_option,
     print_json,
     progress,
+    signing_option,
     state_repo_option,
 )
 from generator.decision import Decision, admit, decide, form_faults
 from generator.errors import DemandOpsError, Fault, InvalidInput, fault
 from generator.service import Generator, Receipt
 from generator.staterepo import reader
-
-_SIGNS = {"start": "+", "change": "~", "stop": "-"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +44,16 @@ class _Document:
 @click.argument("files", nargs=-1, required=True, metavar="FILE…")
 @state_repo_option
 @click.option("--dry-run", is_flag=True, help="Show the consequence and book nothing.")
+@signing_option
 @output_option
 @click.pass_context
 def request(
-    ctx: click.Context, files: tuple[str, ...], state_repo: str, dry_run: bool, output: str
+    ctx: click.Context,
+    files: tuple[str, ...],
+    state_repo: str,
+    dry_run: bool,
+    signing_key: Path | None,
+    output: str,
 ) -> None:
     """Book demand requests from files.
 
@@ -65,7 +71,7 @@ def request(
     elif dry_run:
         rows = _rehearse(documents, state_repo, output)
     else:
-        rows = _book(documents, state_repo)
+        rows = _book(documents, state_repo, signing_key)
     if output == "json":
         print_json(rows)
     else:
@@ -133,9 +139,11 @@ def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str
     return _row(index, document.request_id, "refused", errors=_errors(faults))
 
 
-def _book(documents: list[_Document], state_repo: str) -> list[dict[str, Any]]:
+def _book(
+    documents: list[_Document], state_repo: str, signing_key: Path | None
+) -> list[dict[str, Any]]:
     with progress("reading the ledger") as tell:
-        generator = Generator(state_repo, patient=False, progress=tell)
+        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=tell)
     try:
         tickets = [generator.submit(document.goal) for document in documents]
         rows = []
@@ -196,7 +204,7 @@ def _show_consequence(index: int, decision: Decision) -> None:
     out = console()
     out.print(f"Request {index}: '{decision.request.id}' would be {decision.outcome}")
     for release in decision.releases:
-        out.print(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
+        out.print(f"  {SIGNS[release.change]} {release.name} ({release.what})")
         for detail in release.details:
             out.print(f"      {detail}")
     for path, text in sorted(decision.files.items()):

@@ -23,7 +23,8 @@ class Operation(Enum):
 
     The reference's goal joins and shuts down, adding to and taking from what its requesters hold.
     Our own names its demand and puts (replaces), releases or renews it; ``EXPIRE`` is the
-    generator's, for a demand whose lease ran out.
+    generator's, for a demand whose lease ran out, ``ROLLBACK`` a person's, to go back to the books
+    of an earlier commit.
     """
 
     JOIN = "join"
@@ -32,6 +33,7 @@ class Operation(Enum):
     RELEASE = "release"
     RENEW = "renew"
     EXPIRE = "expire"
+    ROLLBACK = "rollback"
 
     @property
     def asks(self) -> bool:

@@ -22,6 +22,7 @@ from generator.demand.claim import (
     Claim,
     ClaimKey,
     ConnectionClaim,
+    Subject,
     SubjectKind,
 )
 from generator.demand.lease import LONGEST_S, Lease
@@ -44,9 +45,13 @@ def segment(exact: str) -> str:
 
 def path_of(key: ClaimKey) -> str:
     """Return the path of a claim's file in the state repo."""
-    fan = hashlib.sha256(key.subject.id.encode()).hexdigest()[:2]
-    folder = f"{LEDGER_ROOT}/{key.subject.kind.value}/{fan}/{segment(key.subject.id)}"
-    return f"{folder}/{segment(key.demand)}.yaml"
+    return f"{folder_of(key.subject)}/{segment(key.demand)}.yaml"
+
+
+def folder_of(subject: Subject) -> str:
+    """Return the folder of all claims on an application or a connection."""
+    fan = hashlib.sha256(subject.id.encode()).hexdigest()[:2]
+    return f"{LEDGER_ROOT}/{subject.kind.value}/{fan}/{segment(subject.id)}"
 
 
 def _timestamp(text: str) -> str:

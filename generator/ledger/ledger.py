@@ -12,6 +12,7 @@ from generator.ledger import named
 from generator.ledger.books import Changes, ClaimChange, Ledger
 from generator.ledger.join import join
 from generator.ledger.release import release
+from generator.ledger.restore import restore
 
 __all__ = ["Changes", "ClaimChange", "Ledger", "apply"]
 
@@ -44,3 +45,5 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
             return named.renew(ledger, request, now)
         case Operation.EXPIRE:
             return named.expire(ledger, request, now)
+        case Operation.ROLLBACK:
+            return restore(ledger, request, now)

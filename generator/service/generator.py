@@ -16,6 +16,7 @@ from generator.service.ticket import Listener, Ticket, handed_in
 from generator.service.waiting import Waiting
 from generator.staterepo import remote, writer
 from generator.staterepo.outbox import Slot
+from generator.staterepo.signing import Signer
 from generator.staterepo.snapshot import Progress, Snapshot
 
 log = logging.getLogger("demandops")
@@ -26,7 +27,7 @@ _STOP_TIMEOUT_S = 20.0
 class Generator:
     """Takes demands from any thread and turns them into commits of one state repo."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - one for each thing that a caller may set
         self,
         state_repo: str,
         *,
@@ -34,6 +35,7 @@ class Generator:
         queue_limit: int = settings.QUEUE_LIMIT,
         patient: bool = True,
         with_targets: bool = False,
+        signing_key: Path | None = None,
         progress: Progress = lambda done, total: None,
         on_published: Callable[[Catalog], None] = lambda catalog: None,
     ) -> None:
@@ -45,16 +47,19 @@ class Generator:
             queue_limit: how many demands may wait.
             patient: whether to start while the remote is away, from what was fetched last.
             with_targets: whether receipts say which releases a demand needs.
+            signing_key: an SSH key that signs the commits (:mod:`generator.staterepo.signing`).
             progress: told (files read, files in all) while the ledger is loaded.
             on_published: called in the worker thread after every push, with the catalog in force;
                 must return at once.
 
         Raises:
-            StateRepoError, InvalidInput: where the state repo cannot be used.
+            StateRepoError, InvalidInput: where the state repo or the key cannot be used.
         """
+        signer = Signer(signing_key) if signing_key else None
         self._slot = Slot(data or settings.data_home(state_repo))
         try:
             repository = remote.connect(state_repo, self._slot.folder, log.info, patient=patient)
+            repository.signer = signer
             snapshot = writer.first_snapshot(repository, progress)
         except BaseException:
             self._slot.close()

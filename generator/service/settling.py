@@ -26,6 +26,7 @@ from generator.errors import (
     Withdrawn,
     fault,
 )
+from generator.service import rollback
 from generator.service.expiry import LeaseClock
 from generator.service.targets import of_decision as targets_of
 from generator.service.throttle import Throttle
@@ -34,6 +35,7 @@ from generator.service.waiting import TAKEN_BACK, Waiting
 from generator.staterepo import history, writer
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo.repository import PushDenied, RemoteAway, StateRepository
+from generator.staterepo.signing import SigningFailed
 from generator.staterepo.snapshot import Snapshot
 
 log = logging.getLogger("demandops")
@@ -217,9 +219,12 @@ class Settler:
         if ticket.operation in arrived:
             return _published_before(ticket, arrived[ticket.operation])
         try:
+            goal = ticket.goal
+            if rollback.is_rollback(goal):
+                goal = rollback.understood(goal, self._repository, line.start)
             decision = decide(
                 line.head.state,
-                ticket.goal,
+                goal,
                 ticket.received,
                 line.read,
                 lambda stage: ticket.tell(stage, stage),
@@ -234,6 +239,8 @@ class Settler:
             return replace(_commit(line, ticket, decision), targets=targets)
         except InvalidInput as error:
             line.note(ticket.operation, "Refused")
+            return error
+        except SigningFailed as error:
             return error
         except Exception as error:  # one demand that the program cannot handle stops no other
             log.exception("a fault of the generator, at demand %s", ticket.operation)
@@ -276,6 +283,8 @@ def _published_before(ticket: Ticket, arrival: history.Arrival) -> Receipt | Dem
     goal = ticket.goal if isinstance(ticket.goal, dict) else {}
     gives_up = goal.get("shutdown") or goal.get("operation") == Operation.RELEASE.value
     outcome: Outcome = "released" if gives_up else "booked"
+    if rollback.is_rollback(goal):
+        outcome = "restored"
     if arrival.outcome == "unchanged":
         outcome = "unchanged"
     name = goal.get("id") or goal.get("request") or goal.get("demand") or ""

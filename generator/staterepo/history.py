@@ -14,8 +14,9 @@ import pygit2
 from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
-from generator.errors import StateRepoError
 from generator.staterepo.snapshot import commit_of
+
+_WHY = "Why: "
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +28,7 @@ class LogEntry:
     author: str
     summary: str
     trailers: dict[str, list[str]]
+    why: str = ""
 
     def one(self, key: str) -> str:
         """Return the first value of a trailer, or nothing."""
@@ -60,7 +62,14 @@ def entry_of(commit: Commit) -> LogEntry:
         author=commit.author.name,
         summary=commit.message.split("\n", 1)[0],
         trailers=trailers_of(commit.message),
+        why=_why(commit.message),
     )
+
+
+def _why(message: str) -> str:
+    """Return the sentence in which a commit of the generator says why it was made."""
+    lines = (line for line in message.split("\n") if line.startswith(_WHY))
+    return next(lines, "").removeprefix(_WHY)
 
 
 def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> Iterator[LogEntry]:
@@ -115,17 +124,3 @@ def last_generated(repo: Repository, tip: Oid) -> Oid | None:
             return commit.id
         commit = commit.parents[0] if commit.parents else None
     return None
-
-
-def revisions(repo: Repository, tip: str | Oid, spec: str) -> list[str]:
-    """Return the commits that ``REV`` or ``A..B`` names, oldest first.
-
-    Raises:
-        StateRepoError: where a side is no commit.
-    """
-    first, dots, last = spec.partition("..")
-    if not dots:
-        return [str(commit_of(repo, first or tip).id)]
-    if not first:
-        raise StateRepoError(f"'{spec}' has no start; write A..B")
-    return [entry.commit for entry in walk(repo, last or tip, first)][::-1]

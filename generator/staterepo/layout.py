@@ -18,8 +18,9 @@ from generator.decision import State, rendered
 from generator.errors import StateRepoError
 from generator.ledger.ledger import Ledger
 from generator.settings import MAIN_BRANCH, RENDER_VERSION, data_folder
-from generator.staterepo import message
+from generator.staterepo import message, signing
 from generator.staterepo import tree as trees
+from generator.staterepo.signing import Signer
 
 
 def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
@@ -47,7 +48,15 @@ def _read(folder: Path, prefix: str) -> dict[str, str]:
     }
 
 
-def init(target: Path, now: datetime, *, bare: bool, gitops: str, url: str = "") -> str:
+def init(
+    target: Path,
+    now: datetime,
+    *,
+    bare: bool,
+    gitops: str,
+    url: str = "",
+    signer: Signer | None = None,
+) -> str:
     """Make a state repo and return its first commit.
 
     Args:
@@ -55,6 +64,7 @@ def init(target: Path, now: datetime, *, bare: bool, gitops: str, url: str = "")
         now: the time of the commit.
         bare: whether to make a bare repository, which the generator can use in place.
         gitops: which controller reads it.
+        signer: signs the commit, if given.
         url: where the clusters will find it; the skeleton's example where left out.
 
     Raises:
@@ -71,7 +81,7 @@ def init(target: Path, now: datetime, *, bare: bool, gitops: str, url: str = "")
         partial = target.with_name(f".{target.name}.partial")
         shutil.rmtree(partial, ignore_errors=True)
         try:
-            commit = _write(partial, content, now, bare)
+            commit = _write(partial, content, now, bare, signer)
             if target.exists():
                 target.rmdir()
             partial.rename(target)
@@ -83,7 +93,9 @@ def init(target: Path, now: datetime, *, bare: bool, gitops: str, url: str = "")
     return commit
 
 
-def _write(folder: Path, content: Mapping[str, str], now: datetime, bare: bool) -> str:
+def _write(
+    folder: Path, content: Mapping[str, str], now: datetime, bare: bool, signer: Signer | None
+) -> str:
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # what is pushed here is on the disk when told so
     tree = trees.write(repo, None, content)
@@ -94,7 +106,8 @@ def _write(folder: Path, content: Mapping[str, str], now: datetime, bare: bool) 
         f"Operation: init\nRender-Version: {RENDER_VERSION}\n"
     )
     signature = message.generator_signature(now)
-    commit = repo.create_commit(f"refs/heads/{MAIN_BRANCH}", signature, signature, text, tree, [])
+    commit = signing.create_commit(repo, signer, (signature, signature), text, tree, [])
+    repo.references.create(f"refs/heads/{MAIN_BRANCH}", commit)
     if not bare:
         repo.checkout_head(  # type: ignore[no-untyped-call]
             strategy=pygit2.enums.CheckoutStrategy.FORCE

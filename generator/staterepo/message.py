@@ -14,9 +14,10 @@ import pygit2
 
 from generator.decision import Decision
 from generator.demand.claim import SubjectKind
-from generator.demand.request import Operation
+from generator.demand.request import DemandRequest, Operation
 from generator.errors import Fault
 from generator.ledger import format as ledger_format
+from generator.ledger.restore import Restoration
 from generator.render.changeset import ReleaseChange
 from generator.settings import RENDER_VERSION
 
@@ -40,14 +41,25 @@ def generator_signature(moment: datetime) -> pygit2.Signature:
 
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
-    """Return the requesters as the author, at the time when the demand was received."""
+    """Return the requesters as the author, at the time when the demand was received.
+
+    Of a rollback it is the person who asked for it.
+    """
+    request = decision.request
+    if isinstance(request, Restoration):
+        email = re.sub(r"[<>\s]", "", request.email) or GENERATOR_EMAIL
+        return pygit2.Signature(_name(request.by), email, int(received.timestamp()), 0)
     names = ", ".join(_requesters(decision))
-    # git takes no angle brackets in a name and strips these characters from its ends
-    name = _clipped(names.replace("<", "(").replace(">", ")"), _MAX_AUTHOR).strip(" .,:;\"'\\")
     demand = decision.changes.claims[0].key.demand
     local = demand if _LOCAL_PART.fullmatch(demand) else ledger_format.segment(demand)
     email = f"{local}@demandops.invalid"
-    return pygit2.Signature(name or "unnamed", email, int(received.timestamp()), 0)
+    return pygit2.Signature(_name(names), email, int(received.timestamp()), 0)
+
+
+def _name(names: str) -> str:
+    """Return a name as git takes it: without angle brackets, or these characters at its ends."""
+    plain = _clipped(names.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
+    return plain.strip(" .,:;\"'\\") or "unnamed"
 
 
 def of_decision(
@@ -67,6 +79,7 @@ def of_decision(
         ("Operation", request.operation.value),
         ("Operation-Id", operation),
         *settled,
+        *_of_rollback(request),
         *(("Demand-Id", demand) for demand in dict.fromkeys(c.key.demand for c in claims)),
         *(("Requester", requester) for requester in _requesters(decision)),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
@@ -98,6 +111,8 @@ def _title(decision: Decision) -> str:
     operation = decision.request.operation
     if operation is Operation.EXPIRE:
         return f"Expire {subjects}"
+    if isinstance(decision.request, Restoration):
+        return f"Roll back to {decision.request.to[:12]}"
     renewed = operation.asks and _only_leases(decision)
     return f"{_VERBS[Operation.RENEW if renewed else operation][0]} {subjects}"
 
@@ -107,6 +122,11 @@ def _why(decision: Decision, received: datetime) -> str:
     moment = received.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
     who = ", ".join(_requesters(decision))
     what = _counted(decision)
+    if isinstance(request, Restoration):
+        return (
+            f"Why: {request.by} rolled the books back to commit {request.to[:12]}, which changes "
+            f"{what}: {request.reason}"
+        )
     if request.operation is Operation.EXPIRE:
         ends = [c.before.lease.ends for c in decision.changes.claims if c.before and c.before.lease]
         last = max(ends).astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
@@ -122,6 +142,13 @@ def _why(decision: Decision, received: datetime) -> str:
         f"Why: request '{request.id}'{named}, received {moment}, {verb} {what} in the name of "
         f"{who}."
     )
+
+
+def _of_rollback(request: DemandRequest) -> list[tuple[str, str]]:
+    """Return the trailers that only a rollback has: where it went back to, and why."""
+    if not isinstance(request, Restoration):
+        return []
+    return [("Restores", request.to), ("Reason", request.reason)]
 
 
 def _only_leases(decision: Decision) -> bool:

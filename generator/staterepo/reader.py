@@ -2,37 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from itertools import islice
 from pathlib import Path
 
-from pygit2 import Commit
-
 from generator import settings
-from generator.decision import rendered
-from generator.errors import InvalidInput
+from generator.errors import StateRepoError
+from generator.ledger.restore import Restoration
 from generator.render.changeset import Read
-from generator.settings import GENERATED_ROOTS, RENDER_VERSION
-from generator.staterepo import history, remote
+from generator.staterepo import (
+    history,
+    moments,
+    paths,
+    remote,
+    restoring,
+    signatures,
+    verification,
+)
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.address import is_url
 from generator.staterepo.history import LogEntry
 from generator.staterepo.outbox import Slot
+from generator.staterepo.paths import PathHistory
 from generator.staterepo.snapshot import Progress, Snapshot
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Whether the rendered files of one commit are those that its books and settings give."""
-
-    commit: str
-    summary: str
-    holds: bool
-    skipped: str = ""
-    fault: str = ""
-    differing: tuple[str, ...] = ()
+from generator.staterepo.verification import Verdict
 
 
 class Reader:
@@ -62,8 +58,15 @@ class Reader:
             self._slot.close()
 
     def commit(self, revision: str | None = None) -> str:
-        """Return the id of a commit; the newest where no revision is given."""
-        return str(snapshots.commit_of(self._repository.objects, revision or self._tip).id)
+        """Return the id of a commit, by a revision or a time; the newest where none is given.
+
+        Raises:
+            StateRepoError: where it is neither, or a time before the first commit.
+        """
+        if not revision:
+            return str(self._tip)
+        now = datetime.now(timezone.utc)
+        return str(moments.resolve(self._repository.objects, self._tip, revision, now).id)
 
     def includes(self, commit: str, other: str) -> bool:
         """Tell whether ``commit`` is ``other`` or comes after it."""
@@ -79,6 +82,14 @@ class Reader:
         """
         return snapshots.load(self._repository.objects, self.commit(revision), progress)
 
+    def last_valid(self, revision: str, progress: Progress = lambda done, total: None) -> Snapshot:
+        """Load a commit; of what is not valid there, the last version that was (and its problems).
+
+        Raises:
+            InvalidInput, StateRepoError: where there never was a valid configuration.
+        """
+        return snapshots.load_last_valid(self._repository.objects, revision, progress)
+
     def file_reader(self, revision: str | None = None) -> Read:
         """Return a function that gives the text of a file at a commit."""
         tree = snapshots.commit_of(self._repository.objects, self.commit(revision)).tree
@@ -86,61 +97,99 @@ class Reader:
 
     def log(self, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
-        first, dots, last = (spec or "").partition("..")
-        if dots:
-            yield from history.walk(self._repository.objects, last or self._tip, first)
-        else:
-            yield from history.walk(self._repository.objects, first or self._tip)
+        since, until = self._sides(spec or "")
+        yield from history.walk(self._repository.objects, until, since)
+
+    def touching(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
+        """Yield those commits that changed a file or folder."""
+        since, until = self._sides(spec or "")
+        objects = self._repository.objects
+        known = {one.commit for one in history.walk(objects, until, since)} if since else None
+        for touch in paths.touching(objects, until, path):
+            if known is None or touch.entry.commit in known:
+                yield touch.entry
 
     def revisions(self, spec: str | None) -> list[str]:
-        """Return the commits that ``REV`` or ``A..B`` names, oldest first."""
-        return history.revisions(self._repository.objects, self._tip, spec or str(self._tip))
+        """Return the commits that ``REV`` or ``A..B`` names, oldest first.
 
-    def verify(self, revision: str) -> Verdict:
-        """Render the books of a commit again and compare the bytes."""
-        commit = snapshots.commit_of(self._repository.objects, revision)
-        entry = history.entry_of(commit)
-        if not entry.by_generator:
-            return Verdict(entry.commit, entry.summary, True, "made by a person")
-        version = entry.one("Render-Version")
-        if version != str(RENDER_VERSION):
-            return Verdict(
-                entry.commit,
-                entry.summary,
-                True,
-                f"rendered by version {version}, this is version {RENDER_VERSION}",
-            )
-        try:
-            snapshot = self._in_force_at(commit, entry.one("In-Force"))
-        except InvalidInput as error:
-            why = f"a person's file was not valid then: {error.faults[0]}"
-            return Verdict(entry.commit, entry.summary, True, why)
-        try:
-            wanted = rendered(snapshot.state)
-        except InvalidInput as error:  # the generator did render it then, so it must now
-            return Verdict(entry.commit, entry.summary, False, fault=str(error.faults[0]))
-        differing = _differing(wanted, commit)
-        return Verdict(entry.commit, entry.summary, not differing, differing=differing)
-
-    def _in_force_at(self, commit: Commit, sound: str) -> Snapshot:
-        """Return what the generator went by at one of its commits.
-
-        ``sound`` is the commit whose configuration was in force, where people had broken theirs.
+        Raises:
+            StateRepoError: where a side is neither revision nor time.
         """
-        if not sound:
-            return snapshots.load(self._repository.objects, commit.id)
-        snapshot = snapshots.load(self._repository.objects, sound)
-        later = snapshots.advance(self._repository.objects, snapshot, commit.id).snapshot
-        return replace(later, state=replace(snapshot.state, ledger=later.state.ledger))
+        since, until = self._sides(spec or "")
+        if since is None:
+            return [until]
+        walked = history.walk(self._repository.objects, until, since)
+        return [entry.commit for entry in walked][::-1]
 
+    def _sides(self, spec: str) -> tuple[str | None, str]:
+        """Return the commits that ``A..B`` names; of ``REV`` the second alone."""
+        first, dots, last = spec.partition("..")
+        if not dots:
+            return None, self.commit(first)
+        if not first:
+            raise StateRepoError(f"'{spec}' has no start; write A..B")
+        return self.commit(first), self.commit(last)
 
-def _differing(wanted: dict[str, str], commit: Commit) -> tuple[str, ...]:
-    standing = trees.texts(commit.tree, GENERATED_ROOTS)
-    return tuple(
-        path
-        for path in sorted({*wanted, *standing})
-        if wanted.get(path) != standing.get(path) and not trees.is_note(path)
-    )
+    def verify(
+        self,
+        commits: Sequence[str],
+        *,
+        whole: bool = False,
+        progress: Progress = lambda done, total: None,
+    ) -> list[Verdict]:
+        """Return a verdict on each commit: rendered again and compared byte by byte, and signed?
+
+        Args:
+            commits: oldest first.
+            whole: whether to load every commit from nothing, rather than by what differs.
+            progress: told (commits done, commits in all).
+        """
+        objects, verdicts = self._repository.objects, list[Verdict]()
+        for verdict in verification.verify(objects, commits, whole=whole):
+            verdicts.append(verdict)
+            progress(len(verdicts), len(commits))
+        return signatures.checked(objects, verdicts)
+
+    def history(self, path: str, revision: str, most: int) -> PathHistory:
+        """Return how a file or folder came to what it is at a commit."""
+        return paths.of_path(self._repository.objects, revision, path, most)
+
+    def path_called(self, name: str, revision: str) -> str | None:
+        """Return the path of a release, or of the last one of that name, which was stopped."""
+        objects = self._repository.objects
+        standing = paths.called(objects, revision, name)
+        return standing or paths.once_called(objects, revision, name)
+
+    def differing(self, before: str, after: str, root: str) -> dict[str, bool]:
+        """Return the files below a folder that differ between two commits, and which are left."""
+        objects = self._repository.objects
+        sides = [snapshots.commit_of(objects, revision).tree for revision in (before, after)]
+        found = trees.below_root(objects, sides[0], sides[1], root)
+        return {path: blob is not None for path, blob in found}
+
+    def concerns(self, commit: str, node: str) -> bool:
+        """Tell whether a commit changed what runs on a node, or a claim that names it."""
+        return paths.concerns(self._repository.objects, commit, node)
+
+    def behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
+        """Return the commits of people that a commit carries out, newest first."""
+        since, follows = entry.one("Since"), entry.one("Follows")
+        if not (since and follows):
+            return []
+        walked = history.walk(self._repository.objects, follows, since)
+        return list(islice((one for one in walked if not one.by_generator), most))
+
+    def restoration(self, to: str, **more: object) -> Restoration:
+        """Return the request to go back to a commit."""
+        return restoring.restoration(self._repository.objects, to, **more)
+
+    def configured_since(self, commit: str) -> list[str]:
+        """Return the files of people that are not what they were at a commit."""
+        return restoring.configured_since(self._repository.objects, commit, self._tip)
+
+    def person(self) -> tuple[str, str]:
+        """Return name and e-mail address of who runs this."""
+        return restoring.person(self._repository.objects)
 
 
 @contextmanager

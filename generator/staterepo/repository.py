@@ -15,6 +15,7 @@ from pygit2 import Oid, Repository
 
 from generator.errors import StateRepoError
 from generator.settings import MAIN_BRANCH
+from generator.staterepo.signing import Signer
 
 MAIN = f"refs/heads/{MAIN_BRANCH}"
 TIMEOUT_S = 120
@@ -34,6 +35,8 @@ class StateRepository(ABC):
 
     objects: Repository
     address: str
+    signer: Signer | None = None
+    """Signs what is committed here; nothing: commits are not signed."""
 
     @abstractmethod
     def tip(self) -> Oid:

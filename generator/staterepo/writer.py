@@ -21,7 +21,7 @@ from generator.demand.claim import Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
-from generator.staterepo import history, message
+from generator.staterepo import history, message, signing
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
@@ -135,11 +135,18 @@ class Line:
         for attempt in range(1, _ATTEMPTS + 1):
             try:
                 tree = trees.write(self._objects, self._tree, files)
-                made = self._objects.create_commit(
-                    None, author, committer, text, tree, [self.head.commit]
+                made = signing.create_commit(
+                    self._objects,
+                    self._repository.signer,
+                    (author, committer),
+                    text,
+                    tree,
+                    [self.head.commit],
                 )
                 self._tree = snapshots.commit_of(self._objects, made).tree
                 break
+            except signing.SigningFailed:
+                raise
             except (OSError, pygit2.GitError, KeyError, StateRepoError):
                 # git's housekeeping removes a folder of loose objects just as one is put there,
                 # or moves one into a pack just as it is looked for

@@ -1,0 +1,176 @@
+"""The answers of ``demandops why``, as plain data and as lines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from generator.demand.claim import Claim, Subject
+from generator.ledger import format as ledger_format
+from generator.plan import explanation
+from generator.plan.release import Release
+from generator.render.changeset import described
+from generator.render.paths import path_of
+from generator.staterepo.history import LogEntry
+from generator.staterepo.reader import Reader
+from generator.staterepo.snapshot import Snapshot
+
+_PEOPLES_COMMITS = 5
+
+
+def release(snapshot: Snapshot, found: Release) -> dict[str, Any]:
+    """Return why a release runs."""
+    ledger, catalog = snapshot.state.ledger, snapshot.state.catalog
+    claims = explanation.claims_behind(ledger, found)
+    return {
+        "runs": True,
+        "what": described(None, found, stood=False).what,
+        **_where(found),
+        "requesters": sorted({who for claim in claims for who in claim.requesters}),
+        "claims": [_claim(claim) for claim in claims],
+        "shaped_by": [
+            {"file": one.file, "entry": one.entry or None, "what": one.what}
+            for one in explanation.shaped_by(found, catalog)
+        ],
+        "overrides": explanation.overrides_of(found, catalog),
+    }
+
+
+def subject(snapshot: Snapshot, found: Subject) -> dict[str, Any]:
+    """Return who holds an application or a connection, and what runs because of that."""
+    ledger, catalog = snapshot.state.ledger, snapshot.state.catalog
+    claims = sorted(ledger.of(found), key=lambda claim: claim.booked)
+    releases = explanation.releases_of(ledger, catalog, found)
+    return {
+        "runs": bool(claims),
+        "what": str(found),
+        "requesters": sorted({who for claim in claims for who in claim.requesters}),
+        "claims": [_claim(claim) for claim in claims],
+        "releases": [{"name": one.name, **_where(one), "file": path_of(one)} for one in releases],
+    }
+
+
+def commits(repo: Reader, path: str, commit: str, most: int) -> dict[str, Any]:
+    """Return which commits made a path what it is."""
+    history = repo.history(path, commit, most)
+    return {
+        "started": _commit(repo, history.started),
+        "changes": [_commit(repo, entry) for entry in history.newest],
+        "more_changes": history.more,
+        "stopped": _commit(repo, history.stopped),
+    }
+
+
+def _where(found: Release) -> dict[str, Any]:
+    return {
+        "cluster": found.node.cluster,
+        "domain": found.domain.name,
+        "namespace": found.domain.namespace,
+        "node": found.node.id,
+    }
+
+
+def _claim(claim: Claim) -> dict[str, Any]:
+    lease = claim.lease
+    return {
+        "subject": str(claim.subject),
+        "demand": claim.demand,
+        "request": claim.request,
+        "requesters": list(claim.requesters),
+        "since": claim.booked.isoformat(),
+        "lease": {"seconds": lease.seconds, "until": lease.until.isoformat()} if lease else None,
+        "file": ledger_format.path_of(claim.key),
+        "release_by": explanation.how_to_release(claim),
+    }
+
+
+def _commit(repo: Reader, entry: LogEntry | None) -> dict[str, Any] | None:
+    if entry is None:
+        return None
+    return {
+        "commit": entry.commit,
+        "time": entry.time.isoformat(),
+        "author": entry.author,
+        "operation": entry.one("Operation") or None,
+        "requesters": entry.trailers.get("Requester", []),
+        "summary": entry.summary,
+        "why": entry.why or None,
+        "carries_out": [
+            {"commit": one.commit, "author": one.author, "summary": one.summary}
+            for one in repo.behind(entry, _PEOPLES_COMMITS)
+        ],
+    }
+
+
+def lines(found: dict[str, Any]) -> Iterator[str]:
+    """Yield an answer as people read it."""
+    at = found["commit"][:10]
+    told = f"{found['kind']} {found['name']}"
+    if not found["runs"]:
+        word = "stands" if found["kind"] == "file" else "does not run"
+        yield f"{told} {word} at {at}"
+        yield f"  file        {found['file']}"
+        yield from _history(found)
+        return
+    yield f"{told} runs at {at}"
+    yield f"  what        {found['what']}"
+    if "node" in found:
+        yield (
+            f"  where       node {found['node']}, cluster {found['cluster']}, namespace "
+            f"{found['namespace']}, access domain {found['domain']}"
+        )
+    yield f"  file        {found['file']}"
+    for one in found.get("releases", ()):
+        yield f"  needs       {one['name']} on {one['node']} ({one['file']})"
+    yield from _claims(found)
+    if found.get("shaped_by"):
+        yield "shaped by"
+        for one in found["shaped_by"]:
+            entry = f" {one['entry']}" if one["entry"] else ""
+            yield f"  {one['file']}{entry}: {one['what']}"
+    for one in found.get("overrides", ()):
+        yield f"overridden by {one}"
+    yield from _history(found)
+
+
+def _claims(found: dict[str, Any]) -> Iterator[str]:
+    yield "asked for by"
+    for claim in found["claims"]:
+        since = claim["since"][:19].replace("T", " ")
+        yield f"  {', '.join(claim['requesters'])} since {since} UTC, for {claim['subject']}"
+        yield f"    demand {claim['demand']}, request '{claim['request']}'{_lease(claim)}"
+        yield f"    {claim['file']}"
+        yield f"    to release it: {claim['release_by']}, or delete that file by pull request"
+
+
+def _lease(claim: dict[str, Any]) -> str:
+    if claim["lease"] is None:
+        return ""
+    until = claim["lease"]["until"][:19].replace("T", " ")
+    return f", lease of {claim['lease']['seconds']} s until {until} UTC"
+
+
+def _history(found: dict[str, Any]) -> Iterator[str]:
+    if found["stopped"]:
+        yield "stopped by"
+        yield from _told(found["stopped"], why=True)
+    if found["changes"]:
+        yield "changed by"
+        for entry in found["changes"]:
+            yield from _told(entry, why=False)
+    if found["more_changes"]:
+        yield f"  and {found['more_changes']} more before (-n); git log -- {found['file']}"
+    if found["started"]:
+        yield "started by"
+        yield from _told(found["started"], why=True)
+
+
+def _told(entry: dict[str, Any], *, why: bool) -> Iterator[str]:
+    when = entry["time"][:19].replace("T", " ")
+    who = ", ".join(entry["requesters"]) or entry["author"]
+    word = entry["operation"] or "by hand"
+    yield f"  {entry['commit'][:10]} {when} UTC  {word} by {who}: {entry['summary']}"
+    if why and entry["why"]:
+        yield f"    {entry['why']}"
+    for one in entry["carries_out"]:
+        yield f"    carries out {one['commit'][:10]} by {one['author']}: {one['summary']}"

@@ -1,0 +1,155 @@
+"""``demandops why``: what runs, who asked for it, what shaped it, and by which commits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import click
+
+from generator.cli import explained
+from generator.cli.output import (
+    REV_HELP,
+    console,
+    output_option,
+    print_json,
+    progress,
+    state_repo_option,
+    warn_of,
+)
+from generator.demand.claim import Subject, SubjectKind
+from generator.errors import StateRepoError, near, shown
+from generator.ledger import format as ledger_format
+from generator.plan import explanation
+from generator.plan.release import Release
+from generator.render.paths import path_of
+from generator.staterepo import reader
+from generator.staterepo.reader import Reader
+from generator.staterepo.snapshot import Snapshot
+
+_KINDS = ("release", "application", "connection")
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What the question is about: a release, a subject, or a file that is neither (any more)."""
+
+    kind: str
+    name: str
+    path: str
+    release: Release | None = None
+    subject: Subject | None = None
+
+
+@click.command()
+@click.argument("name", metavar="RELEASE|CONNECTION|APPLICATION|PATH")
+@state_repo_option
+@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; the newest by default.")
+@click.option(
+    "--kind",
+    type=click.Choice(_KINDS),
+    help="What the name is of, where it could be several things.",
+)
+@click.option(
+    "-n",
+    "--max-count",
+    "most",
+    type=click.IntRange(0),
+    default=10,
+    show_default=True,
+    help="List at most so many of the commits that changed it.",
+)
+@output_option
+def why(
+    name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
+) -> None:
+    """Tell why something runs, or ran: who asks for it, what shaped it, and which commits did.
+
+    It takes the name of a release, the id of an application or a connection, or a path below
+    clusters/ or ledger/. Of what runs no more it tells when it was stopped, by whom and why.
+    """
+    with reader.opened(state_repo) as repo:
+        with progress("reading the ledger") as tell:
+            snapshot = repo.last_valid(repo.commit(at), tell)
+        warn_of(snapshot.problems)
+        asked = _understood(repo, snapshot, name, kind)
+        commit = str(snapshot.commit)
+        found: dict[str, Any] = {"commit": commit, "kind": asked.kind, "name": asked.name}
+        if asked.release is not None:
+            found |= explained.release(snapshot, asked.release)
+        elif asked.subject is not None:
+            found |= explained.subject(snapshot, asked.subject)
+        else:
+            found |= {"runs": False}
+        found["file"] = asked.path
+        found |= explained.commits(repo, asked.path, commit, most)
+    if output == "json":
+        print_json(found)
+        return
+    out = console()
+    for line in explained.lines(found):
+        out.print(line, soft_wrap=True)
+
+
+def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Asked:
+    """Find what a name means.
+
+    Raises:
+        StateRepoError: where it means nothing, or several things.
+    """
+    if name.startswith(("clusters/", "bootstrap/", f"{ledger_format.LEDGER_ROOT}/")):
+        return _by_path(repo, snapshot, name)
+    found = [one for one in _by_name(repo, snapshot, name) if kind in (None, one.kind)]
+    running = [one for one in found if one.release or _is_held(snapshot, one)]
+    if len(running or found) == 1:
+        return (running or found)[0]
+    if found:
+        kinds = " and ".join(dict.fromkeys(one.kind for one in found))
+        raise StateRepoError(f"{shown(name)} is the name of a {kinds}; say which by --kind")
+    ledger, catalog = snapshot.state.ledger, snapshot.state.catalog
+    known = [*explanation.names(ledger, catalog)]
+    known += [id for one in SubjectKind for id in ledger.subjects(one)]
+    raise StateRepoError(
+        f"nothing called {shown(name)} runs, or ever did{near(name, known)}"
+        + ("" if known else "; nothing runs at all")
+    )
+
+
+def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
+    ledger, catalog = snapshot.state.ledger, snapshot.state.catalog
+    found = []
+    release = explanation.find(ledger, catalog, name)
+    path = path_of(release) if release else repo.path_called(name, str(snapshot.commit))
+    if path is not None:
+        found.append(_Asked("release", name, path, release))
+    for kind in SubjectKind:
+        subject = Subject(kind, name)
+        folder = ledger_format.folder_of(subject)
+        if ledger.of(subject) or _has_history(repo, snapshot, folder):
+            found.append(_Asked(kind.value[:-1], name, folder, subject=subject))
+    return found
+
+
+def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Asked:
+    path = path.rstrip("/")
+    text = repo.file_reader(str(snapshot.commit))(path)
+    key = snapshot.keys.get(path)
+    if key is not None:
+        return _Asked("claim", key.demand, path, subject=key.subject)
+    name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
+    release = explanation.find(snapshot.state.ledger, snapshot.state.catalog, name)
+    if release is not None and path_of(release) == path:
+        return _Asked("release", name, path, release)
+    if text is None and not _has_history(repo, snapshot, path):
+        raise StateRepoError(f"{shown(path)} is no file of the state repo, and never was")
+    kind = "claim" if ledger_format.kind_of(path) else "release"
+    return _Asked(kind if text is None else "file", name, path)
+
+
+def _is_held(snapshot: Snapshot, asked: _Asked) -> bool:
+    return asked.subject is not None and bool(snapshot.state.ledger.of(asked.subject))
+
+
+def _has_history(repo: Reader, snapshot: Snapshot, path: str) -> bool:
+    history = repo.history(path, str(snapshot.commit), 0)
+    return bool(history.started or history.stopped)

@@ -1,0 +1,73 @@
+"""What a rollback needs of history: a commit's claims, what people changed since, and who asks."""
+
+from __future__ import annotations
+
+import getpass
+from datetime import datetime, timezone
+
+import pygit2
+from pygit2 import Oid, Repository
+
+from generator.catalog.catalog import CONFIG_ROOTS
+from generator.demand.claim import Claim
+from generator.demand.request import Operation
+from generator.errors import Fault, InvalidInput
+from generator.ledger import format as ledger_format
+from generator.ledger.restore import Restoration
+from generator.staterepo import tree as trees
+from generator.staterepo.snapshot import commit_of
+
+_PEOPLES = (*CONFIG_ROOTS, "overrides")
+
+
+def restoration(repo: Repository, to: str, **more: object) -> Restoration:
+    """Return the request to go back to a commit.
+
+    Args:
+        to: the commit.
+        more: the other fields of :class:`Restoration`.
+
+    Raises:
+        InvalidInput: with every claim file of that commit that is not valid.
+        StateRepoError: where there is no such commit.
+    """
+    commit = commit_of(repo, to)
+    claims: list[Claim] = []
+    faults: list[Fault] = []
+    for path, text in trees.texts(commit.tree, (ledger_format.LEDGER_ROOT,)).items():
+        if ledger_format.kind_of(path) is None:
+            continue
+        try:
+            claims.append(ledger_format.read(text, path))
+        except InvalidInput as error:
+            faults += error.faults
+    if faults:
+        raise InvalidInput(faults)
+    return Restoration(
+        id="",
+        operation=Operation.ROLLBACK,
+        to=str(commit.id),
+        made=datetime.fromtimestamp(commit.commit_time, tz=timezone.utc),
+        claims=tuple(claims),
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def configured_since(repo: Repository, commit: str | Oid, tip: str | Oid) -> list[str]:
+    """Return the files of people that are not what they were at ``commit``."""
+    before, after = commit_of(repo, commit).tree, commit_of(repo, tip).tree
+    changed = trees.differences(repo, before, after, "")
+    return sorted(path for path, _ in changed if path.split("/")[0] in _PEOPLES)
+
+
+def person(repo: Repository) -> tuple[str, str]:
+    """Return name and e-mail address of who runs this, as git has them, else of the login."""
+    try:
+        who = repo.default_signature
+        return who.name, who.email
+    except (KeyError, pygit2.GitError):
+        try:
+            name = getpass.getuser()
+        except (KeyError, OSError):
+            name = "unknown"
+        return name, f"{name}@demandops.invalid"

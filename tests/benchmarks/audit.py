@@ -1,0 +1,97 @@
+"""What the auditor's questions cost: a fleet's state repo with thousands of commits, and the views.
+
+Vehicles join and leave at all edges in turn, each a commit by the generator itself. Prints seconds
+for each question; ``--keep FOLDER`` leaves the state repo there (and takes it up again).
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pygit2
+
+from generator.service import Generator
+from generator.staterepo import reader
+from tests.benchmarks import fleet
+
+RELEASES = 1_000
+COMMITS = 10_000
+VERIFIED = 300
+BATCH = 500
+
+
+def lay_down(folder: Path, releases: int, commits: int) -> Path:
+    """Make a state repo with ``commits`` demands behind it."""
+    laid = fleet.lay_down(folder / "state-repo.git", releases)
+    generator = Generator(str(laid.path), data=folder / "data")
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast
+    try:
+        for first in range(0, commits, BATCH):
+            tickets = []
+            for number in range(first, min(first + BATCH, commits)):
+                edge = (number // 2) % laid.edges
+                vehicle = f"{fleet.SPARE}{edge:05d}"
+                goal = fleet.goal(fleet.edge_id(edge), vehicle, shutdown=number % 2 == 1)
+                tickets.append(generator.submit(goal))
+            for ticket in tickets:
+                ticket.future.result()
+    finally:
+        generator.close()
+        pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
+    return laid.path
+
+
+def timed(what: str, call: Callable[[], object]) -> None:
+    """Print how long a question takes."""
+    start = time.perf_counter()
+    found = call()
+    print(f"{what:<60} {time.perf_counter() - start:8.2f} s  {found}")
+
+
+def measure(repo: Path) -> None:
+    """Ask everything once."""
+    with reader.opened(str(repo)) as opened:
+        timed("loading the newest commit", lambda: len(opened.snapshot().state.ledger))
+        files = opened.generated(opened.commit())
+        never, often = (
+            next(p for p in files if w in p) for w in ("od-edge00001-v", "of-edge00000")
+        )
+        timed("history of a file that never changed", lambda: len(opened.history(never, 10).newest))
+        timed("history of one that often did", lambda: opened.history(often, 10).more)
+        gone = f"od-{fleet.edge_id(0)}-{fleet.SPARE}00000"
+        timed("where a release that stopped was", lambda: len(opened.once_called(gone)))
+        timed(f"verify {VERIFIED} commits by differences", lambda: _verify(opened, whole=False))
+        timed(f"verify {VERIFIED} commits whole", lambda: _verify(opened, whole=True))
+
+
+def _verify(opened: reader.Reader, *, whole: bool) -> int:
+    commits = opened.revisions(f"main~{VERIFIED}..main")
+    return sum(verdict.holds for verdict in opened.verify_all(commits, whole=whole))
+
+
+def main() -> int:
+    """Lay down, measure, clean up."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--releases", type=int, default=RELEASES)
+    parser.add_argument("--commits", type=int, default=COMMITS)
+    parser.add_argument("--keep", type=Path)
+    args = parser.parse_args()
+    folder = args.keep or Path(tempfile.mkdtemp(prefix="bench-audit-"))
+    try:
+        repo = folder / "state-repo.git"
+        if not repo.exists():
+            repo = lay_down(folder, args.releases, args.commits)
+        measure(repo)
+    finally:
+        if not args.keep:
+            shutil.rmtree(folder, ignore_errors=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
