@@ -63,7 +63,7 @@ Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
 class Ledger:
     """All claims, with an index for each question that a request asks.
 
-    ``index`` maps what :func:`_entries` says of a claim to the claims of which it holds.
+    ``index`` maps what :func:`entries` says of a claim to the claims of which it holds.
     ``minutes`` are those in which some lease ends: the next end is found without looking at all.
     """
 
@@ -162,7 +162,7 @@ class Ledger:
             return self
         held = held.insert(key.demand, claim) if claim else held.remove(key.demand)
         claims = self.claims.insert(key.subject, held) if held else self.claims.remove(key.subject)
-        before, after = _entries(old), _entries(claim)
+        before, after = entries(old), entries(claim)
         index, minutes = self.index, self.minutes
         for entry in before - after:
             rest = index[entry].remove(key)
@@ -194,25 +194,25 @@ class Ledger:
         return sum(len(claims) for claims in self.claims.values())
 
 
-def _entries(claim: Claim | None) -> set[Entry]:
+def entries(claim: Claim | None) -> set[Entry]:
     """Return what a claim is found by."""
     if claim is None:
         return set()
-    entries: set[Entry] = {("demand", claim.demand)}
-    entries |= {("requester", requester) for requester in claim.requesters}
+    found: set[Entry] = {("demand", claim.demand)}
+    found |= {("requester", requester) for requester in claim.requesters}
     if claim.lease is not None:
-        entries.add((_ENDS, _minute(claim.lease.ends)))
+        found.add((_ENDS, _minute(claim.lease.ends)))
     if isinstance(claim, ApplicationClaim):
-        entries.add(("node", claim.node))
+        found.add(("node", claim.node))
         for _, topic in claim.all_inputs():
-            entries |= {("takes", topic.source, topic.topic), ("node", topic.source)}
+            found |= {("takes", topic.source, topic.topic), ("node", topic.source)}
     else:
         for end in (claim.source, claim.target):
-            entries.add(("link", claim.type.name, end))
+            found.add(("link", claim.type.name, end))
         for route in claim.topics.values():
             _, taking = route.ends(claim.source, claim.target)
-            entries.add(("brings", taking, route.written))
-    return entries
+            found.add(("brings", taking, route.written))
+    return found
 
 
 def _minute(moment: datetime) -> str:

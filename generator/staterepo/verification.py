@@ -1,26 +1,28 @@
 """Proving commits: what the generator committed is what books and configuration give.
 
 A commit is proven whole (loaded and rendered from nothing) or by differences from the one proven
-before it. The second trusts object ids and that rendering is a function of release and catalog; it
-does not trust what the generator thought was affected: every release is planned again at every
-commit, and rendered again where its plan differs at all. The first and the last commit of a row
-are proven whole.
+before it. The second trusts object ids, and that planning and rendering are functions; it does not
+trust what the generator thought was affected: every release is planned and rendered again of whose
+plan anything that was read has changed (:mod:`generator.plan.traced`), and every file that differs
+in Git is compared. The first and the last commit of a row are proven whole.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 
 from generator.catalog.catalog import CONFIG_ROOTS
+from generator.decision import State
+from generator.demand.claim import Claim
 from generator.errors import InvalidInput
 from generator.ledger import format as ledger_format
-from generator.plan.planner import ReleaseKey, all_keys, plan
-from generator.plan.release import Bridge, Release, ServiceRelease
+from generator.ledger.ledger import ClaimChange
+from generator.plan.planner import ReleaseKey
+from generator.plan.traced import TracedPlan
 from generator.render import gitops
 from generator.render.paths import path_of
 from generator.settings import GENERATED_ROOTS, RENDER_VERSION
@@ -32,9 +34,6 @@ from generator.staterepo.snapshot import Snapshot
 _PEOPLES = (*CONFIG_ROOTS, "overrides")
 _FREE = ("init", "upgrade")
 """Operations that may write what people own: they lay it down, or bring it to a new form."""
-
-_Planned = tuple[Release, str, Oid]
-_Files = dict[str, Oid]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,19 +61,30 @@ class _Proof:
     """A commit that was rendered again, and what of it serves the next."""
 
     tree: Tree
-    snapshot: Snapshot
-    planned: dict[ReleaseKey, _Planned]
-    steady: _Files
+    state: State
+    claims: dict[str, Claim]
+    plan: TracedPlan
+    planned: dict[ReleaseKey, tuple[str, Oid]]
+    steady: dict[str, Oid]
     """What stays when nothing is demanded."""
-    standing: _Files
+    standing: dict[str, Oid]
     """What the commit holds below the generated folders."""
 
+    def take_in(self, state: State, changes: Sequence[ClaimChange]) -> None:
+        """Plan and render what the changes may have changed."""
+        self.state = state
+        for key, release in self.plan.advance(state.ledger, changes).items():
+            self.planned.pop(key, None)
+            if release is not None:
+                text = gitops.render(release, state.catalog, state.engine)
+                self.planned[key] = (path_of(release), _blob(text))
+
     def differing(self) -> tuple[str, ...]:
-        wanted = self.steady | {path: blob for _, path, blob in self.planned.values()}
-        paths = sorted({*wanted, *self.standing})
+        """Return the files that are not what they should be."""
+        wanted = self.steady | dict(self.planned.values())
         return tuple(
             path
-            for path in paths
+            for path in sorted({*wanted, *self.standing})
             if wanted.get(path) != self.standing.get(path) and not trees.is_note(path)
         )
 
@@ -94,28 +104,30 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
             yield verdict
             continue
         in_force = entry.one("In-Force")
-        ends = place in (0, len(commits) - 1)
+        afresh = whole or bool(in_force) or place in (0, len(commits) - 1)
+        touched = _not_its_own(repo, commit, entry)
+        verdict = replace(verdict, touched=touched, holds=not touched)
+        changes, snapshot = list[ClaimChange](), None
         try:
-            if whole or ends or in_force or proof is None or _reconfigured(proof, commit):
+            if afresh or proof is None or _reconfigured(proof, commit):
                 snapshot = _in_force_at(repo, commit, in_force)
-                proof = None
             else:
-                snapshot = _advanced(repo, proof, commit)
+                changes = _claims_changed(repo, proof, commit)
         except InvalidInput as error:
             proof = None
             yield replace(verdict, skipped=f"a person's file was not valid then: {error.faults[0]}")
             continue
-        touched = _not_its_own(repo, commit, entry)
         try:
-            proof = _proven(repo, proof, snapshot, commit)
+            if snapshot is not None:
+                proof = _from_nothing(snapshot, commit)
+            elif proof is not None:
+                _bring_forward(repo, proof, commit, changes)
         except InvalidInput as error:  # the generator did render it then, so it must now
             proof = None
-            yield replace(verdict, holds=False, fault=str(error.faults[0]), touched=touched)
+            yield replace(verdict, holds=False, fault=str(error.faults[0]))
             continue
-        differing = proof.differing()
-        yield replace(
-            verdict, holds=not (differing or touched), differing=differing, touched=touched
-        )
+        differing = proof.differing() if proof else ()
+        yield replace(verdict, holds=not (differing or touched), differing=differing)
         if in_force:  # whose configuration is not that of its tree
             proof = None
 
@@ -149,67 +161,58 @@ def _reconfigured(proof: _Proof, commit: Commit) -> bool:
     return ids(proof.tree) != ids(commit.tree)
 
 
-def _advanced(repo: Repository, proof: _Proof, commit: Commit) -> Snapshot:
-    """Return the books at a commit, reading the claims that differ from those proven before.
+def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[ClaimChange]:
+    """Return the claims that differ from those proven before.
 
     Raises:
         InvalidInput: where a claim file is not valid.
     """
-    ledger, keys = proof.snapshot.state.ledger, proof.snapshot.keys
+    changes = []
     for path, blob in trees.below_root(repo, proof.tree, commit.tree, ledger_format.LEDGER_ROOT):
         if ledger_format.kind_of(path) is None:
             continue
-        known = keys.get(path)
-        if known is not None:
-            ledger, keys = ledger.replace(known, None), keys.remove(path)
-        if blob is not None:
-            claim = ledger_format.read(_text(commit, path), path)
-            ledger, keys = ledger.replace(claim.key, claim), keys.insert(path, claim.key)
-    state = replace(proof.snapshot.state, ledger=ledger)
-    return replace(proof.snapshot, commit=commit.id, state=state, keys=keys)
+        known = proof.claims.get(path)
+        claim = ledger_format.read(_text(commit, path), path) if blob else None
+        if known or claim:
+            changes.append(ClaimChange(known, claim))
+    return changes
 
 
-def _proven(repo: Repository, before: _Proof | None, snapshot: Snapshot, commit: Commit) -> _Proof:
-    """Plan every release anew, and render those whose plan is not the one that is known."""
+def _from_nothing(snapshot: Snapshot, commit: Commit) -> _Proof:
+    """Render a commit whole."""
     state = snapshot.state
-    planned = {}
-    for key in all_keys(state.ledger, state.catalog):
-        release = plan(state.ledger, state.catalog, key)
-        if release is None:
-            continue
-        known = before.planned.get(key) if before else None
-        if known is None or not _same(known[0], release):
-            text = gitops.render(release, state.catalog, state.engine)
-            known = (release, path_of(release), _blob(text))
-        planned[key] = known
-    if before is None:
-        steady = gitops.standing_files(state.catalog, state.engine)
-        standing = dict(_standing(commit.tree))
-        ids = {path: _blob(text) for path, text in steady.items()}
-        return _Proof(commit.tree, snapshot, planned, ids, standing)
-    standing = before.standing
+    steady = gitops.standing_files(state.catalog, state.engine)
+    proof = _Proof(
+        tree=commit.tree,
+        state=state,
+        claims={ledger_format.path_of(claim.key): claim for claim in state.ledger},
+        plan=TracedPlan(state.catalog),
+        planned={},
+        steady={path: _blob(text) for path, text in steady.items()},
+        standing=dict(_standing(commit.tree)),
+    )
+    proof.take_in(state, ())
+    return proof
+
+
+def _bring_forward(
+    repo: Repository, proof: _Proof, commit: Commit, changes: Sequence[ClaimChange]
+) -> None:
+    """Render what a commit changed of its books, and note what it changed of its files."""
+    ledger = proof.state.ledger
+    for change in changes:
+        ledger = ledger.replace(change.key, change.after)
+        path = ledger_format.path_of(change.key)
+        proof.claims.pop(path, None)
+        if change.after is not None:
+            proof.claims[path] = change.after
     for root in GENERATED_ROOTS:
-        for path, blob in trees.below_root(repo, before.tree, commit.tree, root):
-            standing.pop(path, None)
+        for path, blob in trees.below_root(repo, proof.tree, commit.tree, root):
+            proof.standing.pop(path, None)
             if blob is not None:
-                standing[path] = blob
-    return _Proof(commit.tree, snapshot, planned, before.steady, standing)
-
-
-def _same(one: Release, other: Release) -> bool:
-    """Compare exactly: to Python 1 is True and 1.0, to a chart they are three values."""
-    return type(one) is type(other) and one == other and _written(one) == _written(other)
-
-
-def _written(release: Release) -> str:
-    values: Any
-    if isinstance(release, ServiceRelease):
-        values = (release.parameters, release.inputs)
-    elif isinstance(release, Bridge):
-        values = release.rates
-    else:
-        values = release.topics
-    return repr(values)
+                proof.standing[path] = blob
+    proof.tree = commit.tree
+    proof.take_in(replace(proof.state, ledger=ledger), changes)
 
 
 def _standing(tree: Tree) -> Iterator[tuple[str, Oid]]:

@@ -11,6 +11,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pygit2
@@ -56,22 +57,34 @@ def timed(what: str, call: Callable[[], object]) -> None:
 def measure(repo: Path) -> None:
     """Ask everything once."""
     with reader.opened(str(repo)) as opened:
+        tip = opened.commit()
         timed("loading the newest commit", lambda: len(opened.snapshot().state.ledger))
-        files = opened.generated(opened.commit())
-        never, often = (
-            next(p for p in files if w in p) for w in ("od-edge00001-v", "of-edge00000")
-        )
-        timed("history of a file that never changed", lambda: len(opened.history(never, 10).newest))
-        timed("history of one that often did", lambda: opened.history(often, 10).more)
+        old = opened.path_called("od-edge00001-v00001x0", tip)
+        often = opened.path_called(f"of-{fleet.edge_id(0)}-fusion", tip) or _fusion(opened, tip)
+        timed("history of a file that is as it was at first", lambda: _told(opened, old, tip))
+        timed("history of a file that changed often", lambda: _told(opened, often, tip))
         gone = f"od-{fleet.edge_id(0)}-{fleet.SPARE}00000"
-        timed("where a release that stopped was", lambda: len(opened.once_called(gone)))
-        timed(f"verify {VERIFIED} commits by differences", lambda: _verify(opened, whole=False))
-        timed(f"verify {VERIFIED} commits whole", lambda: _verify(opened, whole=True))
+        timed("history of a release that stopped", lambda: opened.path_called(gone, tip))
+        timed("a time at the far end", lambda: opened.commit(f"{opened.commit('main~9000')}")[:10])
+        timed("log of one requester", lambda: sum(1 for e in opened.log() if gone in e.summary))
+        for whole in (False, True):
+            how = "whole" if whole else "by differences"
+            timed(f"verify {VERIFIED} commits {how}", partial(_verify, opened, whole=whole))
+
+
+def _fusion(opened: reader.Reader, tip: str) -> str:
+    files = opened.differing(opened.commit("main~2"), tip, "clusters")
+    return next(iter(files), "clusters")
+
+
+def _told(opened: reader.Reader, path: str | None, tip: str) -> str:
+    history = opened.history(path or "", tip, 10)
+    return f"{len(history.newest)} and {history.more} more"
 
 
 def _verify(opened: reader.Reader, *, whole: bool) -> int:
     commits = opened.revisions(f"main~{VERIFIED}..main")
-    return sum(verdict.holds for verdict in opened.verify_all(commits, whole=whole))
+    return sum(verdict.holds for verdict in opened.verify(commits, whole=whole))
 
 
 def main() -> int:

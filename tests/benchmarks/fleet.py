@@ -20,6 +20,7 @@ from generator.catalog.loading import load
 from generator.decision import State, admit, rendered
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger, apply
+from generator.settings import GENERATED_ROOTS
 from generator.staterepo import layout, message
 from generator.staterepo import tree as trees
 
@@ -90,7 +91,11 @@ def _nodes(edges: int, edges_per_cluster: int) -> str:
 def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
     """Make a bare state repo with about ``releases`` releases running, by regions."""
     edges = max(1, round(releases / RELEASES_PER_EDGE))
-    files = layout.files()
+    files = {
+        path: text
+        for path, text in layout.files().items()
+        if path.split("/")[0] not in GENERATED_ROOTS  # they are of the skeleton's one cluster
+    }
     files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster)
     regions = sorted({_region(number, edges_per_cluster) for number in range(edges)})
     files["inventory/clusters.yaml"] = yamlio.dump(
