@@ -107,7 +107,9 @@ def lines(found: dict[str, Any]) -> Iterator[str]:
     at = found["commit"][:10]
     told = f"{found['kind']} {found['name']}"
     if not found["runs"]:
-        word = "stands" if found["kind"] == "file" else "does not run"
+        word = "does not run"
+        if found["kind"] in ("file", "claim"):
+            word = "is gone" if found["stopped"] else "stands"
         yield f"{told} {word} at {at}"
         yield f"  file        {found['file']}"
         yield from _history(found)
@@ -167,9 +169,8 @@ def _history(found: dict[str, Any]) -> Iterator[str]:
 
 def _told(entry: dict[str, Any], *, why: bool) -> Iterator[str]:
     when = entry["time"][:19].replace("T", " ")
-    who = ", ".join(entry["requesters"]) or entry["author"]
     word = entry["operation"] or "by hand"
-    yield f"  {entry['commit'][:10]} {when} UTC  {word} by {who}: {entry['summary']}"
+    yield f"  {entry['commit'][:10]} {when} UTC  {word}, {entry['author']}: {entry['summary']}"
     if why and entry["why"]:
         yield f"    {entry['why']}"
     for one in entry["carries_out"]:

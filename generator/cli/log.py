@@ -132,12 +132,14 @@ def _fitting(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Iter
 def _table(entries: Iterable[LogEntry]) -> Table:
     table = Table("Commit", "Time (UTC)", "Operation", "Requesters", "What")
     for entry in entries:
-        requesters = entry.trailers.get("Requester")
+        requesters = ", ".join(entry.trailers.get("Requester", ()))
+        if entry.one("Operation") == "rollback":
+            requesters = f"{entry.author}, for {requesters}"
         table.add_row(
             entry.commit[:10],
             entry.time.strftime("%Y-%m-%d %H:%M:%S"),
             entry.one("Operation") or "by hand",
-            ", ".join(requesters) if requesters else entry.author,
+            requesters or entry.author,
             entry.summary,
         )
     return table

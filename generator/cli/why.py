@@ -104,15 +104,14 @@ def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -
     if len(running or found) == 1:
         return (running or found)[0]
     if found:
-        kinds = " and ".join(dict.fromkeys(one.kind for one in found))
-        raise StateRepoError(f"{shown(name)} is the name of a {kinds}; say which by --kind")
+        kinds = ", ".join(one.kind for one in found)
+        raise StateRepoError(f"{shown(name)} names more than one: {kinds}; say which by --kind")
+    if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
+        return _by_path(repo, snapshot, name)
     ledger, catalog = snapshot.state.ledger, snapshot.state.catalog
-    known = [*explanation.names(ledger, catalog)]
-    known += [id for one in SubjectKind for id in ledger.subjects(one)]
-    raise StateRepoError(
-        f"nothing called {shown(name)} runs, or ever did{near(name, known)}"
-        + ("" if known else "; nothing runs at all")
-    )
+    known = {*explanation.names(ledger, catalog), *repo.ever_stopped(str(snapshot.commit))}
+    known |= {id for one in SubjectKind for id in ledger.subjects(one)}
+    raise StateRepoError(f"nothing called {shown(name)} runs, or ever did{near(name, known)}")
 
 
 def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
@@ -142,8 +141,9 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Asked:
         return _Asked("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
         raise StateRepoError(f"{shown(path)} is no file of the state repo, and never was")
-    kind = "claim" if ledger_format.kind_of(path) else "release"
-    return _Asked(kind if text is None else "file", name, path)
+    if text is not None or not path.startswith(("clusters/", "ledger/")):
+        return _Asked("file", path, path)
+    return _Asked("claim" if ledger_format.kind_of(path) else "release", name, path)
 
 
 def _is_held(snapshot: Snapshot, asked: _Asked) -> bool:

@@ -22,7 +22,7 @@ TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
 _CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2})?")
 _DAY, _MINUTE, _SECOND = timedelta(days=1), timedelta(minutes=1), timedelta(seconds=1)
-_MAIN = re.compile(rf"(?:HEAD|{MAIN_BRANCH})(?=$|[~^@])")
+_MAIN = re.compile(rf"^(?:HEAD|{MAIN_BRANCH})(?=$|[~^@])")
 
 
 def moment(text: str, now: datetime, *, end: bool = False) -> datetime | None:

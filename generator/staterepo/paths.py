@@ -100,9 +100,20 @@ def once_called(repo: Repository, tip: str | Oid, name: str) -> str | None:
     with git.Repo(repo.path) as opened:
         said = opened.git.log(
             *("-1", "--diff-filter=D", "--format=", "--name-only", "-z", "--no-renames", commit),
-            *("--", f":(glob)clusters/*/*/*/{name}.yaml"),
+            *("--", f":(glob){CLUSTERS_ROOT}/*/*/*/{name}.yaml"),
         )
     return next((path for path in said.split("\0") if path.endswith(f"/{name}.yaml")), None)
+
+
+def ever_stopped(repo: Repository, tip: str | Oid) -> set[str]:
+    """Return the names of all releases that were stopped at some time; reads all of history."""
+    commit = str(commit_of(repo, tip).id)
+    with git.Repo(repo.path) as opened:
+        said = opened.git.log(
+            *("--diff-filter=D", "--format=", "--name-only", "-z", "--no-renames", commit),
+            *("--", f":(glob){CLUSTERS_ROOT}/*/*/*/*.yaml"),
+        )
+    return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in said.split("\0") if path}
 
 
 def called(repo: Repository, tip: str | Oid, name: str) -> str | None:

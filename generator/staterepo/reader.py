@@ -160,6 +160,10 @@ class Reader:
         standing = paths.called(objects, revision, name)
         return standing or paths.once_called(objects, revision, name)
 
+    def ever_stopped(self, revision: str) -> set[str]:
+        """Return the names of all releases that were stopped at some time."""
+        return paths.ever_stopped(self._repository.objects, revision)
+
     def differing(self, before: str, after: str, root: str) -> dict[str, bool]:
         """Return the files below a folder that differ between two commits, and which are left."""
         objects = self._repository.objects

@@ -5,7 +5,6 @@ from __future__ import annotations
 import getpass
 from datetime import datetime, timezone
 
-import pygit2
 from pygit2 import Oid, Repository
 
 from generator.catalog.catalog import CONFIG_ROOTS
@@ -62,12 +61,11 @@ def configured_since(repo: Repository, commit: str | Oid, tip: str | Oid) -> lis
 
 def person(repo: Repository) -> tuple[str, str]:
     """Return name and e-mail address of who runs this, as git has them, else of the login."""
+    config = repo.config.snapshot()
     try:
-        who = repo.default_signature
-        return who.name, who.email
-    except (KeyError, pygit2.GitError):
-        try:
-            name = getpass.getuser()
-        except (KeyError, OSError):
-            name = "unknown"
-        return name, f"{name}@demandops.invalid"
+        login = getpass.getuser()
+    except (KeyError, OSError):  # a container's user without an entry
+        login = "unknown"
+    known = {key: config[key] for key in ("user.name", "user.email") if key in config}
+    email = known.get("user.email", f"{login}@demandops.invalid")
+    return known.get("user.name", login), email

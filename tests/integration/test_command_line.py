@@ -24,6 +24,12 @@ from generator.cli import views
 EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("*.yaml"))
 SHA = re.compile(r"[0-9a-f]{40}")
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
+SOURCE_END = "mqtt-vehicle01-edge-source-092a70a6cc97"
+TARGET_END = "mqtt-vehicle01-edge-target-f918b3fb6980"
+NO_REVISION = (
+    "error: 'nope' is neither a commit of the state repo nor a time; `demandops log` lists the "
+    "commits, a time is written like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h\n"
+)
 REQUEST_KEYS = ["index", "request_id", "outcome", "commit", "errors", "warnings", "not_held"]
 NO_CARRIER = (
     "application 'edge/object_detection_fusion': no connection carries point_cloud "
@@ -402,9 +408,7 @@ class TestBookkeeping:
     def test_a_revision_that_does_not_exist(self, demandops: Run, state: Any) -> None:
         ran = demandops("bookkeeping", "--at", "nope", "--state-repo", state.path)
         assert (ran.code, ran.out) == (1, "")
-        assert ran.err == (
-            "error: 'nope' is no commit of the state repo; `demandops log` lists them\n"
-        )
+        assert ran.err == (NO_REVISION)
 
     def test_the_text_is_a_table(self, demandops: Run, joined: Any) -> None:
         ran = demandops("bookkeeping", "--state-repo", joined.path)
@@ -489,9 +493,7 @@ class TestLog:
     ) -> None:
         ran = demandops("log", revision, "--state-repo", state.path)
         assert (ran.code, ran.out) == (1, "")
-        assert ran.err == (
-            "error: 'nope' is no commit of the state repo; `demandops log` lists them\n"
-        )
+        assert ran.err == (NO_REVISION)
 
 
 class TestDiff:
@@ -514,30 +516,37 @@ class TestDiff:
             "    + ego_data /ego",
             "    + requester vehicle01",
             "+ connection vehicle01/edge for vehicle01",
+            f"+ release {SOURCE_END} (MQTT source of connection vehicle01/edge on vehicle01)",
+            f"+ release {TARGET_END} (MQTT target of connection vehicle01/edge on edge)",
+            f"~ release {FUSION} (object-fusion on edge for {APP})",
+            "    + ego_data /ego",
         ]
         back = demandops("diff", "main", "main~1", "--state-repo", joined.path)
         assert back.out.splitlines()[1] == "    - requester vehicle01"
-        assert back.out.splitlines()[-1] == "- connection vehicle01/edge for vehicle01"
+        assert "- connection vehicle01/edge for vehicle01" in back.out.splitlines()
+        assert back.out.splitlines()[-1].startswith(f"- release {TARGET_END} (")
 
     def test_the_json_tells_the_same(self, demandops: Run, joined: Any) -> None:
         ran = demandops("diff", "main~1", "main", "--state-repo", joined.path, "--output", "json")
         found = ran.json()
-        assert found.keys() == {"services", "connections"}
-        assert all(part.keys() == {"added", "removed", "changed"} for part in found.values())
+        assert found.keys() == {"services", "connections", "releases", "other_files"}
+        for part in (found["services"], found["connections"]):
+            assert part.keys() == {"added", "removed", "changed"}
         assert sorted(found["services"]["added"]) == ["od-edge-vehicle00", FUSION]
         assert found["connections"]["added"]["vehicle00/edge"]["requesters"] == ["vehicle00"]
         assert found["services"]["removed"] == found["services"]["changed"] == {}
 
     def test_no_difference(self, demandops: Run, joined: Any) -> None:
         ran = demandops("diff", "main", "main", "--state-repo", joined.path)
-        assert (ran.code, ran.out) == (0, "no difference in bookkeeping\n")
+        assert (ran.code, ran.out) == (
+            0,
+            "no difference in bookkeeping\nno difference in what runs\n",
+        )
 
     def test_a_revision_that_does_not_exist(self, demandops: Run, state: Any) -> None:
         ran = demandops("diff", "main", "nope", "--state-repo", state.path)
         assert (ran.code, ran.out) == (1, "")
-        assert ran.err == (
-            "error: 'nope' is no commit of the state repo; `demandops log` lists them\n"
-        )
+        assert ran.err == (NO_REVISION)
 
 
 class TestVerify:
@@ -572,6 +581,10 @@ class TestVerify:
             "skipped": None,
             "fault": None,
             "differing": [path],
+            "touched": [],
+            "signed": False,
+            "signer": None,
+            "signature": None,
         }
 
     def test_a_commit_of_a_person_is_skipped(self, demandops: Run, joined: Any) -> None:

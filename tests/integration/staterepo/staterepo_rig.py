@@ -399,7 +399,7 @@ def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]
     """What `demandops verify` finds fault with, in all of history or behind a commit."""
     with reader.opened(str(repo)) as opened:
         commits = opened.revisions(f"{since or root(repo)}..")
-        verdicts = [opened.verify(commit) for commit in commits]
+        verdicts = opened.verify(commits)
     return {verdict.summary: verdict.differing for verdict in verdicts if not verdict.holds}
 
 

@@ -1,0 +1,529 @@
+"""An auditor's questions, by the program and by plain git: what ran, for whom, and by whom."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from asking import APP, application, connection, goal, perception
+
+from generator.cli.main import run as run_command
+from generator.ledger.format import read
+
+Run = Callable[..., Any]
+
+EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("*.yaml"))
+DETECTION = "od-edge-vehicle00"
+FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
+PATH = f"clusters/c-its/perception/edge/{DETECTION}.yaml"
+
+
+def git(repo: Any, *args: str) -> str:
+    command = ["git", "-C", str(repo.path), *args]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.rstrip("\n")
+
+
+@pytest.fixture(scope="session")
+def _played(laid_down: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The experiment's first six steps: all four join, vehicle00 and vehicle01 leave."""
+    folder = tmp_path_factory.mktemp("played")
+    shutil.copytree(laid_down, folder / "state.git")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DEMANDOPS_DATA_HOME", str(folder / "home"))
+        files = [str(file) for file in EXPERIMENT[:6]]
+        assert run_command(["request", *files, "--state-repo", str(folder / "state.git")]) == 0
+    return folder / "state.git"
+
+
+@pytest.fixture
+def played(_played: Path, state: Any) -> Any:
+    shutil.rmtree(state.path)
+    shutil.copytree(_played, state.path)
+    return state
+
+
+@pytest.fixture
+def ask(demandops: Run, state: Any) -> Run:
+    """Return a function that asks for JSON."""
+
+    def call(*args: str) -> Any:
+        ran = demandops(*args, "--state-repo", state.path, "--output", "json")
+        assert (ran.code, ran.err) == (0, "")
+        return ran.json()
+
+    return call
+
+
+class TestPlainGit:
+    """What docs/audit.md says of git alone."""
+
+    def test_by_author(self, played: Any) -> None:
+        said = git(played, "log", "--author=vehicle00", "--format=%an: %s", "main")
+        subjects = f"{APP}, vehicle00/edge, station00/edge"
+        assert said.splitlines() == [
+            f"vehicle00, station00: Release {subjects}",
+            f"vehicle00, station00: Join {subjects}",
+        ]
+
+    def test_by_trailer(self, played: Any) -> None:
+        form = "--format=%(trailers:key=Requester,valueonly,separator=%x2C )"
+        said = git(played, "log", form, "main").splitlines()
+        assert said[:2] == ["vehicle01, station00", "vehicle00, station00"]
+        assert len(said) == 6  # init has none
+
+    def test_by_what_a_message_says(self, played: Any) -> None:
+        for pattern, count in (
+            ("^Operation: shutdown$", 2),
+            ("^Requester: vehicle02$", 1),
+            (f"^Application: {APP}$", 6),
+            ("^Connection: vehicle03/edge$", 1),
+        ):
+            said = git(played, "log", f"--grep={pattern}", "--format=%h", "main")
+            assert len(said.splitlines()) == count, pattern
+
+    def test_by_path(self, played: Any) -> None:
+        said = git(played, "log", "--format=%(trailers:key=Operation,valueonly,separator=)",
+                   "main", "--", PATH)  # fmt: skip
+        assert said.splitlines() == ["shutdown", "join"]
+
+    def test_blame_of_a_claim_names_who_booked_it(self, played: Any) -> None:
+        path = next(p for p, text in played.files("ledger/").items() if "- vehicle02" in text)
+        said = git(played, "blame", "--line-porcelain", "main", "--", path)
+        authors = {line for line in said.splitlines() if line.startswith("author ")}
+        assert authors == {"author vehicle02, station00"}
+
+    def test_where_a_file_of_that_name_once_was(self, played: Any) -> None:
+        said = git(played, "log", "--diff-filter=D", "--name-only", "--format=%s", "main", "--",
+                   f":(glob)clusters/**/{DETECTION}.yaml")  # fmt: skip
+        assert said.splitlines()[-1] == PATH
+
+    def test_what_stood_at_a_time(self, played: Any) -> None:
+        assert git(played, "rev-list", "-1", "--first-parent", "--before=now", "main") == played.tip
+
+
+class TestWhy:
+    def test_a_release_that_runs(self, ask: Run, played: Any) -> None:
+        found = ask("why", FUSION)
+        assert (found["runs"], found["kind"], found["commit"]) == (True, "release", played.tip)
+        assert (found["node"], found["cluster"]) == ("edge", "c-its")
+        assert (found["namespace"], found["domain"]) == ("perception", "perception")
+        assert found["file"] == f"clusters/c-its/perception/edge/{FUSION}.yaml"
+        assert found["requesters"] == ["station00", "vehicle02", "vehicle03"]
+        files = played.files("ledger/")
+        for claim in found["claims"]:
+            booked = read(files[claim["file"]], claim["file"])
+            assert claim["requesters"] == list(booked.requesters)
+            assert claim["demand"] == booked.demand
+            assert claim["since"] == booked.booked.isoformat()
+            assert claim["release_by"] == (
+                f"send request '{booked.request}' again with shutdown: true"
+            )
+        assert len(found["claims"]) == 2
+        shaping = {one["file"]: one for one in found["shaped_by"]}
+        assert set(shaping) == {
+            "demandops.yaml",
+            "appdefs/object-detection-fusion/appdef.yaml",
+            "appdefs/object-detection-fusion/values/object-fusion.yaml.j2",
+            "registry/charts.yaml",
+            "registry/images.yaml",
+            "inventory/nodes.yaml",
+            "policy/access-domains.yaml",
+        }
+        assert set(shaping) <= set(played.files())
+        assert shaping["registry/charts.yaml"]["what"].startswith("version 0.1.0 from folder ")
+        assert found["overrides"] == []
+
+    def test_its_commits_are_those_that_git_tells(self, ask: Run, played: Any) -> None:
+        found = ask("why", FUSION)
+        said = git(played, "log", "--format=%H", "main", "--", found["file"]).splitlines()
+        assert [one["commit"] for one in [*found["changes"], found["started"]]] == said
+        assert (found["stopped"], found["more_changes"]) == (None, 0)
+        assert found["started"]["author"] == "vehicle00, station00"
+        bounded = ask("why", FUSION, "-n", "1")
+        assert [one["commit"] for one in bounded["changes"]] == said[:1]
+        assert bounded["more_changes"] == len(said) - 2
+        assert bounded["started"]["commit"] == said[-1]
+
+    def test_a_release_that_stopped(self, ask: Run, played: Any) -> None:
+        found = ask("why", DETECTION)
+        stopped, started = git(played, "log", "--format=%H", "main", "--", PATH).splitlines()
+        assert (found["runs"], found["file"]) == (False, PATH)
+        assert (found["stopped"]["commit"], found["started"]["commit"]) == (stopped, started)
+        assert found["stopped"]["operation"] == "shutdown"
+        assert found["stopped"]["why"].endswith("in the name of vehicle00, station00.")
+        assert ask("why", PATH)["stopped"] == found["stopped"]
+
+    def test_what_ran_before(self, ask: Run, played: Any) -> None:
+        found = ask("why", DETECTION, "--at", "main~2")
+        assert found["runs"]
+        assert found["requesters"] == ["station00", "vehicle00"]
+
+    def test_a_connection_and_an_application(self, ask: Run, played: Any) -> None:
+        found = ask("why", "vehicle02/edge")
+        assert (found["kind"], found["runs"]) == ("connection", True)
+        assert {one["node"] for one in found["releases"]} == {"vehicle02", "edge"}
+        assert ask("why", APP)["requesters"] == ["station00", "vehicle02", "vehicle03"]
+        gone = ask("why", "vehicle00/edge")
+        assert (gone["kind"], gone["runs"]) == ("connection", False)
+        assert gone["stopped"]["requesters"] == ["vehicle00", "station00"]
+
+    def test_a_claim_by_its_file(self, ask: Run, played: Any) -> None:
+        path = next(p for p in played.files("ledger/connections/"))
+        found = ask("why", path)
+        assert (found["kind"], found["file"], found["runs"]) == ("claim", path, True)
+        played.commit({path: None}, "Nobody needs it\n")
+        gone = ask("why", path)
+        assert (gone["runs"], gone["stopped"]["author"]) == (False, "A person")
+
+    def test_what_a_person_changed_is_named(self, ask: Run, played: Any, request_json: Run) -> None:
+        images = played.files()["registry/images.yaml"].replace("2025-04", "2025-05")
+        by_hand = played.commit({"registry/images.yaml": images}, "Newer images\n")
+        request_json(goal([], [connection("another")]))
+        change = ask("why", FUSION)["changes"][0]
+        assert change["operation"] == "follow"
+        assert change["carries_out"] == [
+            {"commit": by_hand, "author": "A person", "summary": "Newer images"}
+        ]
+
+    def test_an_application_and_a_connection_of_one_id(
+        self, demandops: Run, ask: Run, state: Any, request_json: Run
+    ) -> None:
+        request_json(goal([application("twin")], [connection("twin")]))
+        ran = demandops("why", "twin", "--state-repo", state.path)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            "error: 'twin' names more than one: application, connection; say which by --kind\n"
+        )
+        assert ask("why", "twin", "--kind", "connection")["kind"] == "connection"
+
+    @pytest.mark.parametrize(
+        ("name", "hint"),
+        [
+            ("od-edge-vehicle0", f"'{DETECTION}'"),  # which ran once
+            ("vehicle02/edgy", "'vehicle02/edge'"),
+            (FUSION[:-1], f"'{FUSION}'"),
+        ],
+    )
+    def test_a_near_miss(self, demandops: Run, played: Any, name: str, hint: str) -> None:
+        ran = demandops("why", name, "--state-repo", played.path)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            f"error: nothing called '{name}' runs, or ever did; did you mean {hint}?\n"
+        )
+
+    @pytest.mark.parametrize(
+        "name",
+        ["", "-", "..", "*", ":(glob)**", "clusters/", "clusters/../x", "ledger//x", "\x1b[1m"],
+    )
+    def test_rubbish(self, demandops: Run, played: Any, name: str) -> None:
+        ran = demandops("why", "--state-repo", played.path, "--", name)
+        assert ran.code in (0, 1)
+        assert "\x1b" not in ran.err
+
+    def test_a_file_that_people_broke_is_told_and_does_not_hide_the_answer(
+        self, demandops: Run, played: Any
+    ) -> None:
+        played.commit({"inventory/nodes.yaml": "nodes: [\n"})
+        ran = demandops("why", FUSION, "--state-repo", played.path)
+        assert ran.code == 0
+        assert ran.err.startswith("warning: inventory/nodes.yaml: ")
+        assert ran.out.startswith(f"release {FUSION} runs at ")
+
+    def test_the_text(self, demandops: Run, played: Any) -> None:
+        out = demandops("why", DETECTION, "--state-repo", played.path).out.splitlines()
+        assert out[0] == f"release {DETECTION} does not run at {played.tip[:10]}"
+        assert out[1] == f"  file        {PATH}"
+        assert [line for line in out if not line.startswith(" ")][1:] == [
+            "stopped by",
+            "started by",
+        ]
+
+
+class TestLogFilters:
+    @pytest.mark.parametrize(
+        ("filters", "operations"),
+        [
+            (["--requester", "vehicle01"], ["shutdown", "join"]),
+            (["--requester", "vehicle01", "--operation", "join"], ["join"]),
+            (["--requester", "nobody"], []),
+            (["--connection", "vehicle03/edge"], ["join"]),
+            (["--application", APP, "-n", "3"], ["shutdown", "shutdown", "join"]),
+            (["--operation", "init"], ["init"]),
+            (["--release", DETECTION], ["shutdown", "join"]),
+            (["--release", PATH, "main~2"], ["join"]),
+            (["--release", DETECTION, "main~3..main"], ["shutdown"]),
+            (["--node", "vehicle03"], ["join"]),
+            (["--node", "vehicle00"], ["shutdown", "join"]),
+            (["--node", "cloud"], []),
+            (["--since", "1h", "--operation", "shutdown"], ["shutdown", "shutdown"]),
+            (["--until", "2020-01-01"], []),
+            (["--operation", "by-hand"], []),
+        ],
+    )
+    def test_what_fits(
+        self, ask: Run, played: Any, filters: list[str], operations: list[str]
+    ) -> None:
+        assert [row["operation"] for row in ask("log", *filters)] == operations
+
+    def test_by_demand(self, ask: Run, played: Any) -> None:
+        rows = ask("log")
+        assert [row["commit"] for row in ask("log", "--demand", rows[0]["demand_ids"][0])] == [
+            row["commit"] for row in rows if row["demand_ids"] == rows[0]["demand_ids"]
+        ]
+
+    def test_a_node_that_only_a_claim_names(self, ask: Run, played: Any, request_json: Run) -> None:
+        """A further requester of what runs changes the ledger and no release."""
+        request_json(perception(id="first"))
+        before = played.tip
+        request_json(perception(id="second"))
+        assert git(played, "diff", "--name-only", before, "main", "--", "clusters") == ""
+        assert ask("log", "--node", "vehicle00", f"{before}..main")[0]["request_id"] == "second"
+
+    def test_no_time(self, demandops: Run, played: Any) -> None:
+        ran = demandops("log", "--since", "soon", "--state-repo", played.path)
+        assert ran.code == 2
+        assert "'soon' is no time; write it like 2026-01-31T14:03" in ran.err
+
+    def test_nothing_fits(self, demandops: Run, played: Any) -> None:
+        ran = demandops("log", "--requester", "nobody", "--state-repo", played.path)
+        assert (ran.code, ran.out) == (0, "no commit fits\n")
+
+
+class TestTimes:
+    def test_bookkeeping_at_a_time(self, ask: Run, played: Any) -> None:
+        """The state repo was laid down in January, all else happened just now."""
+        first = git(played, "rev-list", "--max-parents=0", "main")
+        assert ask("bookkeeping", "--at", "2026-01-31")["commit"] == first
+        assert ask("bookkeeping", "--at", "1d")["commit"] == first
+        assert ask("bookkeeping", "--at", "0s")["commit"] == played.tip
+
+    def test_before_the_first_commit(self, demandops: Run, played: Any) -> None:
+        ran = demandops("bookkeeping", "--at", "2020-01-01", "--state-repo", played.path)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err.startswith("error: at 2020-01-01 23:59:59 UTC there was no state repo yet; ")
+
+    def test_diff_by_time(self, ask: Run, played: Any) -> None:
+        found = ask("diff", "2026-01-31", "main")
+        started = {one["name"] for one in found["releases"]["started"]}
+        assert started == {path.rsplit("/", 1)[-1].removesuffix(".yaml")
+                           for path in played.manifests() if "/_" not in path}  # fmt: skip
+        assert found["releases"]["changed"] == found["releases"]["stopped"] == []
+
+
+class TestDiff:
+    def test_a_newer_image_changes_releases_and_no_books(
+        self, ask: Run, played: Any, request_json: Run
+    ) -> None:
+        images = played.files()["registry/images.yaml"].replace("2025-04", "2025-05")
+        played.commit({"registry/images.yaml": images})
+        request_json(goal([], [connection("another")]))
+        found = ask("diff", "main~2", "main~1")
+        assert found["services"] == {"added": {}, "removed": {}, "changed": {}}
+        details = {one["name"]: one["details"] for one in found["releases"]["changed"]}
+        assert any("2025-04" in line and line.startswith("- ") for line in details[FUSION])
+        assert any("2025-05" in line and line.startswith("+ ") for line in details[FUSION])
+
+    def test_a_release_that_moved(self, ask: Run, state: Any, request_json: Run) -> None:
+        def put(node: str) -> Any:
+            topic = {"topic": "/points", "source": "vehicle00"}
+            app = {"id": "a", "type": "object-detection-fusion", "node": node, "connect": "none",
+                   "inputs": {"point_cloud": [topic]}}  # fmt: skip
+            return {"apiVersion": "demandops/v1", "kind": "Demand", "demand": "d",
+                    "requesters": ["vehicle00"], "applications": [app]}  # fmt: skip
+
+        assert request_json(put("edge"), put("cloud")).code == 0
+        (moved,) = ask("diff", "main~1", "main")["releases"]["changed"]
+        assert moved["name"].startswith("of-a")
+        assert moved["file"].startswith("clusters/c-its/perception/cloud/")
+        assert any(
+            line.startswith("- clusters/c-its/perception/edge/") for line in moved["details"]
+        )
+
+
+class TestRollback:
+    def roll(self, demandops: Run, state: Any, *args: str) -> Any:
+        return demandops("rollback", *args, "--state-repo", state.path, "--output", "json")
+
+    def test_books_and_files_are_what_they_were(
+        self, demandops: Run, ask: Run, played: Any
+    ) -> None:
+        wanted = git(played, "rev-parse", "main~2:ledger", "main~2:clusters")
+        ran = self.roll(demandops, played, "main~2", "-m", "they left\nby mistake")
+        found = ran.json()
+        assert (ran.code, found["outcome"], found["commit"]) == (0, "restored", played.tip)
+        assert git(played, "rev-parse", "main:ledger", "main:clusters") == wanted
+        assert (found["dropped"], found["changed_back"]) == ([], [])
+        assert {tuple(one["requesters"]) for one in found["restored"]} == {
+            ("station00", "vehicle00"),
+            ("station00", "vehicle01"),
+        }
+        assert f"+ {DETECTION}" in git(played, "log", "-1", "--format=%b", "main")
+        form = "%(trailers:key=Operation,key=Restores,key=Reason,valueonly,separator=%x2C)"
+        said = git(played, "log", "-1", f"--format={form}", "main")
+        assert said == f"rollback,{found['to']},they left by mistake"
+        assert [row["commit"] for row in ask("log", "--operation", "rollback")] == [played.tip]
+        assert demandops("verify", "--state-repo", played.path).code == 0
+
+    def test_who_did_it_is_the_author(self, demandops: Run, played: Any) -> None:
+        config = played.path / "config"
+        config.write_text(
+            config.read_text() + "[user]\n\tname = Ada <A>\n\temail = ada@example.org\n"
+        )
+        assert self.roll(demandops, played, "main~1", "-m", "why not").code == 0
+        assert git(played, "log", "-1", "--format=%an|%ae", "main") == "Ada (A)|ada@example.org"
+
+    def test_what_was_booked_since_is_listed_and_stays(self, demandops: Run, played: Any) -> None:
+        before = played.tip
+        ran = self.roll(demandops, played, "main~4", "-m", "x")
+        found = ran.json()
+        assert (ran.code, found["outcome"], played.tip) == (1, "refused", before)
+        assert {error["file"] for error in found["errors"]} >= {
+            path for path, text in played.files("ledger/").items() if "- vehicle02" in text
+        }
+        dropping = self.roll(demandops, played, "main~4", "-m", "x", "--drop-newer").json()
+        assert {tuple(one["requesters"]) for one in dropping["dropped"]} == {
+            ("station00", "vehicle02"),
+            ("station00", "vehicle03"),
+        }
+
+    def test_a_dry_run_tells_the_same_and_changes_nothing(
+        self, demandops: Run, played: Any
+    ) -> None:
+        before = played.tip
+        dry = self.roll(demandops, played, "main~2", "--dry-run").json()
+        assert (played.tip, dry["commit"]) == (before, None)
+        done = self.roll(demandops, played, "main~2", "-m", "x").json()
+        assert {**done, "commit": None} == dry
+
+    def test_what_people_configured_since_stays(
+        self, demandops: Run, played: Any, request_json: Run
+    ) -> None:
+        images = played.files()["registry/images.yaml"].replace("2025-04", "2025-05")
+        played.commit({"registry/images.yaml": images})
+        ran = demandops("rollback", "main~3", "-m", "x", "--state-repo", played.path)
+        assert ran.code == 0
+        assert ran.out.splitlines()[-1] == "  registry/images.yaml"
+        assert played.files()["registry/images.yaml"] == images
+        assert "2025-05" in played.files()[PATH]
+        assert demandops("verify", "--state-repo", played.path).code == 0
+
+    def test_claims_that_are_not_possible_any_more(self, demandops: Run, played: Any) -> None:
+        nodes = played.files()["inventory/nodes.yaml"]
+        played.commit({"inventory/nodes.yaml": nodes.replace("id: vehicle00", "id: vehicle99")})
+        before = played.tip
+        ran = self.roll(demandops, played, "main~3", "-m", "x")
+        assert (ran.code, played.tip) == (1, before)
+        messages = {error["message"] for error in ran.json()["errors"]}
+        assert any(
+            text.startswith("'vehicle00' is not in inventory/nodes.yaml") for text in messages
+        )
+
+    def test_nothing_to_roll_back(self, demandops: Run, played: Any) -> None:
+        ran = demandops("rollback", "main", "-m", "x", "--state-repo", played.path)
+        assert ran.code == 0
+        assert ran.out.endswith("nothing to roll back\n")
+
+    def test_it_wants_a_reason(self, demandops: Run, played: Any) -> None:
+        ran = demandops("rollback", "main~1", "-m", "  ", "--state-repo", played.path)
+        assert ran.code == 2
+        assert "say why: -m REASON" in ran.err
+
+    def test_a_commit_that_is_not_of_this_history(self, demandops: Run, played: Any) -> None:
+        git(played, "config", "user.name", "x")
+        git(played, "config", "user.email", "x@example.org")
+        other = git(played, "commit-tree", "-m", "other", f"{played.tip}^{{tree}}")
+        ran = self.roll(demandops, played, other, "-m", "x")
+        assert ran.code == 1
+        assert ran.json()["errors"][0]["message"] == (
+            f"commit {other} is not in the history of the state repo; roll back to one that is"
+        )
+
+    def test_no_request_file_rolls_back(self, request_json: Run, played: Any) -> None:
+        before = played.tip
+        made = {"apiVersion": "demandops/v1", "kind": "Rollback", "to": before,
+                "dropNewer": True, "reason": "x", "by": ["x", "x"]}  # fmt: skip
+        ran = request_json(made)
+        assert (ran.code, played.tip) == (1, before)
+
+
+class TestVerifyByDifferences:
+    """A row of commits, proven from one to the next."""
+
+    FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 1\n"
+
+    def verdicts(self, demandops: Run, state: Any, *more: str) -> dict[str, Any]:
+        ran = demandops("verify", "main~4..main", *more, "--state-repo", state.path,
+                        "--output", "json")  # fmt: skip
+        rows = {row["commit"]: row for row in ran.json()}
+        assert ran.code == (0 if all(row["holds"] for row in rows.values()) else 1)
+        return rows
+
+    def surrounded(self, state: Any, request_json: Run, changed: Callable[[], str]) -> str:
+        """Make a commit in the middle of others, and return it."""
+        request_json(goal([], [connection("before-1")]), goal([], [connection("before-2")]))
+        made = changed()
+        request_json(goal([], [connection("after")]))
+        return made
+
+    @pytest.mark.parametrize("more", [(), ("--whole",)])
+    def test_a_file_that_should_not_have_been_touched(
+        self, demandops: Run, played: Any, request_json: Run, more: tuple[str, ...]
+    ) -> None:
+        path = f"clusters/c-its/perception/edge/{FUSION}.yaml"
+        changed = {path: played.files()[path] + "# changed\n"}
+        made = self.surrounded(played, request_json, lambda: played.commit(changed, self.FORGED))
+        rows = self.verdicts(demandops, played, *more)
+        assert rows[made]["differing"] == [path]
+        assert next(row["commit"] for row in rows.values() if not row["holds"]) == made
+
+    @pytest.mark.parametrize("more", [(), ("--whole",)])
+    def test_a_file_that_should_have_been_touched(
+        self, demandops: Run, played: Any, request_json: Run, more: tuple[str, ...]
+    ) -> None:
+        """A claim goes, and what it asked for stays."""
+        path = next(p for p, t in played.files("ledger/connections/").items() if "vehicle02/" in t)
+        text = self.FORGED.replace("none", read(played.files()[path], path).demand)
+        made = self.surrounded(played, request_json, lambda: played.commit({path: None}, text))
+        rows = self.verdicts(demandops, played, *more)
+        assert len(rows[made]["differing"]) == 2
+        assert all("vehicle02" in left for left in rows[made]["differing"])
+        assert not rows[made]["touched"]
+
+    @pytest.mark.parametrize(
+        "path", ["policy/access-domains.yaml", "ledger/connections/00/x-0/y-0.yaml", "overrides/a"]
+    )
+    def test_what_is_not_the_generators_to_write(
+        self, demandops: Run, played: Any, request_json: Run, path: str
+    ) -> None:
+        text = played.files().get(path, "# nothing\n") + "# more\n"
+        made = self.surrounded(
+            played, request_json, lambda: played.commit({path: text}, self.FORGED)
+        )
+        row = self.verdicts(demandops, played)[made]
+        assert (row["holds"], row["touched"]) == (False, [path])
+
+    def test_a_claim_that_is_not_written_as_it_should_be(
+        self, demandops: Run, played: Any, request_json: Run
+    ) -> None:
+        path = next(iter(played.files("ledger/connections/")))
+        text = played.files()[path]
+        message = self.FORGED.replace("none", read(text, path).demand)
+        made = self.surrounded(
+            played, request_json, lambda: played.commit({path: text + "# a note\n"}, message)
+        )
+        assert self.verdicts(demandops, played)[made]["touched"] == [path]
+
+    def test_both_ways_say_the_same_of_changed_configuration(
+        self, demandops: Run, played: Any, request_json: Run
+    ) -> None:
+        images = played.files()["registry/images.yaml"].replace("2025-04", "2025-05")
+        self.surrounded(
+            played, request_json, lambda: played.commit({"registry/images.yaml": images})
+        )
+        rows = self.verdicts(demandops, played)
+        assert rows == self.verdicts(demandops, played, "--whole")
+        assert all(row["holds"] for row in rows.values())

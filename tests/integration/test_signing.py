@@ -1,0 +1,309 @@
+"""Commits signed by an SSH key, as the real git checks them, and what `verify` says of them."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import stat
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from asking import connection, goal
+
+from generator.staterepo.signing import Signer, SigningFailed
+
+Run = Callable[..., Any]
+
+SIGNERS = "policy/allowed-signers"
+
+
+def keygen(path: Path, passphrase: str = "", kind: str = "ed25519") -> Path:
+    command = ["ssh-keygen", "-q", "-t", kind, "-N", passphrase, "-C", "", "-f", str(path)]
+    subprocess.run(command, check=True)
+    return path
+
+
+def listed(*keys: Path) -> str:
+    public = [Path(f"{key}.pub").read_text().strip() for key in keys]
+    return "".join(f'generator@example.org namespaces="git" {key}\n' for key in public)
+
+
+@pytest.fixture
+def key(tmp_path: Path) -> Path:
+    return keygen(tmp_path / "key")
+
+
+@pytest.fixture
+def book(demandops: Run, state: Any) -> Run:
+    """Return a function that books a connection by ``demandops request``."""
+    import yaml
+
+    def call(id: str, *more: str | Path) -> Any:
+        made = yaml.safe_dump(goal([], [connection(id)]))
+        return demandops("request", "-", "--state-repo", state.path, *more, stdin=made)
+
+    return call
+
+
+@pytest.fixture
+def agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An agent of our own, which holds nothing yet."""
+    said = subprocess.run(
+        ["ssh-agent", "-a", str(tmp_path / "agent")], check=True, capture_output=True, text=True
+    ).stdout
+    pid = re.search(r"SSH_AGENT_PID=(\d+)", said)
+    assert pid
+    monkeypatch.setenv("SSH_AUTH_SOCK", str(tmp_path / "agent"))
+    yield
+    os.kill(int(pid[1]), 15)
+
+
+def git_says(state: Any, allowed: str, tmp_path: Path) -> subprocess.CompletedProcess[str]:
+    file = tmp_path / "allowed"
+    file.write_text(allowed)
+    config = ["-c", "gpg.format=ssh", "-c", f"gpg.ssh.allowedSignersFile={file}"]
+    return subprocess.run(
+        ["git", "-C", str(state.path), *config, "verify-commit", "main"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_git_accepts_the_signature(book: Run, state: Any, key: Path, tmp_path: Path) -> None:
+    assert book("a", "--signing-key", key).code == 0
+    said = git_says(state, listed(key), tmp_path)
+    assert said.returncode == 0
+    assert said.stderr.startswith('Good "git" signature for generator@example.org with ED25519 key')
+    assert git_says(state, listed(keygen(tmp_path / "other")), tmp_path).returncode != 0
+    fsck = subprocess.run(["git", "-C", str(state.path), "fsck", "--strict"], check=False)
+    assert fsck.returncode == 0
+
+
+@pytest.mark.parametrize("kind", ["rsa", "ecdsa"])
+def test_other_kinds_of_keys(book: Run, state: Any, tmp_path: Path, kind: str) -> None:
+    key = keygen(tmp_path / "key", kind=kind)
+    assert book("a", "--signing-key", key).code == 0
+    assert git_says(state, listed(key), tmp_path).returncode == 0
+
+
+def test_ids_of_any_alphabet(book: Run, state: Any, key: Path, tmp_path: Path) -> None:
+    assert book("Straße/北京", "--signing-key", key).code == 0
+    assert git_says(state, listed(key), tmp_path).returncode == 0
+
+
+def test_a_key_that_an_agent_holds(book: Run, state: Any, agent: None, tmp_path: Path) -> None:
+    key = keygen(tmp_path / "key")
+    subprocess.run(["ssh-add", "-q", str(key)], check=True)
+    key.unlink()
+    assert book("a", "--signing-key", f"{key}.pub").code == 0
+    assert git_says(state, listed(key), tmp_path).returncode == 0
+
+
+def test_by_the_environment(
+    book: Run, state: Any, key: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEMANDOPS_SIGNING_KEY", str(key))
+    assert book("a").code == 0
+    assert git_says(state, listed(key), tmp_path).returncode == 0
+
+
+def test_init_and_rollback_sign_too(
+    demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path
+) -> None:
+    shutil.rmtree(state.path)
+    made = demandops("init", state.path, "--bare", "--signing-key", key)
+    assert made.code == 0
+    assert git_says(state, listed(key), tmp_path).returncode == 0
+    assert book("a").code == 0
+    where = ("--state-repo", state.path, "--signing-key", key)
+    assert demandops("rollback", "main~1", "-m", "x", "--drop-newer", *where).code == 0
+    assert git_says(state, listed(key), tmp_path).returncode == 0
+
+
+def test_what_people_changed_is_carried_out_by_a_signed_commit(
+    book: Run, state: Any, key: Path, tmp_path: Path
+) -> None:
+    assert book("a").code == 0
+    path = next(iter(state.files("ledger/connections/")))
+    state.commit({path: None})
+    assert book("b", "--signing-key", key).code == 0
+    heads = [
+        subprocess.run(
+            ["git", "-C", str(state.path), "cat-file", "commit", commit],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.split("\n\n")[0]
+        for commit in ("main~1", "main~2")
+    ]
+    assert ["\ngpgsig " in head for head in heads] == [True, False]
+
+
+class TestKeysThatCannotSign:
+    """Told at the start, before anything is booked."""
+
+    def told(self, book: Run, state: Any, key: Path | str) -> str:
+        before = state.tip
+        ran = book("a", "--signing-key", key)
+        assert (ran.code, ran.out, state.tip) == (1, "", before)
+        assert "PRIVATE KEY-----" not in ran.err
+        return str(ran.err)
+
+    def test_none(self, book: Run, state: Any, tmp_path: Path) -> None:
+        key = tmp_path / "nothing"
+        assert self.told(book, state, key) == (
+            f"error: signing key {key} is no file; make one with `ssh-keygen -t ed25519 -f {key}`, "
+            "or name the one you have\n"
+        )
+
+    def test_a_passphrase(self, book: Run, state: Any, tmp_path: Path) -> None:
+        key = keygen(tmp_path / "key", "a passphrase")
+        assert self.told(book, state, key) == (
+            f"error: signing key {key} has a passphrase; run `ssh-add {key}` and name {key}.pub, "
+            "so that the agent signs\n"
+        )
+
+    def test_readable_by_others(self, book: Run, state: Any, key: Path) -> None:
+        key.chmod(0o644)
+        assert self.told(book, state, key) == (
+            f"error: signing key {key} can be read by others; run: chmod 600 {key}\n"
+        )
+
+    def test_no_key(self, book: Run, state: Any, tmp_path: Path) -> None:
+        key = tmp_path / "key"
+        key.write_text("hello\n")
+        key.chmod(stat.S_IRUSR)
+        assert self.told(book, state, key).startswith(f"error: signing key {key} does not sign: ")
+
+    def test_an_agent_that_does_not_hold_it(
+        self, book: Run, state: Any, agent: None, tmp_path: Path
+    ) -> None:
+        key = keygen(tmp_path / "key")
+        key.unlink()
+        assert self.told(book, state, f"{key}.pub").startswith(
+            f"error: signing key {key}.pub is public, and no agent signs for it ("
+        )
+
+    def test_no_agent(
+        self, book: Run, state: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.delenv("SSH_AUTH_SOCK", raising=False)
+        key = keygen(tmp_path / "key")
+        key.unlink()
+        assert "no agent signs for it" in self.told(book, state, f"{key}.pub")
+
+
+def test_a_key_that_is_gone_later_is_told_to_the_requester(
+    state: Any, key: Path, tmp_path: Path, data_home: Path
+) -> None:
+    from generator.service import Generator
+
+    generator = Generator(str(state.path), signing_key=key)
+    try:
+        generator.submit(goal([], [connection("a")])).future.result(30)
+        before, hidden = state.tip, key.rename(tmp_path / "hidden")
+        with pytest.raises(SigningFailed):
+            generator.submit(goal([], [connection("b")])).future.result(30)
+        assert state.tip == before
+        hidden.rename(key)
+        generator.submit(goal([], [connection("c")])).future.result(30)
+    finally:
+        assert generator.close()
+
+
+def test_ssh_keygen_is_missing(key: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SigningFailed, match="ssh-keygen is missing"):
+        Signer(key)
+
+
+class TestVerify:
+    def rows(self, demandops: Run, state: Any, since: str, code: int) -> list[dict[str, Any]]:
+        where = ("--state-repo", state.path, "--output", "json")
+        ran = demandops("verify", f"{since}..main", *where)
+        assert ran.code == code
+        return list(ran.json())
+
+    def test_without_a_list_it_only_counts(
+        self, demandops: Run, book: Run, state: Any, key: Path
+    ) -> None:
+        first = state.tip
+        book("a", "--signing-key", key)
+        book("b")
+        ran = demandops("verify", f"{first}..main", "--state-repo", state.path)
+        assert ran.code == 0
+        assert ran.out.splitlines()[-2:] == ["2 of 2 commits hold", "1 of 2 are signed"]
+
+    def test_with_a_list_every_later_commit_must_be_signed(
+        self, demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path
+    ) -> None:
+        first = state.tip
+        book("before")
+        state.commit({SIGNERS: listed(key)}, "Only signed commits\n")
+        book("good", "--signing-key", key)
+        good = state.tip
+        assert self.rows(demandops, state, first, 0)[-1]["signer"] == "generator@example.org"
+        book("unsigned")
+        unsigned = state.tip
+        book("another", "--signing-key", keygen(tmp_path / "another"))
+        ran = demandops("verify", f"{first}..main", "--state-repo", state.path)
+        assert ran.code == 1
+        assert f"{unsigned[:10]} UNSIGNED  Join unsigned" in ran.out.splitlines()
+        rows = {row["commit"]: row for row in self.rows(demandops, state, first, 1)}
+        assert rows[good]["holds"]
+        assert rows[unsigned]["signature"] == (
+            "is not signed, and policy/allowed-signers asks for it"
+        )
+        assert rows[state.tip]["signature"] == (
+            "is signed, but not by a key that policy/allowed-signers lists"
+        )
+        assert [row["holds"] for row in rows.values()] == [True, True, True, False, False]
+
+    def test_a_commit_cannot_vouch_for_itself(
+        self, demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path
+    ) -> None:
+        state.commit({SIGNERS: listed(key)})
+        since = state.tip
+        forged = "Forged\n\nOperation: join\nRender-Version: 1\n"
+        state.commit({SIGNERS: listed(keygen(tmp_path / "forger"))}, forged)
+        (row,) = self.rows(demandops, state, since, 1)
+        assert row["touched"] == [SIGNERS]
+        assert row["signature"] == "is not signed, and policy/allowed-signers asks for it"
+
+    def test_a_signature_of_another_commit(
+        self, demandops: Run, book: Run, state: Any, key: Path
+    ) -> None:
+        import pygit2
+
+        state.commit({SIGNERS: listed(key)})
+        since = state.tip
+        book("a", "--signing-key", key)
+        repo = pygit2.Repository(str(state.path))
+        signed = repo[state.tip].peel(pygit2.Commit)
+        signature, content = signed.gpg_signature
+        assert signature and content
+        text = content.decode().replace("in the name of vehicle00", "in the name of vehicle01")
+        assert text != content.decode()
+        made = repo.create_commit_with_signature(text, signature.decode(), "gpgsig")
+        repo.references["refs/heads/main"].set_target(made)
+        (row,) = self.rows(demandops, state, since, 1)
+        assert row["signature"] == "has a signature that is not of this commit"
+
+    def test_keys_may_change(
+        self, demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path
+    ) -> None:
+        """Each commit is held to the list that was there before it."""
+        new = keygen(tmp_path / "new")
+        since = state.tip
+        state.commit({SIGNERS: listed(key)})
+        book("a", "--signing-key", key)
+        state.commit({SIGNERS: listed(new)})
+        book("b", "--signing-key", new)
+        assert all(row["holds"] for row in self.rows(demandops, state, since, 0))
+        book("c", "--signing-key", key)
+        assert not self.rows(demandops, state, since, 1)[-1]["holds"]

@@ -1,0 +1,83 @@
+"""Plans brought forward are the plans made afresh, whatever is booked in whatever order."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from inmemory import Repo
+from model.goals import Maker
+from trying import TIMES, chances, examples, told
+
+from generator.catalog.catalog import Catalog
+from generator.decision import Decision
+from generator.ledger.ledger import ClaimChange, Ledger
+from generator.plan.planner import ReleaseKey, all_keys, plan
+from generator.plan.release import Release
+from generator.plan.traced import TracedPlan
+
+
+def afresh(ledger: Ledger, catalog: Catalog) -> dict[ReleaseKey, Release]:
+    plans = {key: plan(ledger, catalog, key) for key in all_keys(ledger, catalog)}
+    return {key: release for key, release in plans.items() if release}
+
+
+class Following:
+    """What somebody holds who hears only of changes."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        self._plan = TracedPlan(catalog)
+        self.releases: dict[ReleaseKey, Release] = {}
+
+    def take(self, ledger: Ledger, changes: tuple[ClaimChange, ...]) -> int:
+        found = self._plan.advance(ledger, changes)
+        for key, release in found.items():
+            self.releases.pop(key, None)
+            if release is not None:
+                self.releases[key] = release
+        return len(found)
+
+
+@examples(60)
+@given(chances, st.integers(1, 14))
+def test_what_is_brought_forward_is_what_is_made_afresh(random: Random, length: int) -> None:
+    repo = Repo()
+    following = Following(repo.state.catalog)
+    for request in told(Maker(random).sequence(length)):
+        taken = repo.take(request)
+        if isinstance(taken, Decision):
+            following.take(repo.state.ledger, taken.changes.claims)
+            assert following.releases == afresh(repo.state.ledger, repo.state.catalog)
+
+
+@pytest.mark.parametrize("seed", range(2 * TIMES))
+def test_several_changes_at_once(seed: int) -> None:
+    repo, random = Repo(), Random(seed)
+    following = Following(repo.state.catalog)
+    changes: list[ClaimChange] = []
+    for request in Maker(random).sequence(80):
+        taken = repo.take(request)
+        if isinstance(taken, Decision):
+            changes += taken.changes.claims
+        if random.random() < 0.2:
+            following.take(repo.state.ledger, tuple(changes))
+            changes.clear()
+            assert following.releases == afresh(repo.state.ledger, repo.state.catalog)
+
+
+def test_what_reads_nothing_that_changed_is_left_alone() -> None:
+    repo = Repo()
+    maker = Maker(Random(1), calm=True)
+    following = Following(repo.state.catalog)
+    for request in maker.sequence(20):
+        repo.take(request)
+    ledger = repo.state.ledger
+    everything = following.take(ledger, ())
+    assert everything == len(all_keys(ledger, repo.state.catalog)) > 4
+    claim = next(claim for claim in ledger if claim.subject.kind.value == "connections")
+    without = ledger.replace(claim.key, None)
+    assert 0 < following.take(without, (ClaimChange(claim, None),)) < everything
+    assert following.releases == afresh(without, repo.state.catalog)
+    assert following.take(without, ()) == 0
