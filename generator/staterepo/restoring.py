@@ -5,7 +5,7 @@ from __future__ import annotations
 import getpass
 from datetime import datetime, timezone
 
-from pygit2 import Oid, Repository
+from pygit2 import Config, Oid, Repository
 
 from generator.catalog.catalog import CONFIG_ROOTS
 from generator.demand.claim import Claim
@@ -66,6 +66,12 @@ def person(repo: Repository) -> tuple[str, str]:
         login = getpass.getuser()
     except (KeyError, OSError):  # a container's user without an entry
         login = "unknown"
-    known = {key: config[key] for key in ("user.name", "user.email") if key in config}
-    email = known.get("user.email", f"{login}@demandops.invalid")
-    return known.get("user.name", login), email
+    name = _configured(config, "user.name") or login
+    return name, _configured(config, "user.email") or f"{login}@demandops.invalid"
+
+
+def _configured(config: Config, key: str) -> str:
+    try:
+        return config[key]
+    except KeyError:
+        return ""

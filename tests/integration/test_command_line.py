@@ -516,7 +516,7 @@ class TestDiff:
             "    + ego_data /ego",
             "    + requester vehicle01",
             "+ connection vehicle01/edge for vehicle01",
-            f"+ release {SOURCE_END} (MQTT source of connection vehicle01/edge on vehicle01)",
+            f"+ release {SOURCE_END} (MQTT source of connection vehicle01/edge on vehicle00)",
             f"+ release {TARGET_END} (MQTT target of connection vehicle01/edge on edge)",
             f"~ release {FUSION} (object-fusion on edge for {APP})",
             "    + ego_data /ego",

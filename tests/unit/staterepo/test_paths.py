@@ -1,0 +1,104 @@
+"""The history of a path is what git says it is, in histories of any shape."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from random import Random
+
+import pygit2
+import pytest
+
+from generator.staterepo import paths
+from generator.staterepo import tree as trees
+
+PATH = "clusters/c/d/n/r.yaml"
+
+
+class History:
+    """Commits on top of each other, some of them merges, a minute apart."""
+
+    def __init__(self, folder: Path) -> None:
+        self.repo = pygit2.init_repository(str(folder), bare=True, initial_head="main")
+        self.made: list[pygit2.Oid] = []
+
+    def commit(self, text: str | None, *parents: int) -> pygit2.Oid:
+        """Commit with ``text`` at the path, or nothing there, on top of commits by number."""
+        number = len(self.made)
+        who = pygit2.Signature("a", "a@example.org", 1_770_000_000 + 60 * number, 0)
+        files = {"other": str(number)} | ({PATH: text} if text is not None else {})
+        tree = trees.write(self.repo, None, files)
+        above = [self.made[parent] for parent in parents]
+        made = self.repo.create_commit(None, who, who, f"{number}\n", tree, above)
+        self.made.append(made)
+        return made
+
+    def git(self, path: str) -> set[str]:
+        command = [
+            "git",
+            "-C",
+            self.repo.path,
+            "log",
+            "--format=%H",
+            str(self.made[-1]),
+            "--",
+            path,
+        ]
+        said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        return set(said.split())
+
+    def ours(self, path: str) -> list[str]:
+        return [t.entry.commit for t in paths.touching(self.repo, self.made[-1], path)]
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_the_same_commits_as_git_log(tmp_path: Path, seed: int) -> None:
+    random = Random(seed)
+    history = History(tmp_path / "r.git")
+    history.commit(None)
+    for number in range(1, 40):
+        parents = {number - 1, random.randrange(number)} if random.random() < 0.3 else {number - 1}
+        parents = {random.randrange(number)} if random.random() < 0.1 else parents
+        chosen = sorted(parents, reverse=random.random() < 0.5)
+        tip = history.repo[history.made[chosen[0]]].peel(pygit2.Commit)
+        text = trees.read_text(tip.tree, PATH)
+        if random.random() < 0.3:
+            text = random.choice([None, "a", "b", "c"])
+        history.commit(text, *chosen)
+    for path in (PATH, "clusters/c", "nothing"):
+        ours = history.ours(path)
+        assert set(ours) == history.git(path)
+        assert len(ours) == len(set(ours))
+
+
+def test_the_last_time_that_something_stood_there(tmp_path: Path) -> None:
+    history = History(tmp_path / "r.git")
+    history.commit("a")
+    history.commit(None, 0)
+    started = history.commit("b", 1)
+    first = history.commit("c", 2)
+    second = history.commit("d", 3)
+    tip = history.commit("d", 4)
+    found = paths.of_path(history.repo, tip, PATH, 1)
+    assert found.started and found.started.commit == str(started)
+    assert ([one.commit for one in found.newest], found.more) == ([str(second)], 1)
+    assert found.stopped is None
+    stopped = history.commit(None, 5)
+    gone = paths.of_path(history.repo, stopped, PATH, 9)
+    assert gone.stopped and gone.stopped.commit == str(stopped)
+    assert [one.commit for one in gone.newest] == [str(second), str(first)]
+    assert gone.started == found.started
+    never = paths.of_path(history.repo, stopped, "nothing/there", 9)
+    assert never == paths.PathHistory(None, (), 0, None)
+
+
+def test_where_a_release_is_or_once_was(tmp_path: Path) -> None:
+    history = History(tmp_path / "r.git")
+    there = history.commit("a")
+    gone = history.commit(None, 0)
+    assert paths.called(history.repo, there, "r") == PATH
+    assert paths.called(history.repo, gone, "r") is None
+    assert paths.once_called(history.repo, gone, "r") == PATH
+    assert paths.once_called(history.repo, gone, "q") is None
+    assert paths.once_called(history.repo, gone, "*") is None
+    assert paths.ever_stopped(history.repo, gone) == {"r"}
