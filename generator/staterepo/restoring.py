@@ -72,6 +72,6 @@ def person(repo: Repository) -> tuple[str, str]:
 
 def _configured(config: Config, key: str) -> str:
     try:
-        return config[key]
+        return config[key] or ""
     except KeyError:
         return ""
