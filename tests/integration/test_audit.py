@@ -179,6 +179,30 @@ class TestWhy:
         gone = ask("why", path)
         assert (gone["runs"], gone["stopped"]["author"]) == (False, "A person")
 
+    @pytest.mark.parametrize("case", ["zenoh", "ros"])
+    def test_every_release_of_other_carriers(
+        self, demandops: Run, ask: Run, state: Any, case: str
+    ) -> None:
+        folder = Path(__file__).parents[1] / "golden" / case
+        overlay = folder / "state-repo"
+        state.commit(
+            {
+                file.relative_to(overlay).as_posix(): file.read_text()
+                for file in overlay.rglob("*")
+                if file.is_file()
+            }
+        )
+        first = sorted((folder / "requests").iterdir())[0]
+        assert demandops("request", first, "--state-repo", state.path).code == 0
+        clients = [path for path in state.manifests() if "/_" not in path]
+        assert clients
+        for path in clients:
+            found = ask("why", path.rsplit("/", 1)[-1].removesuffix(".yaml"))
+            assert (found["runs"], found["file"]) == (True, path)
+            assert found["claims"]
+            assert {claim["file"] for claim in found["claims"]} <= set(state.files("ledger/"))
+            assert found["started"]["operation"] == "join"
+
     def test_what_a_person_changed_is_named(self, ask: Run, played: Any, request_json: Run) -> None:
         images = played.files()["registry/images.yaml"].replace("2025-04", "2025-05")
         by_hand = played.commit({"registry/images.yaml": images}, "Newer images\n")
