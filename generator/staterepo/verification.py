@@ -9,14 +9,14 @@ in Git is compared. The first and the last commit of a row are proven whole.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 
 from generator.catalog.catalog import CONFIG_ROOTS
-from generator.decision import State
+from generator.decision import State, rendered
 from generator.demand.claim import Claim
 from generator.errors import InvalidInput
 from generator.ledger import format as ledger_format
@@ -81,12 +81,7 @@ class _Proof:
 
     def differing(self) -> tuple[str, ...]:
         """Return the files that are not what they should be."""
-        wanted = self.steady | dict(self.planned.values())
-        return tuple(
-            path
-            for path in sorted({*wanted, *self.standing})
-            if wanted.get(path) != self.standing.get(path) and not trees.is_note(path)
-        )
+        return _differing(self.steady | dict(self.planned.values()), self.standing)
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
@@ -95,41 +90,77 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
     Args:
         whole: whether to load and render every commit from nothing.
     """
-    proof: _Proof | None = None
-    for place, revision in enumerate(commits):
+    row = _Row(repo)
+    for place, revision in enumerate(commits, 1):
         commit = snapshots.commit_of(repo, revision)
         entry = entry_of(commit)
         verdict = Verdict(entry.commit, entry.summary, True, _why_not(entry))
         if verdict.skipped:
             yield verdict
             continue
-        in_force = entry.one("In-Force")
-        afresh = whole or bool(in_force) or place in (0, len(commits) - 1)
         touched = _not_its_own(repo, commit, entry)
-        verdict = replace(verdict, touched=touched, holds=not touched)
-        changes, snapshot = list[ClaimChange](), None
+        alone = whole or place == len(commits) or bool(entry.one("In-Force"))
         try:
-            if afresh or proof is None or _reconfigured(proof, commit):
-                snapshot = _in_force_at(repo, commit, in_force)
-            else:
-                changes = _claims_changed(repo, proof, commit)
-        except InvalidInput as error:
-            proof = None
-            yield replace(verdict, skipped=f"a person's file was not valid then: {error.faults[0]}")
-            continue
-        try:
-            if snapshot is not None:
-                proof = _from_nothing(snapshot, commit)
-            elif proof is not None:
-                _bring_forward(repo, proof, commit, changes)
+            differing = row.differing(commit, entry, alone=alone)
+        except _Unreadable as error:
+            why = f"a person's file was not valid then: {error}"
+            yield replace(verdict, skipped=why, touched=touched, holds=not touched)
         except InvalidInput as error:  # the generator did render it then, so it must now
-            proof = None
-            yield replace(verdict, holds=False, fault=str(error.faults[0]))
-            continue
-        differing = proof.differing() if proof else ()
-        yield replace(verdict, holds=not (differing or touched), differing=differing)
-        if in_force:  # whose configuration is not that of its tree
-            proof = None
+            yield replace(verdict, holds=False, fault=str(error.faults[0]), touched=touched)
+        else:
+            holds = not (differing or touched)
+            yield replace(verdict, holds=holds, differing=differing, touched=touched)
+
+
+class _Unreadable(Exception):
+    """A commit that cannot be judged, for a file of people in it is not valid."""
+
+
+class _Row:
+    """Commits that are proven one after the other."""
+
+    def __init__(self, repo: Repository) -> None:
+        self._repo = repo
+        self._proof: _Proof | None = None
+
+    def differing(self, commit: Commit, entry: LogEntry, *, alone: bool) -> tuple[str, ...]:
+        """Return the files of a commit that are not what they should be.
+
+        Args:
+            alone: whether nothing that is known of another commit may serve.
+
+        Raises:
+            _Unreadable, InvalidInput: where it cannot be read, or not be rendered.
+        """
+        proof, self._proof = self._proof, None
+        if alone:
+            state = self._loaded(commit, entry)
+            wanted = {path: _blob(text) for path, text in rendered(state).items()}
+            return _differing(wanted, dict(_standing(commit.tree)))
+        if proof is None or _reconfigured(proof, commit):
+            proof = _from_nothing(self._loaded(commit, entry), commit)
+        else:
+            try:
+                changes = _claims_changed(self._repo, proof, commit)
+            except InvalidInput as error:
+                raise _Unreadable(error.faults[0]) from None
+            _bring_forward(self._repo, proof, commit, changes)
+        self._proof = proof  # of one that could not be judged nothing serves the next
+        return proof.differing()
+
+    def _loaded(self, commit: Commit, entry: LogEntry) -> State:
+        try:
+            return _in_force_at(self._repo, commit, entry.one("In-Force")).state
+        except InvalidInput as error:
+            raise _Unreadable(error.faults[0]) from None
+
+
+def _differing(wanted: Mapping[str, Oid], standing: Mapping[str, Oid]) -> tuple[str, ...]:
+    return tuple(
+        path
+        for path in sorted({*wanted, *standing})
+        if wanted.get(path) != standing.get(path) and not trees.is_note(path)
+    )
 
 
 def _why_not(entry: LogEntry) -> str:
@@ -178,9 +209,8 @@ def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[Cla
     return changes
 
 
-def _from_nothing(snapshot: Snapshot, commit: Commit) -> _Proof:
-    """Render a commit whole."""
-    state = snapshot.state
+def _from_nothing(state: State, commit: Commit) -> _Proof:
+    """Render a commit whole, so that the next can be proven by what differs."""
     steady = gitops.standing_files(state.catalog, state.engine)
     proof = _Proof(
         tree=commit.tree,
