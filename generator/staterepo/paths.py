@@ -96,24 +96,25 @@ def once_called(repo: Repository, tip: str | Oid, name: str) -> str | None:
     """Return the path of a release that was stopped, the last one of that name, or nothing."""
     if not _NAME.fullmatch(name):
         return None
-    commit = str(commit_of(repo, tip).id)
-    with git.Repo(repo.path) as opened:
-        said = opened.git.log(
-            *("-1", "--diff-filter=D", "--format=", "--name-only", "-z", "--no-renames", commit),
-            *("--", f":(glob){CLUSTERS_ROOT}/*/*/*/{name}.yaml"),
-        )
-    return next((path for path in said.split("\0") if path.endswith(f"/{name}.yaml")), None)
+    return next(iter(_removed(repo, tip, f"{name}.yaml", "-1")), None)
 
 
 def ever_stopped(repo: Repository, tip: str | Oid) -> set[str]:
     """Return the names of all releases that were stopped at some time; reads all of history."""
+    removed = _removed(repo, tip, "*.yaml")
+    return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
+
+
+def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[str]:
+    """Return the paths of releases that commits removed, newest first."""
     commit = str(commit_of(repo, tip).id)
     with git.Repo(repo.path) as opened:
         said = opened.git.log(
-            *("--diff-filter=D", "--format=", "--name-only", "-z", "--no-renames", commit),
-            *("--", f":(glob){CLUSTERS_ROOT}/*/*/*/*.yaml"),
+            *("--no-show-signature", "--diff-filter=D", "--no-renames", *more),
+            *("--format=", "--name-only", "-z", commit),
+            *("--", f":(glob){CLUSTERS_ROOT}/*/*/*/{file}"),
         )
-    return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in said.split("\0") if path}
+    return [path for path in said.split("\0") if path]
 
 
 def called(repo: Repository, tip: str | Oid, name: str) -> str | None:

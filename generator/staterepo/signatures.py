@@ -76,7 +76,13 @@ def _asked(repo: Repository, allowed: str, commits: list[str]) -> dict[str, tupl
                 [
                     *(opened.git.GIT_PYTHON_GIT_EXECUTABLE, *_CONFIG),
                     *("-c", f"gpg.ssh.allowedSignersFile={file}"),
-                    *("log", "--no-walk=unsorted", "--stdin", "--format=%H %G? %GS"),
+                    *(
+                        "log",
+                        "--no-show-signature",
+                        "--no-walk=unsorted",
+                        "--stdin",
+                        "--format=%H %G? %GS",
+                    ),
                 ],
                 istream=lines,
             )
