@@ -190,7 +190,8 @@ def test_bookkeeping_is_answered_over_ros(serve: Serve, client: Client) -> None:
     unknown = ask("nonsense")
     assert not unknown.ok
     assert unknown.message == (
-        "'nonsense' is no commit of the state repo; `demandops log` lists them"
+        "'nonsense' is neither a commit of the state repo nor a time; `demandops log` lists the "
+        "commits, a time is written like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
     )
 
 
