@@ -31,7 +31,7 @@ def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
     found = _read(data_folder("skeleton"), "")
     found |= _read(data_folder("appdefs"), "appdefs/")
     roots = {"flux": found.pop(ROOT_FILE), "argocd": found.pop("demandops.argocd.yaml")}
-    root = roots[gitops]
+    root = yamlio.edited(roots[gitops], "renderVersion", RENDER_VERSION)
     if url:
         root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {yamlio.scalar(url)}", root)
     found[ROOT_FILE] = root

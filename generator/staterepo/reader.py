@@ -20,6 +20,7 @@ from generator.staterepo import tree as trees
 from generator.staterepo.address import is_url
 from generator.staterepo.history import LogEntry
 from generator.staterepo.outbox import Slot
+from generator.staterepo.repository import StateRepository
 from generator.staterepo.snapshot import Progress, Snapshot
 
 
@@ -60,6 +61,20 @@ class Reader:
         """Give the clone back."""
         if self._slot is not None:
             self._slot.close()
+
+    @property
+    def repository(self) -> StateRepository:
+        """The state repo itself, for a command that writes to it."""
+        return self._repository
+
+    def refuse_other_rendering(self) -> None:
+        """Raise where a generator of another version writes this repo, as a generator does.
+
+        Raises:
+            StateRepoError: saying which version it is and what to do.
+        """
+        tip = snapshots.commit_of(self._repository.objects, self._tip)
+        snapshots.refuse_other_rendering(tip.tree)
 
     def commit(self, revision: str | None = None) -> str:
         """Return the id of a commit; the newest where no revision is given."""

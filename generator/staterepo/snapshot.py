@@ -127,22 +127,26 @@ def load_last_valid(
     return Snapshot(commit.id, State.of(catalog, ledger), keys, tuple(problems), sound)
 
 
-def refuse_newer(tree: Tree) -> None:
-    """Raise where a newer generator writes the repo: two versions would undo each other's files.
+def refuse_other_rendering(tree: Tree) -> None:
+    """Raise where a generator of another version writes the repo: two would undo each other's work.
 
     Raises:
-        StateRepoError: saying which version it is.
+        StateRepoError: saying which version it is and what to do.
     """
     try:
         data = yamlio.load(trees.read_text(tree, ROOT_FILE) or "")
     except InvalidInput:
         return
     version = data.get("renderVersion") if isinstance(data, dict) else None
-    if isinstance(version, int) and version > RENDER_VERSION:
-        raise StateRepoError(
-            f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
-            f"{RENDER_VERSION}; update the generator"
-        )
+    if not isinstance(version, int) or version == RENDER_VERSION:
+        return
+    remedy = "update the generator"
+    if version < RENDER_VERSION:
+        remedy = "stop older generators, then have all rendered anew by `demandops upgrade`"
+    raise StateRepoError(
+        f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
+        f"{RENDER_VERSION}; {remedy}"
+    )
 
 
 def _last_valid_catalog(repo: Repository, commit: Commit, fault: InvalidInput) -> Catalog:
@@ -240,7 +244,7 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     What is not valid there is left as it was before, and told in the new snapshot's problems.
     """
     before, after = commit_of(repo, snapshot.commit).tree, commit_of(repo, to).tree
-    refuse_newer(after)
+    refuse_other_rendering(after)
     state, problems = snapshot.state, list[Fault]()
     catalog_changed = _edited_by_hand(repo, snapshot.commit, to)
     if any(_id(before, root) != _id(after, root) for root in CONFIG_ROOTS) or snapshot.problems:

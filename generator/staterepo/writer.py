@@ -57,6 +57,19 @@ class Line:
         self.head = self.head.after(made, decision.state, keys)
         return str(made)
 
+    def record(
+        self,
+        files: Mapping[str, str | None],
+        state: State,
+        text: str,
+        author: Signature,
+        now: datetime,
+    ) -> str:
+        """Commit what a person had done by a command; ``state`` is what the files give then."""
+        made = self._write(files, text, author, now)
+        self.head = self.head.after(made, state, ())
+        return str(made)
+
     def note(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
         """Have the next commit name a demand that changed nothing, if there is a next one.
 
@@ -76,7 +89,7 @@ class Line:
         change = Changeset({}, ())
         if advance.catalog_changed:
             try:
-                change = self._everything(state)
+                change = self.everything(state)
             except InvalidInput as error:
                 problems += error.faults
                 state = replace(before.state, ledger=state.ledger)
@@ -110,7 +123,12 @@ class Line:
                 state = replace(state, ledger=state.ledger.restored(subject, before.state.ledger))
         return state, consequence(state, before.state.ledger, good, self.read)
 
-    def _everything(self, state: State) -> Changeset:
+    def everything(self, state: State) -> Changeset:
+        """Render all that a state asks for, and compare it with what stands.
+
+        Raises:
+            Refused, InvalidInput: where a release cannot be planned or rendered.
+        """
         files: dict[str, str | None] = dict(rendered(state))
         changes = []
         standing = {
@@ -175,7 +193,7 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
         StateRepoError: where this is no state repo.
     """
     tip = repository.tip()
-    snapshots.refuse_newer(snapshots.commit_of(repository.objects, tip).tree)
+    snapshots.refuse_other_rendering(snapshots.commit_of(repository.objects, tip).tree)
     base = history.last_generated(repository.objects, tip)
     base = base or tip
     told = history.entry_of(snapshots.commit_of(repository.objects, base)).one("In-Force")
