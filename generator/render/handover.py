@@ -55,11 +55,11 @@ def _suspend_flux(catalog: Catalog) -> Iterator[Step]:
         commands = []
         for domain in domains:
             kubectl = f"kubectl -n {domain.namespace}"
-            suspend = f"patch kustomization {domain.name} --type merge -p {_SUSPEND}"
-            commands.append(f"{kubectl} {suspend}")
+            suspend = f"--type merge -p {_SUSPEND}"
+            commands.append(f"{kubectl} patch kustomization {domain.name} {suspend}")
             commands.append(
-                f"{kubectl} get helmrelease -l {_OURS} -o name | "
-                f"xargs -r {kubectl} patch --type merge -p {_SUSPEND}"
+                f"{kubectl} get helmrelease -l {_of(domain)} -o name | "
+                f"xargs -r {kubectl} patch {suspend}"
             )
         yield Step(
             cluster, "suspend Flux, which would remove what it no longer finds", (*commands,)
@@ -72,16 +72,22 @@ def _from_flux(catalog: Catalog) -> Iterator[Step]:
         commands = []
         for domain in domains:
             kubectl = f"kubectl -n {domain.namespace}"
-            commands.append(f"{kubectl} delete kustomization {domain.name}")
-        for namespace in _namespaces(domains):
-            kubectl = f"kubectl -n {namespace}"
             commands.append(  # Helm's notes, which would have Flux go on from them one day
-                f"{kubectl} get helmrelease -l {_OURS} -o custom-columns=:metadata.name "
-                f"--no-headers | xargs -r -I NAME {kubectl} delete secret -l owner=helm,name=NAME"
+                f"{kubectl} get helmrelease -l {_of(domain)} -o name | sed s,.*/,, | "
+                f"xargs -r -I NAME {kubectl} delete secret -l owner=helm,name=NAME"
             )
-            commands.append(f"{kubectl} delete {_FLUXS} -l {_OURS}")
-            commands.append(f"{kubectl} delete gitrepository {catalog.repository.source}")
+            commands.append(f"{kubectl} delete {_FLUXS} -l {_of(domain)}")
+            commands.append(f"{kubectl} delete kustomization {domain.name}")
+        commands += [
+            f"kubectl -n {namespace} delete gitrepository {catalog.repository.source}"
+            for namespace in _namespaces(domains)
+        ]
         yield Step(cluster, "delete what Flux had; suspended, it removes nothing", (*commands,))
+
+
+def _of(domain: AccessDomain) -> str:
+    """Return the label that Flux puts on all that a domain's Kustomization applies."""
+    return f"kustomize.toolkit.fluxcd.io/name={domain.name}"
 
 
 def _let_argocd_go(catalog: Catalog) -> Iterator[Step]:
