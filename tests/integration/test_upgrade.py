@@ -13,17 +13,28 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pygit2
 import pytest
 import yaml
 from asking import perception
-from conftest import Ran, Run, StateRepo
 
 from generator.errors import StateRepoError
 from generator.service import Generator
 from generator.staterepo import cloned, upgrade
+
+Run = Callable[..., Any]
+StateRepo = Any
+
+
+class Ran(NamedTuple):
+    """What a command gave."""
+
+    code: int
+    out: str
+    err: str
+
 
 ROOT = Path(__file__).parents[2]
 PARTS = ("generator", "ros_bridge", "templates", "appdefs", "state-repo-skeleton")
