@@ -85,7 +85,7 @@ def of_change(
         if text is not None and text == standing:
             continue
         if old or new:
-            releases.append(_described(old, new, standing is not None))
+            releases.append(described(old, new, standing is not None))
     check_files(files)
     return Changeset(files=files, releases=tuple(sorted(releases, key=_order)))
 
@@ -114,7 +114,8 @@ def _order(change: ReleaseChange) -> tuple[int, str]:
     return ["start", "change", "stop"].index(change.change), change.name
 
 
-def _described(old: Release | None, new: Release | None, stood: bool) -> ReleaseChange:
+def described(old: Release | None, new: Release | None, stood: bool) -> ReleaseChange:
+    """Return in words what becomes of a release; ``stood``: there is a file of it."""
     release = new or old
     assert release is not None  # noqa: S101 - the caller has one of them
     if isinstance(release, ServiceRelease):
