@@ -161,7 +161,7 @@ def _files(count: int) -> str:
 
 def _visible(line: str) -> str:
     """Return a line whose characters, which people may have written, do nothing to a terminal."""
-    return "".join(char if char.isprintable() or char == "\t" else "�" for char in line)
+    return "".join(char if char.isprintable() or char in "\n\t" else "�" for char in line)
 
 
 def _lines(found: Checked) -> Iterator[str]:

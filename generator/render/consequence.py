@@ -1,7 +1,7 @@
 """What a change of configuration or books would do to everything that is rendered. Pure.
 
-Unlike a demand's changeset, which looks at what it touches, this renders all, for configuration
-may change anything; and it collects the faults of every release before it gives up.
+Unlike a demand's changeset, which looks at what it touches, this looks at everything, for
+configuration may change anything.
 """
 
 from __future__ import annotations
@@ -68,32 +68,23 @@ def releases_of(ledger: Ledger, catalog: Catalog) -> dict[ReleaseKey, Release]:
     return found
 
 
-def wanted(
+def faults(
     ledger: Ledger, catalog: Catalog, engine: Engine, edited: Collection[str] = ()
-) -> tuple[dict[str, str], dict[ReleaseKey, Release]]:
-    """Return every generated file, and the releases behind them.
+) -> list[Fault]:
+    """Return what keeps releases from being planned or rendered, of all of them.
 
-    Args:
-        ledger, catalog, engine: what they follow from.
-        edited: claims' files that somebody edited, to which a fault of their releases is put down.
-
-    Raises:
-        InvalidInput: with the faults of every release, each told to be in a claim's file where it
-            is in no other.
+    Each is told to be in a claim's file where it is in no other: in one of ``edited`` if there is
+    one among those that ask for the release.
     """
-    files, found = gitops.standing_files(catalog, engine), dict[ReleaseKey, Release]()
-    faults: list[Fault] = []
+    found: list[Fault] = []
     for key in all_keys(ledger, catalog):
         try:
             release = plan(ledger, catalog, key)
             if release is not None:
-                files[path_of(release)] = gitops.render(release, catalog, engine)
-                found[key] = release
+                gitops.render(release, catalog, engine)
         except InvalidInput as error:
-            faults += _located(error.faults, _claim_files(key, ledger, catalog), edited)
-    if faults:
-        raise InvalidInput(dict.fromkeys(faults))
-    return files, found
+            found += _located(error.faults, _claim_files(key, ledger, catalog), edited)
+    return list(dict.fromkeys(found))
 
 
 def _claim_files(key: ReleaseKey, ledger: Ledger, catalog: Catalog) -> list[str]:

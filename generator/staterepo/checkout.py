@@ -8,7 +8,7 @@ bookkeeping.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from generator import yamlio
 from generator.catalog.catalog import CONFIG_ROOTS, Catalog
 from generator.catalog.loading import load
 from generator.catalog.repository import ROOT_FILE
-from generator.decision import State, rehearse
+from generator.decision import State, rehearse, rendered
 from generator.errors import Fault, InvalidInput, fault
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger
@@ -72,7 +72,7 @@ def check(folder: Path, base: str | None = None) -> Checked:
     try:
         state = _state(files, before, ledger, faults)
         claims = [path for path in files if files[path] != before.get(path)]
-        wanted, new = consequences.wanted(ledger, state.catalog, state.engine, claims)
+        wanted = _wanted(state, claims)
     except InvalidInput as error:
         refused, suggested = _hand_edits(folder, files, start, edited)
         faults += error.faults
@@ -82,6 +82,7 @@ def check(folder: Path, base: str | None = None) -> Checked:
         path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
     ]
     refused, suggested = _hand_edits(folder, files, start, edited)
+    new = consequences.releases_of(ledger, state.catalog)
     old = new if start is None else _releases(start)
     standing = {
         path: text for path, text in before.items() if _generated(path) and not trees.is_note(path)
@@ -133,6 +134,15 @@ def _state(
     state = State.of(catalog, ledger)
     rehearse(state)
     return state
+
+
+def _wanted(state: State, edited: Collection[str]) -> dict[str, str]:
+    """Return every generated file; of what cannot be rendered, the faults of every release."""
+    try:
+        return rendered(state)
+    except InvalidInput as error:
+        found = consequences.faults(state.ledger, state.catalog, state.engine, edited)
+        raise InvalidInput(found or error.faults) from None
 
 
 def _releases(start: Base) -> dict[ReleaseKey, Release]:

@@ -16,9 +16,7 @@ from generator.render.handedit import Suggestion, fits_too, suggest
 from generator.render.paths import BOOTSTRAP_ROOT, path_of
 from generator.settings import GENERATED_ROOTS
 from generator.staterepo import tree as trees
-from generator.staterepo.worktree import OWN_ROOT, Base
-
-OVERRIDES_ROOT = "overrides"
+from generator.staterepo.worktree import OVERRIDES_ROOT, OWN_ROOT, Base
 
 _LOST = "is generated, and an edit by hand is lost; take it back"
 _MOST_LEFT = 5
