@@ -16,16 +16,22 @@ from generator.demand.claim import ApplicationClaim, Subject, SubjectKind
 from generator.demand.request import InputTopic
 from generator.errors import Refused, fault
 from generator.ledger.ledger import Ledger
-from generator.plan import clients, naming, parameters, scaling
+from generator.plan import clients, naming, overrides, parameters, scaling
 from generator.plan.clients import BridgeKey, EndKey
 from generator.plan.place import place
 from generator.plan.release import Release, ServiceKey, ServiceRelease
+from generator.plan.standing import in_force
 
 ReleaseKey = ServiceKey | EndKey | BridgeKey
 
 
 def keys_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
-    """Yield what must run because ``subject`` is held."""
+    """Yield what must run because ``subject`` is held and no override denies it."""
+    yield from keys_booked(in_force(ledger, catalog), catalog, subject)
+
+
+def keys_booked(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
+    """Yield what ``subject`` needs by the claims of ``ledger``, suspended or not."""
     if subject.kind is SubjectKind.CONNECTION:
         yield from clients.keys_of(ledger, subject.id)
         return
@@ -67,17 +73,21 @@ def all_keys(ledger: Ledger, catalog: Catalog) -> tuple[ReleaseKey, ...]:
 
 
 def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
-    """Return the release at ``key``, or nothing where no claim needs it.
+    """Return the release at ``key`` as overrides shape it, or nothing where no claim needs it.
 
     Raises:
         Refused: where claims contradict each other in a parameter, or what a claim names is no
             longer in the catalog.
     """
+    ledger = in_force(ledger, catalog)
+    release: Release | None
     if isinstance(key, EndKey):
-        return clients.end(ledger, catalog, key)
-    if isinstance(key, BridgeKey):
-        return clients.bridge(ledger, catalog, key)
-    return _service(ledger, catalog, key)
+        release = clients.end(ledger, catalog, key)
+    elif isinstance(key, BridgeKey):
+        release = clients.bridge(ledger, catalog, key)
+    else:
+        release = _service(ledger, catalog, key)
+    return overrides.shaped(release, ledger, catalog) if release else None
 
 
 def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceRelease | None:
