@@ -118,9 +118,7 @@ def overlap(one: str, other: str) -> bool:
         for place in reached:
             if place < len(other) and other[place] == "*":
                 after.add(place)
-            elif (place < len(other) and "?" in (part, other[place])) or (
-                place < len(other) and part == other[place]
-            ):
+            elif place < len(other) and (part == other[place] or "?" in (part, other[place])):
                 after.add(place + 1)
         reached = after | _past_stars(other, after)
     return len(other) in reached

@@ -40,7 +40,7 @@ def shaped(release: Release, ledger: Ledger, catalog: Catalog) -> Release | None
         return release
     claims = _claims(release, ledger)
     traits = _traits(release, claims)
-    if traits.service and denied_by(traits, catalog) is not None:
+    if denying(release, ledger, catalog) is not None:
         return None
     kept = {claim.demand.removeprefix(KEPT) for claim in claims if claim.demand.startswith(KEPT)}
     by = []
@@ -51,6 +51,13 @@ def shaped(release: Release, ledger: Ledger, catalog: Catalog) -> Release | None
         if effects:
             by.append((override, effects))
     return with_overrides(release, by, catalog)
+
+
+def denying(release: Release, ledger: Ledger, catalog: Catalog) -> Override | None:
+    """Return the override that keeps a service from running, or nothing."""
+    if not isinstance(release, ServiceRelease) or not any(one.deny for one in catalog.in_force):
+        return None
+    return denied_by(_traits(release, _claims(release, ledger)), catalog)
 
 
 def with_overrides(

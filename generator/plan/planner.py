@@ -11,6 +11,7 @@ from types import MappingProxyType
 
 from generator.catalog.appdef import ApplicationDefinition, Parameter, Service
 from generator.catalog.catalog import Catalog
+from generator.catalog.override import Override
 from generator.catalog.registry import ChartSource
 from generator.demand.claim import ApplicationClaim, Subject, SubjectKind
 from generator.demand.request import InputTopic
@@ -80,14 +81,24 @@ def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
             longer in the catalog.
     """
     ledger = in_force(ledger, catalog)
-    release: Release | None
-    if isinstance(key, EndKey):
-        release = clients.end(ledger, catalog, key)
-    elif isinstance(key, BridgeKey):
-        release = clients.bridge(ledger, catalog, key)
-    else:
-        release = _service(ledger, catalog, key)
+    release = _unshaped(ledger, catalog, key)
     return overrides.shaped(release, ledger, catalog) if release else None
+
+
+def denied(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> tuple[Release, Override] | None:
+    """Return the release that is needed at ``key`` and the override that denies it, or nothing."""
+    ledger = in_force(ledger, catalog)
+    release = _unshaped(ledger, catalog, key)
+    by = overrides.denying(release, ledger, catalog) if release else None
+    return (release, by) if release and by else None
+
+
+def _unshaped(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
+    if isinstance(key, EndKey):
+        return clients.end(ledger, catalog, key)
+    if isinstance(key, BridgeKey):
+        return clients.bridge(ledger, catalog, key)
+    return _service(ledger, catalog, key)
 
 
 def _service(ledger: Ledger, catalog: Catalog, key: ServiceKey) -> ServiceRelease | None:
