@@ -8,6 +8,7 @@ connections.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations
 
@@ -63,8 +64,7 @@ def commute(one: object, other: object) -> bool:
     """Tell whether two merge patches give the same whichever comes first."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         return all(commute(one[key], other[key]) for key in one if key in other)
-    same_kind = isinstance(one, bool) is isinstance(other, bool)
-    return same_kind and type(one) is type(other) and one == other
+    return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)  # 1 is not True
 
 
 def can_meet(one: Iterable[Selector], other: Iterable[Selector], catalog: Catalog) -> bool:
