@@ -85,9 +85,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "deny and more": (
         {"deny": True, "version": "0.1.0"},
-        [
-            "deny keeps it from running, so version and replicas can do nothing; keep one of them"
-        ],
+        ["deny keeps it from running, so version and replicas can do nothing; keep one of them"],
     ),
     "hold and more": (
         {"hold": True, "values": {"a": 1}},
@@ -110,9 +108,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "no time": (
         {"expires": "tomorrow"},
-        [
-            "expires: 'tomorrow' is no time with a time zone; write one like 2026-01-31T12:00:00Z"
-        ],
+        ["expires: 'tomorrow' is no time with a time zone; write one like 2026-01-31T12:00:00Z"],
     ),
     "a time without zone": (
         {"expires": "2026-01-31T12:00:00"},
