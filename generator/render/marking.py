@@ -17,7 +17,9 @@ from generator.render.engine import Engine
 from generator.render.paths import CLUSTERS_ROOT
 
 _START = "# override overrides/"
-_HOLDS = re.compile(rf"{_START}[^:]+: (\w+, )*hold(, \w+)*; ")
+_OF_NOW = frozenset({"hold", "keep"})
+"""Effects that are not in a file's body, and so are told as they are even where it is held."""
+_TOLD_ANEW = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
@@ -31,13 +33,18 @@ def text_of(release: Release, catalog: Catalog, engine: Engine, standing: str | 
         Refused, InvalidInput: where it cannot be rendered.
     """
     shaping = release.shaping
-    if shaping.held and standing is not None:
-        before, body = split(standing)
-        lines = [line(one, effects) for one, effects in shaping.by if "hold" in effects]
-        lines += [one for one in before if not _HOLDS.match(one)]
-    else:
+    if not shaping.held:
         body = gitops.render(release, catalog, engine)
-        lines = [line(override, effects) for override, effects in shaping.by]
+        return _commented([line(one, effects) for one, effects in shaping.by], body)
+    now = [line(one, effects) for one, effects in shaping.by if _OF_NOW & {*effects}]
+    if standing is None:
+        then = [line(one, effects) for one, effects in shaping.by if not _OF_NOW & {*effects}]
+        return _commented([*now, *then], gitops.render(release, catalog, engine))
+    then, body = split(standing)
+    return _commented([*now, *(one for one in then if not _TOLD_ANEW.match(one))], body)
+
+
+def _commented(lines: list[str], body: str) -> str:
     return "".join(f"{one}\n" for one in lines) + body
 
 
