@@ -8,7 +8,7 @@ from typing import Any
 import click
 from rich.table import Table
 
-from generator.catalog.override import written
+from generator.catalog.override import ImagePin, written
 from generator.cli.output import console, output_option, print_json, progress, state_repo_option
 from generator.plan.survey import Entry, survey
 from generator.staterepo import reader
@@ -70,11 +70,7 @@ def _row(entry: Entry) -> dict[str, Any]:
         "name": one.name,
         "file": one.path,
         "state": entry.state,
-        "effects": {
-            name: value
-            for name, value in one.model_dump(mode="json", exclude_none=True).items()
-            if name in one.effects()
-        },
+        "effects": {name: _plain(getattr(one, name)) for name in one.effects()},
         "releases": list(entry.releases),
         "claims": list(entry.claims),
         "priority": one.priority,
@@ -82,3 +78,10 @@ def _row(entry: Entry) -> dict[str, Any]:
         "until": written(one.end) if one.end else None,
         "reason": one.reason,
     }
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401
+    """Return an effect as it stands in the file; a null of a patch is a part of it."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value
