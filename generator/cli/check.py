@@ -76,6 +76,7 @@ def _data(found: Checked) -> dict[str, Any]:
         "faults": [
             {"file": one.file, "field": one.field, "message": one.message} for one in found.faults
         ],
+        "warnings": [{"file": one.file, "message": one.message} for one in found.warnings],
         "overrides": [
             {
                 "instead_of": one.path,
@@ -149,6 +150,8 @@ def _print(directory: Path, found: Checked) -> None:
     out = console()
     for one in found.faults:
         errors.print(f"error: {one}")
+    for one in found.warnings:
+        errors.print(f"warning: {one}")
     if not found.faults:
         out.print(f"{directory}: all files are valid and everything renders")
     for line in _lines(found):

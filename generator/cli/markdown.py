@@ -31,6 +31,7 @@ def report(found: Checked, longest: int = LONGEST) -> str:
     """Return the report, of at most ``longest`` characters."""
     parts = [f"{MARK}\n", *_head(found)]
     parts += _faults(found)
+    parts += _warnings(found)
     parts += _suggestions(found)
     parts += _consequence(found)
     return _bounded(parts, longest)
@@ -76,6 +77,13 @@ def _faults(found: Checked) -> Iterator[str]:
         places = [code(place) for place in (one.file, one.field) if place]
         yield f"\n- {': '.join([*places, code(one.message)])}"
     if found.faults:
+        yield "\n"
+
+
+def _warnings(found: Checked) -> Iterator[str]:
+    for one in found.warnings:
+        yield f"\n- warning: {code(one.file)}: {code(one.message)}"
+    if found.warnings:
         yield "\n"
 
 

@@ -54,14 +54,15 @@ def upgrade(
     """
     wish = Wish(gitops, url)
     asks = gitops is not None and not yes and output == "text" and sys.stdin.isatty()
+    now = datetime.now(timezone.utc)
     with progress("reading the ledger") as tell:
         if dry_run or asks:
-            made = upgrading.plan(state_repo, wish, tell)
+            made = upgrading.plan(state_repo, wish, now, tell)
         if asks and not dry_run and made.handover.before:
             _print_steps("before this, on the clusters:", made.handover.before)
             click.confirm("Is this done?", abort=True)
         if not dry_run:
-            made = upgrading.upgrade(state_repo, wish, datetime.now(timezone.utc), tell)
+            made = upgrading.upgrade(state_repo, wish, now, tell)
     if output == "json":
         print_json(_data(made, dry_run))
     else:

@@ -10,20 +10,25 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from pathlib import Path
 
 from generator import yamlio
 from generator.catalog.catalog import CONFIG_ROOTS, Catalog
 from generator.catalog.loading import load
+from generator.catalog.override import written
 from generator.catalog.repository import ROOT_FILE
 from generator.decision import State, rehearse, rendered
 from generator.errors import Fault, InvalidInput, fault
 from generator.ledger import format as ledger_format
+from generator.ledger import markers
 from generator.ledger.ledger import Ledger
 from generator.plan.bookkeeping import bookkeeping
 from generator.plan.difference import EntryChange, difference
+from generator.plan.following import due, taken_in
 from generator.plan.planner import ReleaseKey
 from generator.plan.release import Release
+from generator.plan.survey import survey, warnings
 from generator.render import consequence as consequences
 from generator.render.consequence import Consequence
 from generator.render.handedit import Suggestion
@@ -39,7 +44,8 @@ class Checked:
 
     ``consequence`` is missing where the files are not valid; ``books`` is missing there too, and
     where there is nothing valid to compare with. ``base`` is what was compared with, if anything;
-    where its own files are not valid (``base_in_force``), the last valid ones stand in.
+    where its own files are not valid (``base_in_force``), the last valid ones stand in. What is in
+    ``warnings`` is no fault and may still not be meant.
     """
 
     faults: tuple[Fault, ...]
@@ -48,15 +54,17 @@ class Checked:
     books: tuple[EntryChange, ...] | None = None
     base: str | None = None
     base_in_force: bool = True
+    warnings: tuple[Fault, ...] = ()
 
 
-def check(folder: Path, base: str | None = None) -> Checked:
+def check(folder: Path, base: str | None = None, now: datetime | None = None) -> Checked:
     """Check the files of a folder, that everything renders, and what follows from the edit.
 
     Args:
         folder: a checked-out state repo, or an unpacked one without Git.
         base: what the edit is to be merged into; by default ``origin/main``, or ``main``. It is
             compared with where the work tree left that.
+        now: overrides that ended by then are not tried; the time of the day where left out.
 
     Raises:
         StateRepoError: where it is no state repo, or ``base`` is no commit, or the clone is too
@@ -70,9 +78,16 @@ def check(folder: Path, base: str | None = None) -> Checked:
     found = replace(found, base_in_force=start is None or start.in_force)
     edited = handedits.edited(files, before)
     try:
-        state = _state(files, before, ledger, faults)
-        claims = [path for path in files if files[path] != before.get(path)]
-        wanted = _wanted(state, claims)
+        moment = now or datetime.now(timezone.utc)
+        state = _state(files, before, ledger, faults, moment)
+        claims = [path for path in {*files, *before} if files.get(path) != before.get(path)]
+        state = _taken_in(state, start, claims, files, moment)
+        standing = {
+            path: text
+            for path, text in before.items()
+            if _generated(path) and not trees.is_note(path)
+        }
+        wanted = _wanted(state, standing, claims)
     except InvalidInput as error:
         refused, suggested = _hand_edits(folder, files, start, edited)
         faults += error.faults
@@ -82,17 +97,15 @@ def check(folder: Path, base: str | None = None) -> Checked:
         path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
     ]
     refused, suggested = _hand_edits(folder, files, start, edited)
-    new = consequences.releases_of(ledger, state.catalog)
+    new = consequences.releases_of(state.ledger, state.catalog)
     old = new if start is None else _releases(start)
-    standing = {
-        path: text for path, text in before.items() if _generated(path) and not trees.is_note(path)
-    }
     return replace(
         found,
         faults=_ordered([*faults, *refused]),
         suggestions=suggested,
         consequence=consequences.consequence(old, new, standing, wanted),
         books=_books(start, state),
+        warnings=_warnings(state, moment),
     )
 
 
@@ -119,7 +132,11 @@ def _ledger(files: Mapping[str, str], faults: list[Fault]) -> Ledger:
 
 
 def _state(
-    files: Mapping[str, str], before: Mapping[str, str], ledger: Ledger, faults: list[Fault]
+    files: Mapping[str, str],
+    before: Mapping[str, str],
+    ledger: Ledger,
+    faults: list[Fault],
+    now: datetime,
 ) -> State:
     """Return what the files say; faults that do not keep it from being rendered are put down."""
     catalog = load({p: t for p, t in files.items() if p.split("/")[0] in CONFIG_ROOTS})
@@ -131,15 +148,54 @@ def _state(
         )
         raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
     faults += _unversioned_charts(catalog, files, before)
+    catalog = _with_ended(catalog, files, now)
     state = State.of(catalog, ledger)
     rehearse(state)
     return state
 
 
-def _wanted(state: State, edited: Collection[str]) -> dict[str, str]:
+def _taken_in(
+    state: State,
+    start: Base | None,
+    changed: Collection[str],
+    files: Mapping[str, str],
+    now: datetime,
+) -> State:
+    """Return the books as the generator would have them once it took the change in."""
+    if start is None or start.state is None:
+        return state
+    old, new = start.state.ledger, state.ledger
+    subjects = [
+        claim.subject
+        for books in (old, new)
+        for claim in books
+        if ledger_format.path_of(claim.key) in changed
+    ]
+    before, after = (old, start.state.catalog), (new, state.catalog)
+    taken = taken_in(before, after, dict.fromkeys(subjects), _marked(files), now)
+    return replace(state, ledger=taken.ledger, catalog=taken.catalog)
+
+
+def _marked(files: Mapping[str, str]) -> dict[str, str]:
+    return {p: text for p, text in files.items() if p.startswith(f"{markers.MARKERS_ROOT}/")}
+
+
+def _with_ended(catalog: Catalog, files: Mapping[str, str], now: datetime) -> Catalog:
+    """Return the catalog without the overrides that a generator ended, or would at once."""
+    catalog = catalog.with_ended(markers.read(_marked(files)))
+    over = {one.name: written(one.end) for one in due(catalog, now) if one.end}
+    return catalog.with_ended({**catalog.ended, **over})
+
+
+def _warnings(state: State, now: datetime) -> tuple[Fault, ...]:
+    idle = warnings(survey(state.ledger, state.catalog, now))
+    return tuple(fault("", text).within(path) for path, text in idle)
+
+
+def _wanted(state: State, standing: Mapping[str, str], edited: Collection[str]) -> dict[str, str]:
     """Return every generated file; of what cannot be rendered, the faults of every release."""
     try:
-        return rendered(state)
+        return rendered(state, standing)
     except InvalidInput as error:
         found = consequences.faults(state.ledger, state.catalog, state.engine, edited)
         raise InvalidInput(found or error.faults) from None

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
+from generator.catalog.override import OVERRIDES_ROOT
 from generator.errors import Fault, fault
 from generator.ledger import format as ledger_format
 from generator.plan.release import Release
@@ -16,7 +17,7 @@ from generator.render.handedit import Suggestion, fits_too, suggest
 from generator.render.paths import BOOTSTRAP_ROOT, path_of
 from generator.settings import GENERATED_ROOTS
 from generator.staterepo import tree as trees
-from generator.staterepo.worktree import OVERRIDES_ROOT, OWN_ROOT, Base
+from generator.staterepo.worktree import OWN_ROOT, Base
 
 _LOST = "is generated, and an edit by hand is lost; take it back"
 _MOST_LEFT = 5

@@ -11,7 +11,7 @@ import random
 import time
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 import pygit2
@@ -23,13 +23,17 @@ from generator.catalog.loading import load
 from generator.catalog.repository import ROOT_FILE
 from generator.decision import State
 from generator.errors import InvalidInput, StateRepoError, fault
+from generator.ledger import markers
+from generator.plan.following import TakenIn, taken_in
+from generator.plan.release import ServiceRelease
+from generator.render.consequence import releases_of
 from generator.render.handover import Handover, handover
 from generator.settings import RENDER_VERSION
-from generator.staterepo import message, reader
+from generator.staterepo import history, message, reader
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
-from generator.staterepo.snapshot import Progress
+from generator.staterepo.snapshot import Progress, Snapshot
 from generator.staterepo.writer import Line
 
 _ATTEMPTS = 10
@@ -61,7 +65,9 @@ class Upgrade:
         return handover(self.old, self.new)
 
 
-def plan(address: str, wish: Wish, progress: Progress = lambda done, total: None) -> Upgrade:
+def plan(
+    address: str, wish: Wish, now: datetime, progress: Progress = lambda done, total: None
+) -> Upgrade:
     """Return what an upgrade would change; nothing is written.
 
     Raises:
@@ -69,7 +75,7 @@ def plan(address: str, wish: Wish, progress: Progress = lambda done, total: None
         StateRepoError: where it cannot be read.
     """
     with reader.opened(address) as repo:
-        return _planned(repo.repository, wish, progress)[0]
+        return _planned(repo.repository, wish, now, progress)[0]
 
 
 def upgrade(
@@ -90,11 +96,12 @@ def upgrade(
     with reader.opened(address) as repo:
         repository = repo.repository
         for attempt in range(1, _ATTEMPTS + 1):
-            made, line, state = _planned(repository, wish, progress)
+            made, line, taken = _planned(repository, wish, now, progress)
             if not made.files:
                 return made
             author = _person(repository.objects, now)
-            commit = line.record(made.files, state, _message(made), author, now)
+            state = replace(line.head.state, ledger=taken.ledger, catalog=taken.catalog)
+            commit = line.record(made.files, state, _message(made), author, now, taken.keys)
             if line.publish():
                 return Upgrade(commit, made.old, made.new, made.files)
             time.sleep(_PAUSE_S * attempt * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
@@ -106,19 +113,61 @@ def upgrade(
 
 
 def _planned(
-    repository: StateRepository, wish: Wish, progress: Progress
-) -> tuple[Upgrade, Line, State]:
-    tip = repository.tip()
-    snapshot = snapshots.load(repository.objects, tip, progress)
+    repository: StateRepository, wish: Wish, now: datetime, progress: Progress
+) -> tuple[Upgrade, Line, TakenIn]:
+    objects, tip = repository.objects, repository.tip()
+    snapshot = snapshots.load(objects, tip, progress)
     line, old = Line(repository, snapshot), snapshot.state.catalog
-    files = trees.texts(snapshots.commit_of(repository.objects, tip).tree, CONFIG_ROOTS)
+    tree = snapshots.commit_of(objects, tip).tree
+    files = trees.texts(tree, CONFIG_ROOTS)
     before = files[ROOT_FILE]
     files[ROOT_FILE] = _root(before, old, wish)
-    state = State.of(load(files), snapshot.state.ledger)
-    found = dict(line.everything(state).files)
+    marked = snapshots.markers_at(tree)
+    catalog = load(files).with_ended(markers.read(marked))
+    state = State.of(catalog, snapshot.state.ledger)
+    taken = _taken_in(repository, snapshot, state, marked, now)
+    state = replace(state, ledger=taken.ledger, catalog=taken.catalog)
+    if old.repository.gitops != catalog.repository.gitops:
+        _refuse_held(state)
+    found = dict(line.everything(state, taken.files).files)
     if files[ROOT_FILE] != before:
         found[ROOT_FILE] = files[ROOT_FILE]
-    return Upgrade(str(tip), old, state.catalog, dict(sorted(found.items()))), line, state
+    return Upgrade(str(tip), old, state.catalog, dict(sorted(found.items()))), line, taken
+
+
+def _taken_in(
+    repository: StateRepository,
+    tip: Snapshot,
+    state: State,
+    marked: Mapping[str, str],
+    now: datetime,
+) -> TakenIn:
+    """Return the books with what people changed since the generator's last commit taken in."""
+    objects = repository.objects
+    last = history.last_generated(objects, tip.commit)
+    before = tip.state if last is None else snapshots.load_last_valid(objects, last).state
+    after = state.ledger
+    keys = {claim.key for books in (before.ledger, after) for claim in books}
+    subjects = {key.subject for key in keys if before.ledger.get(key) != after.get(key)}
+    books = (before.ledger, before.catalog)
+    return taken_in(books, (after, state.catalog), sorted(subjects, key=str), marked, now)
+
+
+def _refuse_held(state: State) -> None:
+    """Raise where an override holds a file that is made for the other controller."""
+    faults = [
+        fault(
+            "hold",
+            f"keeps {release.name} as it is rendered for the other controller; remove it, and "
+            "hold the release again afterwards",
+        ).within(override.path)
+        for release in releases_of(state.ledger, state.catalog).values()
+        if isinstance(release, ServiceRelease) and release.shaping.held
+        for override, effects in release.shaping.by
+        if "hold" in effects
+    ]
+    if faults:
+        raise InvalidInput(faults)
 
 
 def _root(text: str, catalog: Catalog, wish: Wish) -> str:

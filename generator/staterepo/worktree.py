@@ -20,13 +20,7 @@ from generator.staterepo import tree as trees
 OWN_ROOT = ".demandops"
 """Where the generator keeps what is for people to read."""
 
-OVERRIDES_ROOT = "overrides"
-
-_ROOTS = tuple(
-    dict.fromkeys(
-        (*CONFIG_ROOTS, OVERRIDES_ROOT, ledger_format.LEDGER_ROOT, *GENERATED_ROOTS, OWN_ROOT)
-    )
-)
+_ROOTS = (*CONFIG_ROOTS, ledger_format.LEDGER_ROOT, *GENERATED_ROOTS, OWN_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
 _SHALLOW = (
     "this clone is shallow and does not hold the commit that the edit started from; fetch all of "
