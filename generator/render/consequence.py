@@ -77,24 +77,26 @@ def faults(
     one among those that ask for the release.
     """
     found: list[Fault] = []
+    asking: dict[ReleaseKey, list[str]] = {}
     for key in all_keys(ledger, catalog):
         try:
             release = plan(ledger, catalog, key)
             if release is not None:
                 gitops.render(release, catalog, engine)
         except InvalidInput as error:
-            found += _located(error.faults, _claim_files(key, ledger, catalog), edited)
+            asking = asking or _claim_files(ledger, catalog)
+            found += _located(error.faults, asking.get(key, []), edited)
     return list(dict.fromkeys(found))
 
 
-def _claim_files(key: ReleaseKey, ledger: Ledger, catalog: Catalog) -> list[str]:
-    return [
-        ledger_format.path_of(claim.key)
-        for kind in SubjectKind
-        for subject in (Subject(kind, id) for id in ledger.subjects(kind))
-        if key in keys_of(ledger, catalog, subject)
-        for claim in ledger.of(subject)
-    ]
+def _claim_files(ledger: Ledger, catalog: Catalog) -> dict[ReleaseKey, list[str]]:
+    """Return by release the files of the claims that ask for it."""
+    found: dict[ReleaseKey, list[str]] = {}
+    for subject in (Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)):
+        files = [ledger_format.path_of(claim.key) for claim in ledger.of(subject)]
+        for key in keys_of(ledger, catalog, subject):
+            found.setdefault(key, []).extend(files)
+    return found
 
 
 def _located(
