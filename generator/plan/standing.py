@@ -15,7 +15,6 @@ from generator.demand.claim import Claim, Subject
 from generator.ledger.ledger import Ledger
 from generator.plan.matching import Traits, fits, traits_of
 
-
 _MOST_JUDGED = 100_000
 """Claims that are remembered as judged: a shared service has each of its claims looked at often."""
 
