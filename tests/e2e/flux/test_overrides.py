@@ -62,7 +62,7 @@ def test_overrides_arrive_stay_and_go(world: World) -> None:
 
 
 def test_a_denial_stops_what_runs_and_a_keep_lets_it_run_on(world: World) -> None:
-    domain, goal = world.domain, expected.demand(1)
+    goal = expected.demand(1)
     world.follow(world.demand(goal), expected.after(1))
     fields = yaml.safe_load(override({"nodes": ["*"]}, deny=True))
     world.push({"overrides/closed.yaml": yaml.safe_dump(fields)})
