@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -55,15 +55,18 @@ class Catalog:
     overrides: Mapping[str, Override] = field(default_factory=dict)
     ended: Mapping[str, str] = field(default_factory=dict)
     in_force: tuple[Override, ...] = ()
+    judged: dict[Hashable, Override | None] = field(default_factory=dict, compare=False, repr=False)
+    """What was found denied, kept by :mod:`generator.plan.standing`: it follows from the rest."""
 
     def with_ended(self, ended: Mapping[str, str]) -> Catalog:
         """Return the catalog with these overrides ended (:mod:`generator.ledger.markers`)."""
         in_force = in_order(still_in_force(self.overrides, ended))
-        return replace(self, ended=MappingProxyType(dict(ended)), in_force=in_force)
+        ended = MappingProxyType(dict(ended))
+        return replace(self, ended=ended, in_force=in_force, judged={})
 
     def without_overrides(self) -> Catalog:
         """Return the catalog as it would be had nobody written an override."""
-        return replace(self, overrides={}, ended={}, in_force=())
+        return replace(self, overrides={}, ended={}, in_force=(), judged={})
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
         """Return the appdef that ``DeploymentRequest`` names by ``number``."""

@@ -15,6 +15,9 @@ from generator.demand.claim import Claim, Subject
 from generator.ledger.ledger import Ledger
 from generator.plan.matching import Traits, fits, traits_of
 
+_MOST_JUDGED = 100_000
+"""Claims that are remembered as judged: a shared service has each of its claims looked at often."""
+
 
 @dataclass(frozen=True, slots=True)
 class ClaimsInForce(Ledger):
@@ -49,7 +52,17 @@ def in_force(ledger: Ledger, catalog: Catalog) -> Ledger:
 
 def suspended_by(claim: Claim, catalog: Catalog) -> Override | None:
     """Return the override that suspends a claim, the highest where several do, or nothing."""
-    return denied_by(traits_of(claim), catalog) if catalog.in_force else None
+    if not catalog.in_force:
+        return None
+    traits = traits_of(claim)
+    try:
+        return catalog.judged[traits]
+    except KeyError:
+        pass
+    if len(catalog.judged) >= _MOST_JUDGED:
+        catalog.judged.clear()
+    found = catalog.judged[traits] = denied_by(traits, catalog)
+    return found
 
 
 def denied_by(traits: Traits, catalog: Catalog) -> Override | None:

@@ -211,3 +211,29 @@ def test_a_kept_claim_is_the_owners_and_holds_what_the_last_one_did() -> None:
     assert (claim.demand, claim.request) == ("override:tested", "override:tested")
     assert (claim.requesters, claim.lease) == (("petra",), None)
     assert "ego_data" not in claim.inputs  # type: ignore[union-attr]
+
+
+REGISTRY = """\
+apiVersion: demandops/v1
+kind: Charts
+charts:
+  object-detection: {oci: "oci://registry.example/charts/object-detection", version: %s}
+  object-fusion: {http: "https://charts.example/perception", version: %s}
+"""
+CHARTS = "clusters/c-its/perception/_charts"
+
+
+def test_a_held_release_keeps_its_chart_when_the_registry_moves_on() -> None:
+    old, new = REGISTRY % ("1.0.0", "2.0.0"), REGISTRY % ("1.1.0", "2.1.0")
+    books = Books({"registry/charts.yaml": old})
+    books.send(goal([application()]))
+    before = dict(books.files)
+    hold = files(held={"select": [{"services": ["object-detection"]}], "hold": True})
+    for overrides, kept in ((hold, True), ({}, False)):
+        moved = Books({"registry/charts.yaml": new, **overrides})
+        state = type(moved.state)(moved.catalog, moved.state.engine, books.state.ledger)
+        after = rendered(state, before)
+        assert (f"{CHARTS}/object-detection-1.0.0.yaml" in after) is kept
+        assert f"{CHARTS}/object-detection-1.1.0.yaml" in after
+        release = after["clusters/c-its/perception/edge/od-edge-vehicle00.yaml"]
+        assert ("object-detection-1.0.0" in release) is kept
