@@ -60,7 +60,8 @@ def upgrade(
             made = upgrading.plan(state_repo, wish, now, tell)
         if asks and not dry_run and made.handover.before:
             _print_steps("before this, on the clusters:", made.handover.before)
-            click.confirm("Is this done?", abort=True)
+            if not click.confirm("Is this done?"):
+                raise click.ClickException("nothing was changed; do it first, or say --yes")
         if not dry_run:
             made = upgrading.upgrade(state_repo, wish, now, tell)
     if output == "json":

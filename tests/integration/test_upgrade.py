@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import shutil
 import subprocess
 import sys
@@ -214,6 +215,31 @@ def test_a_dry_run_tells_all_and_writes_nothing(
     )
     data = upgraded("--gitops", "argocd", "--dry-run", "--output", "json").json()
     assert (data["outcome"], data["commit"], state.tip) == ("would-change", before, before)
+
+
+@pytest.mark.parametrize(("answer", "code"), [("n", 1), ("y", 0)])
+def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(
+    state: StateRepo, data_home: Path, answer: str, code: int
+) -> None:
+    before = state.tip
+    command = [sys.executable, "-m", "generator.cli.main", "upgrade", "--gitops", "argocd"]
+    ours, theirs = pty.openpty()
+    os.write(ours, f"{answer}\n".encode())
+    done = subprocess.run(
+        [*command, "--state-repo", str(state.path)],
+        stdin=theirs,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    os.close(ours)
+    os.close(theirs)
+    assert done.returncode == code
+    assert done.stdout.startswith("\nbefore this, on the clusters:\n- c-its: suspend Flux")
+    assert (state.tip == before) is (code == 1)
+    if code:
+        assert done.stderr == "error: nothing was changed; do it first, or say --yes\n"
 
 
 def test_back_to_flux_argo_cds_finalizers_go_first(
