@@ -21,12 +21,11 @@ from generator.demand.request import DemandRequest, Operation
 from generator.errors import Fault, InvalidInput, Refused
 from generator.ledger import ledger as booking
 from generator.ledger.ledger import Changes, Ledger
-from generator.plan import denial, derived, keeping, quota, rehearsal
+from generator.plan import denial, derived, keeping, quota
 from generator.plan.clients import is_bridged
 from generator.plan.planner import affected, all_keys
-from generator.plan.release import ServiceRelease
 from generator.plan.standing import in_force
-from generator.render import changeset, gitops
+from generator.render import changeset, tryout
 from generator.render.changeset import Read, ReleaseChange
 from generator.render.engine import Engine
 
@@ -273,33 +272,9 @@ def explain(error: InvalidInput) -> str:
 
 
 def rehearse(state: State) -> None:
-    """Render every service of every appdef once, for invented claims on a real node.
-
-    An appdef that nobody has demanded yet is checked before the first demand comes, and so is what
-    each override in force would make of it.
+    """Try every appdef and every override in force on invented demands.
 
     Raises:
         Refused, InvalidInput: naming the template, the values or the override that does not work.
     """
-    invented = rehearsal.releases(state.catalog)
-    faults = [found for made in invented.values() for found in _tried(made, state)]
-    for override in () if faults else state.catalog.in_force:
-        tries = {
-            appdef: list(rehearsal.overridden(override, made, appdef, state.catalog))
-            for appdef, made in invented.items()
-        }
-        failed = [_tried(made, state) for made in tries.values() if made]
-        if all(failed):  # else there is an application that it may be meant for
-            faults += [found for one in failed[:1] for found in one]
-    if faults:
-        raise InvalidInput(dict.fromkeys(faults))
-
-
-def _tried(releases: Iterable[ServiceRelease], state: State) -> list[Fault]:
-    faults: list[Fault] = []
-    for release in releases:
-        try:
-            gitops.render(release, state.catalog, state.engine)
-        except InvalidInput as error:
-            faults += error.faults
-    return faults
+    tryout.rehearse(state.catalog, state.engine)

@@ -100,15 +100,7 @@ class Line:
         keys: tuple[ClaimKey, ...] = ()
         if advance.catalog_changed:
             try:
-                taken = taken_in(
-                    _books(before.state),
-                    _books(state),
-                    advance.subjects,
-                    snapshots.markers_at(self._tree),
-                    now,
-                )
-                change = self.everything(_with(state, taken), taken.files)
-                state, keys = _with(state, taken), taken.keys
+                state, change, keys = self._taken_in(state, before, advance.subjects, now)
             except InvalidInput as error:
                 problems += error.faults
                 catalog = before.state.catalog.with_ended(state.catalog.ended)
@@ -132,6 +124,15 @@ class Line:
             )
             made = self._write(change.files, text, message.generator_signature(now), now)
             self.head = self.head.after(made, state, keys)
+
+    def _taken_in(
+        self, state: State, before: Snapshot, subjects: Iterable[Subject], now: datetime
+    ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
+        """Render everything for a configuration that changed."""
+        marked = snapshots.markers_at(self._tree)
+        taken = taken_in(_books(before.state), _books(state), subjects, marked, now)
+        state = _with(state, taken)
+        return state, self.everything(state, taken.files), taken.keys
 
     def end(self, override: Override, now: datetime) -> None:
         """Commit that an override's time is over, and what follows.
