@@ -127,6 +127,7 @@ def decide(
         warnings=(
             *_uncarried(request, ledger, state.catalog),
             *_bridged(request, state.catalog),
+            *made.waiting,
             *denial.warnings(request, ledger, state.catalog),
         ),
         overrides=made.overrides,

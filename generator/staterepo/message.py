@@ -174,7 +174,7 @@ def of_ended(
         f"Why: {override.path} of {override.owner} ({override.reason}) expired at "
         f"{written(override.end) if override.end else ''}.",
         "",
-        *_desired_state(releases),
+        *(_desired_state(releases) if releases else ["Desired state: unchanged."]),
     ]
     trailers = [
         ("Operation", "expire-override"),
