@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import random
 import threading
+import time
 import uuid
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,6 +28,7 @@ from generator.errors import (
     fault,
 )
 from generator.service.expiry import LeaseClock
+from generator.service.following import Follower
 from generator.service.targets import of_decision as targets_of
 from generator.service.throttle import Throttle
 from generator.service.ticket import Receipt, Ticket
@@ -63,6 +65,7 @@ class Settler:
         waiting: Waiting,
         on_published: Callable[[Catalog], None],
         with_targets: bool,
+        fetch_interval: float = 0.0,
     ) -> None:
         self.snapshot = snapshot
         self._repository = repository
@@ -75,12 +78,15 @@ class Settler:
         self._tried: dict[str, datetime] = {}
         self._giving_up = threading.Event()
         embedded = repository.always_current
+        self.follower = Follower(repository, waiting, fetch_interval, self._line, self._taken)
         self._batch_limit = _BATCH_LIMIT_EMBEDDED if embedded else _BATCH_LIMIT_REMOTE
 
     def give_up(self) -> None:
         """Stop waiting for a remote that is away; from any thread."""
         self._giving_up.set()
+        self.follower.give_up()
         self._repository.give_up()
+        self._waiting.wake()
 
     def take_up(self, batch: list[Ticket]) -> None:
         """Move what waits into ``batch``, and behind it the demands whose lease ran out.
@@ -103,6 +109,8 @@ class Settler:
         while True:
             self._waiting.dismiss_withdrawn(batch)
             try:
+                if self.follower.link.is_away:  # what is committed cannot be taken back any more
+                    self._repository.refresh()
                 line = self._line()
                 arrived = self._arrived(line.start, batch)
                 results = [(ticket, self._judge(line, ticket, arrived)) for ticket in batch]
@@ -123,17 +131,34 @@ class Settler:
                 pause = min(pause, 1.0)
             except RemoteAway as error:
                 _doubt(batch, self.snapshot)
-                log.warning("%s; trying again in %.1f s", error, pause)
-            if self._giving_up.wait(pause * random.uniform(0.5, 1.0)):  # noqa: S311 - no secret
+                self.follower.out_of_touch(error)
+            self._linger(batch, pause * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
+            if self._giving_up.is_set():
                 raise ShuttingDown(
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
             pause = min(pause * 2, _LONGEST_PAUSE_S)
             self._waiting.take_up(batch, self._batch_limit)
 
+    def _linger(self, batch: list[Ticket], seconds: float) -> None:
+        """Let a while pass; demands that come in meanwhile are kept, and told why they wait."""
+        end = time.monotonic() + seconds
+        told = list(batch)
+        while not self._giving_up.is_set():
+            if self.follower.link.is_away:
+                for ticket in told:
+                    ticket.tell("away", f"waiting: {self.follower.link.contact.trouble}")
+            self._waiting.dismiss_withdrawn(batch)
+            left = end - time.monotonic()
+            if left <= 0:
+                return
+            told = self._waiting.keep(left)
+
     def pause(self) -> float:
-        """Return the seconds after which to look at the leases again."""
-        return self._clock.pause(self.snapshot.state.ledger, _LONGEST_WAIT_S)
+        """Return the seconds after which to look at the leases or at the state repo again."""
+        leases = self._clock.pause(self.snapshot.state.ledger, _LONGEST_WAIT_S)
+        look = self.follower.pause()
+        return leases if look is None else min(leases, look)
 
     def expired(self) -> list[Ticket]:
         """Return a ticket for each demand whose lease ran out; nobody waits for its receipt.
@@ -159,18 +184,11 @@ class Settler:
     def catch_up(self) -> None:
         """Try again what people changed and could not be carried out: a release may allow it."""
         if self.snapshot.problems:
-            self._take_in()
+            self.follower.catch_up()
 
     def notice(self) -> None:
-        """Take in what others published in a repository on this disk: its leases end here too."""
-        if self._repository.always_current and self._repository.tip() != self.snapshot.commit:
-            self._take_in()
-
-    def _take_in(self) -> None:
-        """Bring the snapshot to the newest tip, and publish what follows from people's changes."""
-        line = self._line()
-        if line.publish():
-            self._taken(line)
+        """Take in what others published, while no demand comes."""
+        self.follower.notice(self.snapshot)
 
     def tidy(self) -> None:
         """Every few hundred commits: a demand leaves some twenty loose objects behind."""
@@ -184,9 +202,11 @@ class Settler:
             published = line.publish()
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
+            self.follower.link.denied(str(error))
             return True
         if not published:
             return False
+        self.follower.in_touch(pushed=line.head.commit != line.start.commit)
         self._taken(line)
         self._since_tidy += len(results)
         return True
@@ -205,8 +225,7 @@ class Settler:
         advance = snapshots.advance(self._repository.objects, before, tip)
         line = writer.Line(self._repository, advance.snapshot)
         line.follow(advance, before, _now())
-        for found in line.head.problems:
-            log.error("%s (its last valid version stays in force)", found)
+        self.follower.tell(line.head.problems)
         return line
 
     def _judge(

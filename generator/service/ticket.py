@@ -19,7 +19,8 @@ from generator.staterepo.outbox import Entry
 
 log = logging.getLogger("demandops")
 
-Stage = Literal["admitted", "booked", "committed", "pushed"]
+Stage = Literal["away", "admitted", "booked", "committed", "pushed"]
+"""``away``: the state repo cannot be reached or takes nothing for now; the text says why."""
 Listener = Callable[[Stage, str], None]
 
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")

@@ -140,14 +140,14 @@ def of_follow(
     more: Iterable[tuple[str, str]] = (),
 ) -> str:
     """Return the message of a commit that carries out what people changed in the state repo."""
-    problems = list(problems)
-    body = [
-        "Carry out changes made in the state repo",
-        "",
-        f"Why: commits up to {cause[:12]} changed what is configured or booked.",
-        "",
-        *_desired_state(tuple(releases)),
-    ]
+    problems, releases = list(problems), tuple(releases)
+    why = f"Why: commits up to {cause[:12]} changed what is configured or booked."
+    title = "Carry out changes made in the state repo"
+    if not releases:
+        title = "Report what is not valid in the state repo"
+        title = title if problems else "Report that all of the state repo is valid again"
+    body = [title, "", why]
+    body += ["", *_desired_state(releases)] if releases else []
     if problems:
         body += ["", "Not taken in, for it is not valid:", *(f"  {found}" for found in problems)]
     trailers = [

@@ -21,7 +21,7 @@ from generator.demand.claim import Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
-from generator.staterepo import history, message
+from generator.staterepo import history, message, people, reports
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
@@ -85,16 +85,25 @@ class Line:
             state, change = self._carried_out(state, before, advance.subjects, problems)
         sound = before.sound if problems else snapshot.commit
         self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
-        if change.files:
+        files = {**change.files, **self._report(problems, before)}
+        if files:
+            causes = people.since(self._objects, before.sound or before.commit, snapshot.commit)
             text = message.of_follow(
                 change.releases,
                 str(snapshot.commit),
                 str(before.commit),
                 problems,
-                _in_force(self.head),
+                [*people.trailers(causes), *_in_force(self.head)],
             )
-            made = self._write(change.files, text, message.generator_signature(now), now)
+            made = self._write(files, text, people.author(causes, now), now)
             self.head = self.head.after(made, state, ())
+
+    def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
+        """Return the report on what is not valid, where it is not what stands there already."""
+        standing = self.read(reports.PATH)
+        origin = people.Origins(self._objects, before.sound or before.commit, self.start.commit)
+        wanted = reports.write(reports.reported(problems, reports.read(standing), origin))
+        return {} if wanted == standing else {reports.PATH: wanted}
 
     def _carried_out(
         self, state: State, before: Snapshot, subjects: Iterable[Subject], problems: list[Fault]
