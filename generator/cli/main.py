@@ -13,7 +13,7 @@ from importlib.metadata import EntryPoint, entry_points
 import click
 
 from generator import __version__
-from generator.cli import repo, request, schema, status, views
+from generator.cli import decommission, repo, request, schema, status, views
 from generator.cli.output import errors
 from generator.errors import DemandOpsError, InvalidInput
 
@@ -70,6 +70,7 @@ def cli(verbose: bool) -> None:
 
 cli.add_command(repo.init)
 cli.add_command(request.request)
+cli.add_command(decommission.decommission)
 cli.add_command(views.bookkeeping)
 cli.add_command(views.log)
 cli.add_command(views.diff)

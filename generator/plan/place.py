@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 from generator.catalog.catalog import Catalog
 from generator.catalog.inventory import Node
 from generator.catalog.policy import AccessDomain
@@ -21,7 +23,8 @@ def place(catalog: Catalog, node_id: str) -> tuple[Node, AccessDomain]:
             [
                 fault(
                     "node",
-                    f"'{node_id}' is in use, but not in {missing}; restore it",
+                    f"'{node_id}' is in use, but not in {missing}; restore it, or give up "
+                    f"what it holds: demandops decommission {shlex.quote(node_id)}",
                     code="unknown-node",
                 )
             ]

@@ -8,18 +8,33 @@ from __future__ import annotations
 
 import logging
 import random
+import re
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 
+from generator.catalog.policy import seconds_of
+
 log = logging.getLogger("demandops")
 
+DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
 _SHORTEST_GAP_S = 0.5
 _EMBEDDED_S = 1.0
 """A repository on this disk is looked at this often at least: it is one file that is read."""
+
+
+def interval_s(text: str) -> float:
+    """Return the seconds of a fetch interval: a duration like ``30s``, or seconds; 0: never.
+
+    Raises:
+        ValueError: where it is none.
+    """
+    if re.fullmatch(r"[0-9]{1,8}(\.[0-9]{1,6})?", text):
+        return float(text)
+    return float(seconds_of(text))
 
 
 def _jittered(interval: float) -> float:

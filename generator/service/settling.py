@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 from generator.catalog.catalog import Catalog
 from generator.decision import Decision, Outcome, decide
+from generator.demand import leaving
 from generator.demand.request import DemandRequest, Operation
 from generator.errors import (
     DemandOpsError,
@@ -285,6 +286,7 @@ def _commit(line: writer.Line, ticket: Ticket, decision: Decision) -> Receipt:
         warnings=decision.warnings,
         not_held=decision.changes.not_held,
         lease_s=decision.lease_s,
+        changes=decision.changes.claims,
     )
 
 
@@ -294,10 +296,11 @@ def _published_before(ticket: Ticket, arrival: history.Arrival) -> Receipt | Dem
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal if isinstance(ticket.goal, dict) else {}
     gives_up = goal.get("shutdown") or goal.get("operation") == Operation.RELEASE.value
+    gives_up = gives_up or leaving.is_leaving(goal)
     outcome: Outcome = "released" if gives_up else "booked"
     if arrival.outcome == "unchanged":
         outcome = "unchanged"
-    name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
+    name = goal.get("id") or goal.get("request") or goal.get("demand") or goal.get("name") or ""
     return Receipt(ticket.operation, str(name), outcome, arrival.commit)
 
 

@@ -20,7 +20,7 @@ from generator.decision import State, rehearse, rendered
 from generator.errors import Fault, InvalidInput, StateRepoError, fault
 from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger
-from generator.settings import GENERATED_ROOTS, MAIN_BRANCH
+from generator.settings import GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 
@@ -85,7 +85,7 @@ def _ledger(files: Mapping[str, str], faults: list[Fault]) -> Ledger:
 
 
 def _texts(folder: Path) -> Iterator[tuple[str, str]]:
-    for root in (*CONFIG_ROOTS, "ledger", *GENERATED_ROOTS):
+    for root in (*CONFIG_ROOTS, "ledger", *GENERATED_ROOTS, NOTES_ROOT):
         top = folder / root
         paths = [top] if top.is_file() else sorted(top.rglob("*"))
         for path in paths:
@@ -104,7 +104,7 @@ def _base_files(folder: Path, base: str | None) -> dict[str, str] | None:
     if repo.is_empty:
         return None
     commit = snapshots.commit_of(repo, base) if base else _started_from(repo)
-    return trees.texts(commit.tree, (*CONFIG_ROOTS, *GENERATED_ROOTS))
+    return trees.texts(commit.tree, (*CONFIG_ROOTS, *GENERATED_ROOTS, NOTES_ROOT))
 
 
 def _started_from(repo: Repository) -> Commit:
@@ -119,7 +119,8 @@ def _started_from(repo: Repository) -> Commit:
 
 def _hand_edits(files: Mapping[str, str], before: Mapping[str, str]) -> Iterator[Fault]:
     for path in sorted({*files, *before}):
-        if path.split("/")[0] not in GENERATED_ROOTS or trees.is_note(path):
+        generated = path.split("/")[0] in (*GENERATED_ROOTS, NOTES_ROOT)
+        if not generated or trees.is_note(path):
             continue
         if files.get(path) != before.get(path):
             yield fault(

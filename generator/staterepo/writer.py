@@ -21,7 +21,7 @@ from generator.demand.claim import Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
-from generator.staterepo import history, message, people, reports
+from generator.staterepo import history, holding, message, people, reports
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
@@ -71,18 +71,22 @@ class Line:
         What cannot be planned or rendered (a node that is in use is gone from the inventory) is
         left as it was before, and told in the head's problems.
         """
-        snapshot = advance.snapshot
-        state, problems = snapshot.state, list(snapshot.problems)
-        change = Changeset({}, ())
-        if advance.catalog_changed:
+        snapshot, good, found = self._held_back(advance.snapshot, before, advance.subjects)
+        problems = [*snapshot.problems, *found]
+        whole = advance.catalog_changed
+        if whole:
             try:
-                change = self._everything(state)
+                change = self._everything(snapshot.state)
             except InvalidInput as error:
                 problems += error.faults
-                state = replace(before.state, ledger=state.ledger)
-                advance = replace(advance, catalog_changed=False)
-        if not advance.catalog_changed:
-            state, change = self._carried_out(state, before, advance.subjects, problems)
+                state = replace(before.state, ledger=snapshot.state.ledger)
+                snapshot, good, found = self._held_back(
+                    replace(snapshot, state=state), before, good
+                )
+                problems, whole = [*problems, *found], False
+        state = snapshot.state
+        if not whole:
+            change = consequence(state, before.state.ledger, good, self.read)
         sound = before.sound if problems else snapshot.commit
         self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
         files = {**change.files, **self._report(problems, before)}
@@ -98,26 +102,17 @@ class Line:
             made = self._write(files, text, people.author(causes, now), now)
             self.head = self.head.after(made, state, ())
 
+    def _held_back(
+        self, snapshot: Snapshot, before: Snapshot, subjects: Iterable[Subject]
+    ) -> tuple[Snapshot, list[Subject], list[Fault]]:
+        return holding.held_back(self._objects, snapshot, before, subjects, self.read)
+
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
         """Return the report on what is not valid, where it is not what stands there already."""
         standing = self.read(reports.PATH)
         origin = people.Origins(self._objects, before.sound or before.commit, self.start.commit)
         wanted = reports.write(reports.reported(problems, reports.read(standing), origin))
         return {} if wanted == standing else {reports.PATH: wanted}
-
-    def _carried_out(
-        self, state: State, before: Snapshot, subjects: Iterable[Subject], problems: list[Fault]
-    ) -> tuple[State, Changeset]:
-        """Plan and render the subjects that people changed; one that fails stays as it was."""
-        good = []
-        for subject in subjects:
-            try:
-                consequence(state, before.state.ledger, [subject], self.read)
-                good.append(subject)
-            except InvalidInput as error:
-                problems += error.faults
-                state = replace(state, ledger=state.ledger.restored(subject, before.state.ledger))
-        return state, consequence(state, before.state.ledger, good, self.read)
 
     def _everything(self, state: State) -> Changeset:
         files: dict[str, str | None] = dict(rendered(state))
