@@ -24,15 +24,22 @@ from generator.plan.release import Release, ServiceKey, ServiceRelease
 ReleaseKey = ServiceKey | EndKey | BridgeKey
 
 
-def keys_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
-    """Yield what must run because ``subject`` is held."""
+def keys_of(
+    ledger: Ledger, catalog: Catalog, subject: Subject, *, strict: bool = False
+) -> Iterator[ReleaseKey]:
+    """Yield what must run because ``subject`` is held.
+
+    Of an application whose definition is gone nobody can say: nothing, or where ``strict`` it is
+    refused, for what runs must not stop because somebody deleted a file that it still needs.
+    """
     if subject.kind is SubjectKind.CONNECTION:
         yield from clients.keys_of(ledger, subject.id)
         return
     claims = ledger.application(subject.id)
     if not claims:
         return
-    appdef = catalog.appdefs.get(claims[0].appdef)
+    known = strict or claims[0].appdef in catalog.appdefs
+    appdef = _appdef(catalog, claims[0].appdef) if known else None
     for name, service in (appdef.services if appdef else {}).items():
         if service.each is None:
             yield ServiceKey(name, claims[0].node, application=subject.id)
@@ -50,20 +57,29 @@ def keys_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[Rele
 def affected(
     before: Ledger, after: Ledger, catalog: Catalog, subjects: Iterable[Subject]
 ) -> tuple[ReleaseKey, ...]:
-    """Return every release that a change of ``subjects`` may have added, altered or removed."""
+    """Return every release that a change of ``subjects`` may have added, altered or removed.
+
+    Raises:
+        Refused: where the definition of what is to run from now on is gone.
+    """
     keys = (
         key
         for subject in subjects
         for ledger in (before, after)
-        for key in keys_of(ledger, catalog, subject)
+        for key in keys_of(ledger, catalog, subject, strict=ledger is after)
     )
     return tuple(dict.fromkeys(keys))
 
 
 def all_keys(ledger: Ledger, catalog: Catalog) -> tuple[ReleaseKey, ...]:
-    """Return every release that the ledger asks for."""
+    """Return every release that the ledger asks for.
+
+    Raises:
+        Refused: where the definition of an application that is held is gone.
+    """
     subjects = [Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)]
-    return tuple(dict.fromkeys(key for s in subjects for key in keys_of(ledger, catalog, s)))
+    keys = (key for s in subjects for key in keys_of(ledger, catalog, s, strict=True))
+    return tuple(dict.fromkeys(keys))
 
 
 def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:

@@ -74,24 +74,16 @@ class Reader:
     ) -> Snapshot:
         """Load the books and the configuration that are in force at a commit.
 
-        Where people broke a file these are its last valid versions, as for the generator.
+        Where the generator reported that people broke a file, these are its last valid versions.
 
         Raises:
             InvalidInput, StateRepoError: where it holds no valid state repo.
         """
         commit = snapshots.commit_of(self._repository.objects, self.commit(revision))
         told = self._told_at(commit)
-        try:
-            if told:
-                return self._in_force_at(commit, told)
-            return snapshots.load(self._repository.objects, commit.id, progress)
-        except InvalidInput:
-            if told:
-                raise
-        base = history.last_generated(self._repository.objects, commit.id)
-        if base is None or base == commit.id:
-            return snapshots.load(self._repository.objects, commit.id, progress)
-        return self._in_force_at(commit, str(base))
+        if told:
+            return self._in_force_at(commit, told)
+        return snapshots.load(self._repository.objects, commit.id, progress)
 
     def _told_at(self, commit: Commit) -> str:
         """Return the commit whose configuration the generator told to be in force, if another."""
