@@ -194,7 +194,9 @@ def _run(
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
         # read when the node starts; a change of them now would do nothing, so none is taken
-        node.declare_parameter(name, shown, ParameterDescriptor(read_only=True))
+        of_any_type = name == "fetch_interval"
+        descriptor = ParameterDescriptor(read_only=True, dynamic_typing=of_any_type)
+        node.declare_parameter(name, shown, descriptor)
     set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
     library_log = logging.getLogger("demandops")
     library_log.handlers, library_log.propagate = [_ToRos(node)], False

@@ -6,6 +6,7 @@ come. Every break is mended again, and every commit verifies.
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from git_over_http import Server, serving
 from staterepo_rig import Person, Stages, goal, leave
 
 from generator import settings
+from generator.cli.main import run
 from generator.errors import QueueFull, Withdrawn
 from generator.service import Generator
 from generator.staterepo import reports
@@ -450,3 +452,33 @@ def test_a_lease_that_ends_while_the_remote_is_away_goes_when_it_is_back(
         )
     assert newest(bare).one("Operation") == "expire"
     rig.assert_sound(bare)
+
+
+# ---- what the command line tells ----
+
+
+def test_views_go_on_while_something_is_not_valid_and_say_so(
+    bare: Path, person: Person, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with rig.running(bare, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1))
+        made = person.change(_node_on_no_cluster(bare), "A merge gone wrong")
+        followed(bare, made)
+    problem = (
+        f"{NODES}: nodes[0].cluster: 'c-itz' is not in inventory/clusters.yaml; "
+        f"did you mean 'c-its'? (since {made[:10]} of Petra Platform <petra@example.org>)"
+    )
+    capsys.readouterr()
+    assert run(["status", "--state-repo", str(bare)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(
+        f"1 problems; of each file the last valid version is in force:\n  {problem}\n"
+    )
+    assert "of-edge-fusion-1" in out
+    assert run(["status", "--state-repo", str(bare), "--output", "json"]) == 0
+    (told,) = json.loads(capsys.readouterr().out)["problems"]
+    assert (told["file"], told["field"], told["since"]) == (NODES, "nodes[0].cluster", made)
+    assert run(["bookkeeping", "--state-repo", str(bare)]) == 0
+    shown = capsys.readouterr()
+    assert "edge/fusion-1" in shown.out
+    assert shown.err == f"warning: {problem}; its last valid version is in force\n"
