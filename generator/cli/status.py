@@ -72,9 +72,13 @@ def _print_problems(problems: Iterable[Problem]) -> None:
     """Print what is not valid in the state repo, as the generator reported it there."""
     lines = [f"  {problem}" for problem in problems]
     if lines:
-        console().print(f"{len(lines)} problems; of each file the last valid version is in force:")
+        console().print(f"{_counted(len(lines))}; of each file the last valid version is in force:")
     for line in lines:
         console().print(line, soft_wrap=True)
+
+
+def _counted(number: int) -> str:
+    return f"{number} problem{'s' if number > 1 else ''}"
 
 
 def _read(

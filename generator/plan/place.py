@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 
-from generator.catalog.catalog import Catalog
+from generator.catalog.catalog import DOMAINS_FILE, NODES_FILE, Catalog
 from generator.catalog.inventory import Node
 from generator.catalog.policy import AccessDomain
 from generator.errors import Refused, fault
@@ -18,7 +18,7 @@ def place(catalog: Catalog, node_id: str) -> tuple[Node, AccessDomain]:
     """
     node, domain = catalog.nodes.get(node_id), catalog.domain_of.get(node_id)
     if node is None or domain is None:
-        missing = "inventory/nodes.yaml" if node is None else "any access domain"
+        missing = NODES_FILE if node is None else "any access domain"
         raise Refused(
             [
                 fault(
@@ -26,7 +26,7 @@ def place(catalog: Catalog, node_id: str) -> tuple[Node, AccessDomain]:
                     f"'{node_id}' is in use, but not in {missing}; restore it, or give up "
                     f"what it holds: demandops decommission {shlex.quote(node_id)}",
                     code="unknown-node",
-                )
+                ).within(NODES_FILE if node is None else DOMAINS_FILE)
             ]
         )
     return node, domain

@@ -253,7 +253,7 @@ def _appdef(catalog: Catalog, name: str) -> ApplicationDefinition:
                     "appdef",
                     f"'{name}' is in use, but appdefs/{name} is gone; restore it",
                     code="unknown-application",
-                )
+                ).within(f"appdefs/{name}/appdef.yaml")
             ]
         )
     return appdef

@@ -124,6 +124,8 @@ class Follower:
 
     def out_of_touch(self, error: StateRepoError) -> None:
         """Note that the state repo could not be reached, or takes nothing."""
+        if self._given_up.is_set():  # nobody tries again, so it is no news
+            return
         self._waiting.blocked = str(error)
         self.link.lost(str(error))
         self._looks.done(reached=False)

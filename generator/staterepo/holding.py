@@ -38,7 +38,7 @@ def held_back(
         if found and _faults(
             replace(before.state, ledger=snapshot.state.ledger), before, subject, read
         ):
-            faults += _told_of(found, snapshot, subject)
+            faults += _told_of(found, snapshot, before, subject)
             snapshot = _holding(repo, snapshot, before, subject)
         else:
             good.append(subject)
@@ -53,10 +53,14 @@ def _faults(state: State, before: Snapshot, subject: Subject, read: Read) -> tup
     return ()
 
 
-def _told_of(faults: Iterable[Fault], snapshot: Snapshot, subject: Subject) -> list[Fault]:
-    """Return faults of a subject, each told to be in a claim's file."""
-    paths = [ledger_format.path_of(claim.key) for claim in snapshot.state.ledger.of(subject)]
-    return [found if found.file or not paths else found.within(paths[0]) for found in faults]
+def _told_of(
+    faults: Iterable[Fault], snapshot: Snapshot, before: Snapshot, subject: Subject
+) -> list[Fault]:
+    """Return faults of a subject, each told to be in the file of a claim that is another now."""
+    claims = snapshot.state.ledger.of(subject)
+    changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
+    paths = [ledger_format.path_of(claim.key) for claim in (changed or claims)]
+    return [found.within(paths[0]) if paths else found for found in faults]
 
 
 def _holding(repo: Repository, snapshot: Snapshot, before: Snapshot, subject: Subject) -> Snapshot:
