@@ -80,19 +80,29 @@ class Follower:
         """Return the seconds until the next look is due; nothing: none is."""
         return self._looks.pause()
 
-    def notice(self, known: Snapshot) -> None:
-        """Take in what others published, where it is time to look or it costs nothing."""
+    def notice(self, known: Snapshot, due: bool) -> bool:
+        """Take in what others published, where it is time to look or it costs nothing.
+
+        Args:
+            known: what was taken in last.
+            due: whether there is something to commit although nobody published anything.
+
+        Returns:
+            Whether the state repo was reached, or need not be.
+        """
         try:
             if self._looks.begin():
                 self._repository.look(lambda: self._waiting.urgent)
-            elif not self._repository.always_current:
-                return
-            new = self._repository.tip() != known.commit
+            elif not (self._repository.always_current or due):
+                return True
+            new = due or self._repository.tip() != known.commit
             self.in_touch(pushed=new and self._take_in())
         except CutShort:
             self._looks.again()
         except StateRepoError as error:
             self.out_of_touch(error)
+            return False
+        return True
 
     def catch_up(self) -> None:
         """Try again what people changed and could not be carried out: a release may allow it."""

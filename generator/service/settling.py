@@ -30,6 +30,7 @@ from generator.errors import (
 )
 from generator.service.expiry import LeaseClock
 from generator.service.following import Follower
+from generator.service.overriding import OverrideClock
 from generator.service.targets import of_decision as targets_of
 from generator.service.throttle import Throttle
 from generator.service.ticket import Receipt, Ticket
@@ -79,6 +80,7 @@ class Settler:
         self._since_tidy = 0
         self._throttle = Throttle()
         self._clock = LeaseClock()
+        self._overrides = OverrideClock()
         self._tried: dict[str, datetime] = {}
         self._ahead = Ahead()
         self._giving_up = threading.Event()
@@ -173,10 +175,12 @@ class Settler:
             told = self._waiting.keep(left)
 
     def pause(self) -> float:
-        """Return the seconds after which to look at the leases or at the state repo again."""
-        leases = self._clock.pause(self.snapshot.state.ledger, _LONGEST_WAIT_S)
+        """Return the seconds after which to look at leases, overrides or the state repo again."""
+        state = self.snapshot.state
+        ends = self._clock.pause(state.ledger, _LONGEST_WAIT_S)
+        ends = self._overrides.pause(state.catalog, _now(), ends)
         look = self.follower.pause()
-        return leases if look is None else min(leases, look)
+        return ends if look is None else min(ends, look)
 
     def expired(self) -> list[Ticket]:
         """Return a ticket for each demand whose lease ran out; nobody waits for its receipt.
@@ -205,8 +209,10 @@ class Settler:
             self.follower.catch_up()
 
     def notice(self) -> None:
-        """Take in what others published, while no demand comes."""
-        self.follower.notice(self.snapshot)
+        """Take in what others published, while no demand comes, and end overrides."""
+        due = self._overrides.anything(self.snapshot.state.catalog, _now())
+        if not self.follower.notice(self.snapshot, due):
+            self._overrides.put_off(_now())
 
     def tidy(self) -> None:
         """Every few hundred commits: a demand leaves some twenty loose objects behind."""
@@ -239,11 +245,14 @@ class Settler:
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems:
-            return writer.Line(self._repository, before)
+            line = writer.Line(self._repository, before)
+            self._overrides.end(line, _now())
+            return line
         advance = self._ahead.advance(self._repository.objects, before, tip)
         line = writer.Line(self._repository, advance.snapshot)
         line.follow(advance, before, _now())
         self.follower.tell(line.head.problems)
+        self._overrides.end(line, _now())
         return line
 
     def _judge(
