@@ -139,6 +139,7 @@ def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None
             }
         ],
         "outdated": [],
+        "warnings": [],
     }
 
 
