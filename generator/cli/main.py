@@ -13,7 +13,17 @@ from importlib.metadata import EntryPoint, entry_points
 import click
 
 from generator import __version__
-from generator.cli import check, overrides, repo, request, schema, status, upgrade, views
+from generator.cli import (
+    check,
+    decommission,
+    overrides,
+    repo,
+    request,
+    schema,
+    status,
+    upgrade,
+    views,
+)
 from generator.cli.output import errors
 from generator.errors import DemandOpsError, InvalidInput
 
@@ -70,6 +80,7 @@ def cli(verbose: bool) -> None:
 
 cli.add_command(repo.init)
 cli.add_command(request.request)
+cli.add_command(decommission.decommission)
 cli.add_command(views.bookkeeping)
 cli.add_command(views.log)
 cli.add_command(views.diff)

@@ -194,8 +194,13 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
 
 
 def _show_consequence(index: int, decision: Decision) -> None:
+    console().print(f"Request {index}: '{decision.request.id}' would be {decision.outcome}")
+    show_releases(decision)
+
+
+def show_releases(decision: Decision) -> None:
+    """Print what a decision changes: releases, and the files that are written or removed."""
     out = console()
-    out.print(f"Request {index}: '{decision.request.id}' would be {decision.outcome}")
     for release in decision.releases:
         out.print(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
         for detail in release.details:
