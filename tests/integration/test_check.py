@@ -180,7 +180,7 @@ def test_the_generators_notes_are_not_edited_by_hand(checkout: Path, check: Chec
     report.unlink()
     code, _, err = check()
     assert code == 1
-    assert err.startswith("error: .demandops/reports/problems.yaml: is generated")
+    assert err.startswith("error: .demandops/reports/problems.yaml: is the generator's own")
 
 
 def test_an_application_definition_that_is_in_use_cannot_be_deleted(
