@@ -89,15 +89,16 @@ def serve(ctx: click.Context, state_repo: str | None, access_file: Path | None) 
     try:
         settings = _parameters(state_repo)
         clusters = access.read(access_file).clusters if access_file else {}
-        waker = wake.Wake(clusters)
         with progress("reading the ledger") as tell:
             generator = Generator(
                 settings["state_repo"],
                 progress=tell,
-                on_published=waker,
                 with_targets=bool(clusters),
             )
-        status = Status(clusters, generator.includes) if clusters else None
+        waker = wake.Wake(clusters, generator.changed)
+        generator.watch(waker)
+        waker(generator.snapshot.state.catalog)  # an earlier run may have ended right after a push
+        status = Status(clusters, generator) if clusters else None
         _run(generator, settings, status)
         waker.close()
     finally:
