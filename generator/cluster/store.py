@@ -79,13 +79,15 @@ class ClusterStore:
 
     def read(self, wanted: Iterable[Watched]) -> None:
         """Read some objects once, without a watch; ``trouble`` says what went wrong."""
-        for one in wanted:
+        everything = list(wanted)
+        for one in everything:
             try:
                 self._put(one, self._list(one)["items"])
             except Exception as error:
+                if not _answered(error):  # the others would be waited for in vain
+                    self._troubles |= dict.fromkeys(everything, _told(one, error))
+                    return
                 self._troubles[one] = _told(one, error)
-                if not _answered(error):
-                    return  # the others would be waited for in vain
 
     def refresh(self, wanted: Iterable[Watched]) -> None:
         """Read some objects anew, in this order: watches may lag behind each other.
