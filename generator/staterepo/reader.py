@@ -10,6 +10,7 @@ from pathlib import Path
 from pygit2 import Commit
 
 from generator import settings
+from generator.catalog.catalog import Catalog
 from generator.decision import rendered
 from generator.errors import InvalidInput
 from generator.render.changeset import Read
@@ -120,7 +121,7 @@ class Reader:
             why = f"a person's file was not valid then: {error.faults[0]}"
             return Verdict(entry.commit, entry.summary, True, why)
         try:
-            wanted = rendered(snapshot.state)
+            wanted = rendered(snapshot.state, _held_from(commit, snapshot.state.catalog))
         except InvalidInput as error:  # the generator did render it then, so it must now
             return Verdict(entry.commit, entry.summary, False, fault=str(error.faults[0]))
         differing = _differing(wanted, commit)
@@ -135,7 +136,17 @@ class Reader:
             return snapshots.load(self._repository.objects, commit.id)
         snapshot = snapshots.load(self._repository.objects, sound)
         later = snapshots.advance(self._repository.objects, snapshot, commit.id).snapshot
-        return replace(later, state=replace(snapshot.state, ledger=later.state.ledger))
+        catalog = snapshot.state.catalog.with_ended(later.state.catalog.ended)
+        return replace(
+            later, state=replace(snapshot.state, catalog=catalog, ledger=later.state.ledger)
+        )
+
+
+def _held_from(commit: Commit, catalog: Catalog) -> dict[str, str]:
+    """Return the files as they were before a commit, where overrides hold some of them."""
+    if not commit.parents or not any(override.hold for override in catalog.in_force):
+        return {}
+    return trees.texts(commit.parents[0].tree, GENERATED_ROOTS)
 
 
 def _differing(wanted: dict[str, str], commit: Commit) -> tuple[str, ...]:
