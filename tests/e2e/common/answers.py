@@ -95,6 +95,10 @@ def with_chart(world: World, added: str) -> dict[str, str]:
 class Answers:
     """The requester hears what came of it: goals answered at reconciled or healthy, or why not."""
 
+    def all_applied(self, world: Any) -> None:
+        """Wait until the controller has nothing left to do but to wait for pods."""
+        raise NotImplementedError
+
     def mended(self, world: World) -> None:
         """Have the controller look at a chart that was mended, where it does not by itself."""
 
@@ -161,7 +165,7 @@ class Answers:
         asker.send({"operation": "release", "demand": "d", "answer": "healthy"})
 
     def test_not_answered_before_it_is_healthy(
-        self, world: World, asker: DemandClient, edge_is_full: Callable[[], None]
+        self, world: World, asker: DemandClient, edge_is_full: Callable[[], None], rig: Rig
     ) -> None:
         """Reconciled comes at once; healthy waits until the edge takes pods again."""
         reconciled = threading.Event()
@@ -173,6 +177,8 @@ class Answers:
         with ThreadPoolExecutor(1) as pool:
             waiting = pool.submit(asker.put, "d", [FUSION], answer="healthy", told=told)
             assert reconciled.wait(TIMEOUT_S)
+            rig.kube.wait("all Deployments", lambda: len(world.domain.find("Deployment")) == 4)
+            self.all_applied(world)
             time.sleep(2)
             assert not waiting.done()
             assert unavailable(world.domain) != []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from tests.e2e.common.access import access_file, documented_roles, limited
@@ -25,4 +27,8 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 
 class TestFlux(Answers):
-    """Nothing is particular here."""
+    """What is particular to Flux."""
+
+    def all_applied(self, world: Any) -> None:
+        """Each HelmRelease is ready, for it does not wait for pods."""
+        world.domain.wait_releases_ready()
