@@ -176,9 +176,6 @@ class DemandNode(Node):  # type: ignore[misc]
         """Return why it cannot be told what comes of a demand; empty where it can."""
         if self._answers.status is None:
             return "answered at pushed: this node has no access to the clusters"
-        gitops = self._generator.snapshot.state.catalog.repository.gitops
-        if gitops != "flux":
-            return f"answered at pushed: what {gitops} makes of it is not read yet"
         problem = self._answers.status.reaches(target.place for target in receipt.targets)
         return f"answered at pushed: {problem}" if problem else ""
 

@@ -119,17 +119,18 @@ def serve(
         settings = _parameters(state_repo, fetch_interval)
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
-        waker = wake.Wake(clusters)
         with progress("reading the ledger") as tell:
             generator = Generator(
                 settings["state_repo"],
                 progress=tell,
-                on_published=waker,
                 with_targets=bool(clusters),
                 fetch_interval=interval_s(settings["fetch_interval"]),
             )
+        waker = wake.Wake(clusters, generator.changed)
+        generator.watch(waker)
+        waker(generator.snapshot.state.catalog)  # an earlier run may have ended right after a push
         hook = Webhook(webhook, secret, generator.look) if webhook else None
-        status = Status(clusters, generator.includes) if clusters else None
+        status = Status(clusters, generator) if clusters else None
         _run(generator, settings, status, hook)
         waker.close()
     finally:

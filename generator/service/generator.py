@@ -37,7 +37,6 @@ class Generator:
         with_targets: bool = False,
         fetch_interval: float = 0.0,
         progress: Progress = lambda done, total: None,
-        on_published: Callable[[Catalog], None] = lambda catalog: None,
     ) -> None:
         """Open the state repo and start the worker; what an earlier run left over comes first.
 
@@ -50,8 +49,6 @@ class Generator:
             fetch_interval: seconds between two looks at what others published, while no demand
                 comes; 0: a repository on this disk only, and seldom.
             progress: told (files read, files in all) while the ledger is loaded.
-            on_published: called in the worker thread after every push, with the catalog in force;
-                must return at once.
 
         Raises:
             StateRepoError, InvalidInput: where the state repo cannot be used.
@@ -68,7 +65,7 @@ class Generator:
         self.address = repository.address
         self.queue_limit = queue_limit
         self._waiting = Waiting(self._slot.outbox, queue_limit)
-        self._watchers = [on_published]
+        self._watchers: list[Callable[[Catalog], None]] = []
         self._settler = Settler(
             repository,
             snapshot,
@@ -128,12 +125,27 @@ class Generator:
         """Tell whether ``commit`` is ``other`` or comes after it; from any thread."""
         return self._repository.includes(commit, other)
 
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Tell whether two commits hold the same under ``path``; from any thread."""
+        return self._repository.unchanged(commit, other, path)
+
+    def changed(self, since: str) -> tuple[str, list[str] | None]:
+        """Return the newest published commit and which paths changed since another.
+
+        The paths are None where that other is not known. From any thread.
+        """
+        commit = str(self.snapshot.commit)
+        return commit, self._repository.changed(since, commit)
+
     def withdraw(self, operation: str) -> bool:
         """Take a demand back. False once it is committed, or was never known."""
         return self._waiting.withdraw(operation)
 
     def watch(self, on_published: Callable[[Catalog], None]) -> None:
-        """Have ``on_published`` called as well after every push, in the worker thread."""
+        """Have ``on_published`` called after every push, in the worker thread.
+
+        It is given the catalog in force and must return at once.
+        """
         self._watchers.append(on_published)
 
     def _tell_watchers(self, catalog: Catalog) -> None:

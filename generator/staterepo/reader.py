@@ -85,6 +85,10 @@ class Reader:
         """Tell whether ``commit`` is ``other`` or comes after it."""
         return self._repository.includes(commit, other)
 
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Tell whether two commits hold the same under ``path``."""
+        return self._repository.unchanged(commit, other, path)
+
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
