@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
-from generator.demand import admission, carriers, own, permission, wire
+from generator.demand import admission, approval, carriers, own, permission, wire
 from generator.demand.claim import Subject
 from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from generator.errors import Fault, InvalidInput, Refused
@@ -58,7 +58,10 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What a demand does. ``files`` is empty where it changes nothing."""
+    """What a demand does. ``files`` is empty where it changes nothing.
+
+    ``approval`` names what asks for a person's approval first: access domains, rules, appdefs.
+    """
 
     request: DemandRequest
     outcome: Outcome
@@ -67,6 +70,7 @@ class Decision:
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
+    approval: tuple[str, ...] = ()
 
     @property
     def lease_s(self) -> int | None:
@@ -127,7 +131,20 @@ def decide(
             *_uncarried(request, ledger, state.catalog),
             *_bridged(request, state.catalog),
         ),
+        approval=_approval(request, changes, state.catalog),
     )
+
+
+def _approval(request: DemandRequest, changes: Changes, catalog: Catalog) -> tuple[str, ...]:
+    """Return what asks for approval; what renews or gives up needs none."""
+    if not request.operation.asks:
+        return ()
+    asked = (
+        change.after
+        for change in changes.claims
+        if change.after and (change.before is None or change.before.booked != change.after.booked)
+    )
+    return approval.asked_by(asked, catalog)
 
 
 def admit(

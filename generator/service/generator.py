@@ -11,6 +11,7 @@ from pathlib import Path
 from generator import settings
 from generator.catalog.catalog import Catalog
 from generator.errors import DemandOpsError, ShuttingDown, StateRepoError
+from generator.service.approval import Approvals
 from generator.service.settling import Settler
 from generator.service.ticket import Listener, Ticket, handed_in
 from generator.service.waiting import Waiting
@@ -65,8 +66,16 @@ class Generator:
         self.queue_limit = queue_limit
         self._waiting = Waiting(self._slot.outbox, queue_limit)
         self._watchers = [on_published]
+        self._approvals = Approvals(
+            repository, self._waiting, with_targets, settings.forge_token_file()
+        )
         self._settler = Settler(
-            repository, snapshot, self._waiting, self._tell_watchers, with_targets
+            repository,
+            snapshot,
+            self._waiting,
+            self._tell_watchers,
+            with_targets,
+            self._approvals,
         )
         self._finished: Future[bool] | None = None
         self._stop_lock = threading.Lock()
@@ -163,10 +172,11 @@ class Generator:
                 self._settler.take_up(batch)
                 if not batch:
                     self._settler.notice()
-                    continue
-                self._settler.settle(batch)
-                self._settler.catch_up()
-                self._settler.tidy()
+                else:
+                    self._settler.settle(batch)
+                    self._settler.catch_up()
+                    self._settler.tidy()
+                self._settler.attend()
             except ShuttingDown as error:
                 self._waiting.fail(batch, error, keep=True)
             except DemandOpsError as error:
@@ -175,3 +185,4 @@ class Generator:
                 log.exception("a fault of the generator")
                 told = StateRepoError(f"a fault of the generator: {error!r}; its log says more")
                 self._waiting.fail(batch, told)
+        self._approvals.suspend()

@@ -26,6 +26,7 @@ from generator.errors import (
     Withdrawn,
     fault,
 )
+from generator.service.approval import GIVEN_UP, Approvals, Deferred
 from generator.service.expiry import LeaseClock
 from generator.service.targets import of_decision as targets_of
 from generator.service.throttle import Throttle
@@ -47,7 +48,7 @@ _TIDY_EVERY = 300
 _LONGEST_WAIT_S = 60.0
 """Between two looks at the leases: a clock may be set meanwhile."""
 
-_Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError]
+_Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Deferred]
 
 
 class Settler:
@@ -63,8 +64,10 @@ class Settler:
         waiting: Waiting,
         on_published: Callable[[Catalog], None],
         with_targets: bool,
+        approvals: Approvals,
     ) -> None:
         self.snapshot = snapshot
+        self._approvals = approvals
         self._repository = repository
         self._waiting = waiting
         self._on_published = on_published
@@ -87,9 +90,13 @@ class Settler:
 
         A renewal that waits was received before: it is judged first, or nothing expires yet.
         """
-        self._waiting.take_up(batch, self._batch_limit)
+        self._take_up(batch)
         if not self._waiting.anything:
             batch += self.expired()
+
+    def _take_up(self, batch: list[Ticket]) -> None:
+        self._waiting.take_up(batch, self._batch_limit)
+        self._approvals.resume(batch, self.snapshot.state)
 
     def settle(self, batch: list[Ticket]) -> None:
         """Bring a batch to an end, with what comes in while the remote moves, and empty it.
@@ -103,9 +110,12 @@ class Settler:
         while True:
             self._waiting.dismiss_withdrawn(batch)
             try:
+                self._approvals.give_up(batch, self.snapshot.state)
                 line = self._line()
                 arrived = self._arrived(line.start, batch)
-                results = [(ticket, self._judge(line, ticket, arrived)) for ticket in batch]
+                results: list[_Result] = []
+                for ticket in batch:
+                    results.append((ticket, self._judge(line, ticket, arrived, results)))
                 nothing_to_push = line.head.commit == line.start.commit
                 if nothing_to_push and not verdict_is_current:
                     # only a push would have shown that the remote has moved
@@ -114,7 +124,7 @@ class Settler:
                     if tip != line.start.commit:
                         continue
                 if self._publish(line, results):
-                    self._waiting.answer(results)
+                    self._answer(results)
                     batch.clear()
                     return
                 log.info("the state repo has moved; judging %d demands again", len(batch))
@@ -129,11 +139,35 @@ class Settler:
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
             pause = min(pause * 2, _LONGEST_PAUSE_S)
-            self._waiting.take_up(batch, self._batch_limit)
+            self._take_up(batch)
+
+    def _answer(self, results: list[_Result]) -> None:
+        """Answer what is settled; what needs approval waits on."""
+        told = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
+        self._waiting.answer(told)
+        for ticket, result in results:
+            if isinstance(result, Deferred):
+                self._approvals.take(ticket, result.decision)
+
+    def attend(self) -> None:
+        """Look after the demands that await approval, with main as it is now."""
+        if not self._approvals.is_due(str(self.snapshot.commit)):
+            return
+        try:
+            heads = self._approvals.heads()
+            if heads.main != str(self.snapshot.commit):
+                self._repository.refresh()
+                self._take_in()
+            # a branch that is gone may have been merged: only a newer main tells
+            if self._repository.includes(str(self.snapshot.commit), heads.main):
+                self._approvals.look(self.snapshot, heads)
+        except (RemoteAway, PushDenied) as error:
+            log.warning("%s; the demands that await approval wait on", error)
 
     def pause(self) -> float:
-        """Return the seconds after which to look at the leases again."""
-        return self._clock.pause(self.snapshot.state.ledger, _LONGEST_WAIT_S)
+        """Return the seconds until the next look at the leases, and at what awaits approval."""
+        longest = self._approvals.pause(_LONGEST_WAIT_S)
+        return self._clock.pause(self.snapshot.state.ledger, longest)
 
     def expired(self) -> list[Ticket]:
         """Return a ticket for each demand whose lease ran out; nobody waits for its receipt.
@@ -210,13 +244,21 @@ class Settler:
         return line
 
     def _judge(
-        self, line: writer.Line, ticket: Ticket, arrived: dict[str, history.Arrival]
-    ) -> Receipt | DemandOpsError:
+        self,
+        line: writer.Line,
+        ticket: Ticket,
+        arrived: dict[str, history.Arrival],
+        earlier: list[_Result],
+    ) -> Receipt | DemandOpsError | Deferred:
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
         if ticket.operation in arrived:
             return _published_before(ticket, arrived[ticket.operation])
         try:
+            gone = self._approvals.gave_up(ticket, line.head.state, earlier)
+            earlier[:] = [
+                (t, Withdrawn(GIVEN_UP) if t.operation in gone else r) for t, r in earlier
+            ]
             decision = decide(
                 line.head.state,
                 ticket.goal,
@@ -227,12 +269,18 @@ class Settler:
                     request, catalog, ticket.operation, ticket.received
                 ),
             )
+            if decision.approval:
+                return Deferred(decision)
             if not self._waiting.hold(ticket):
                 return Withdrawn(TAKEN_BACK)
+            self._approvals.replaced_by(decision.request)
             before = line.head.state.ledger
             targets = targets_of(before, decision) if self._with_targets else ()
             return replace(_commit(line, ticket, decision), targets=targets)
         except InvalidInput as error:
+            if self._approvals.released(ticket):  # what was proposed, and nothing else
+                line.note(ticket.operation, "Unchanged")
+                return _released(ticket, str(line.head.commit))
             line.note(ticket.operation, "Refused")
             return error
         except Exception as error:  # one demand that the program cannot handle stops no other
@@ -280,6 +328,12 @@ def _published_before(ticket: Ticket, arrival: history.Arrival) -> Receipt | Dem
         outcome = "unchanged"
     name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
     return Receipt(ticket.operation, str(name), outcome, arrival.commit)
+
+
+def _released(ticket: Ticket, commit: str) -> Receipt:
+    goal = ticket.goal
+    name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
+    return Receipt(ticket.operation, str(name), "released", commit)
 
 
 def _doubt(batch: list[Ticket], start: Snapshot) -> None:

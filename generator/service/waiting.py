@@ -10,9 +10,10 @@ import threading
 from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 
 from generator.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
-from generator.service.ticket import Receipt, Ticket, left_over
+from generator.service.ticket import Receipt, Record, Ticket, left_over
 from generator.staterepo.outbox import Outbox
 
 TAKEN_BACK = "the demand was taken back before it was committed"
@@ -28,6 +29,7 @@ class Waiting:
         self._queue = deque(left_over(entry) for entry in outbox.pending.values())
         self._tickets = {ticket.operation: ticket for ticket in self._queue}
         self._closed = False
+        self._woken = False
 
     @property
     def operations(self) -> tuple[str, ...]:
@@ -42,8 +44,8 @@ class Waiting:
 
     @property
     def unpublished(self) -> int:
-        """How many demands the outbox holds."""
-        return len(self._outbox.pending)
+        """How many demands the outbox holds, but for those that await approval."""
+        return sum(1 for entry in self._outbox.pending.values() if entry.proposal is None)
 
     def add(self, ticket: Ticket) -> None:
         """Put a demand in.
@@ -69,9 +71,37 @@ class Waiting:
     def wait(self, timeout: float | None) -> bool:
         """Wait until something is there or ``timeout`` has passed; false once all is settled."""
         with self._changed:
-            if not self._queue and not self._closed:
+            if not self._queue and not self._closed and not self._woken:
                 self._changed.wait(timeout)
+            self._woken = False
             return bool(self._queue) or not self._closed
+
+    def wake(self) -> None:
+        """End :meth:`wait`, now or the next time: there is something to look after."""
+        with self._changed:
+            self._woken = True
+            self._changed.notify()
+
+    def propose(self, ticket: Ticket, record: Record) -> bool:
+        """Keep on the disk what a demand awaits approval on; false where it was taken back.
+
+        Until it is booked, a demand that awaits approval can be taken back.
+        """
+        with self._changed:
+            if ticket.state == "withdrawn":
+                return False
+            ticket.state, ticket.proposal = "waiting", record
+            self._outbox.append([ticket.entry()])
+        return True
+
+    def requeue(self, tickets: Iterable[Ticket]) -> None:
+        """Put demands in again that need no approval any more."""
+        with self._changed:
+            for ticket in tickets:
+                ticket.proposal = None
+                self._outbox.append([ticket.entry()])
+                self._queue.append(ticket)
+            self._changed.notify()
 
     def take_up(self, batch: list[Ticket], limit: int) -> None:
         """Move what waits into the batch, up to ``limit`` in all, and journal it."""
@@ -91,9 +121,28 @@ class Waiting:
             ticket = self._tickets.get(operation)
             if ticket is None or ticket.state != "waiting":
                 return ticket is not None and ticket.state == "withdrawn"
-            ticket.state = "withdrawn"
-            self._outbox.done([operation], durably=True)  # nor may a restart take it up
+            if ticket.proposal is None:
+                ticket.state = "withdrawn"
+                self._outbox.done([operation], durably=True)  # nor may a restart take it up
+            else:
+                self._mark(ticket, TAKEN_BACK)
         return True
+
+    def retract(self, tickets: Iterable[Ticket], reason: str) -> None:
+        """Mark demands that await approval as ones to go; a restart knows it as well."""
+        with self._changed:
+            for ticket in tickets:
+                self._mark(ticket, reason)
+
+    def _mark(self, ticket: Ticket, reason: str) -> None:
+        """Kept in the outbox until the branch is gone: nobody may merge what was taken back."""
+        if ticket.proposal is None or ticket.state != "waiting":
+            return
+        ticket.state = "withdrawn"
+        ticket.proposal = replace(ticket.proposal, withdrawn=reason)
+        self._outbox.append([ticket.entry()])
+        self._woken = True
+        self._changed.notify()
 
     def hold(self, ticket: Ticket) -> bool:
         """Make a demand one that cannot be taken back any more; false where it was."""
