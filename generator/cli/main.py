@@ -13,7 +13,7 @@ from importlib.metadata import EntryPoint, entry_points
 import click
 
 from generator import __version__
-from generator.cli import repo, request, schema, status, views
+from generator.cli import proposals, repo, request, schema, status, views
 from generator.cli.output import errors
 from generator.errors import DemandOpsError, InvalidInput
 
@@ -77,6 +77,7 @@ cli.add_command(repo.check)
 cli.add_command(repo.verify)
 cli.add_command(schema.schema)
 cli.add_command(status.status)
+cli.add_command(proposals.proposals)
 
 
 def main(args: list[str] | None = None) -> None:

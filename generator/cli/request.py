@@ -24,6 +24,7 @@ from generator.cli.output import (
 from generator.decision import Decision, admit, decide, form_faults
 from generator.errors import DemandOpsError, Fault, InvalidInput, fault
 from generator.service import Generator, Receipt
+from generator.service.proposal import where_told
 from generator.staterepo import reader
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
@@ -179,7 +180,7 @@ def _handed_in(
         if wait:
             errors.print(f"{document.file}: request '{name}' {text}")
         elif not answer.done():
-            answer.set_result(_proposal(text))
+            answer.set_result(where_told(text))
 
     def finish(future: Future[Receipt]) -> None:
         if answer.done():
@@ -192,12 +193,6 @@ def _handed_in(
 
     generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
     return answer
-
-
-def _proposal(text: str) -> dict[str, str]:
-    """Return branch, link and reasons of what a requester is told."""
-    found = _AWAITING.match(text)
-    return {key: value or "" for key, value in found.groupdict().items()} if found else {}
 
 
 def _booked(index: int, receipt: Receipt) -> dict[str, Any]:

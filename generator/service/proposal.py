@@ -17,6 +17,8 @@ from generator.service.ticket import Record, Ticket
 
 Key = tuple[str, ...]
 
+_NEWS = "awaiting approval: "
+
 
 @dataclass(eq=False)
 class Proposal:
@@ -85,7 +87,14 @@ def news(branch: str, link: str, reasons: Iterable[str]) -> str:
     """Return what a requester is told while the demand waits."""
     where = f"{branch} {link}" if link else branch
     why = ", ".join(reasons)
-    return f"awaiting approval: {where}" + (f" (asked for by {why})" if why else "")
+    return f"{_NEWS}{where}" + (f" (asked for by {why})" if why else "")
+
+
+def where_told(text: str) -> dict[str, str]:
+    """Return branch and link out of :func:`news`; no link where there is none."""
+    branch, _, rest = text.removeprefix(_NEWS).partition(" ")
+    link = rest.split(" ")[0] if rest.startswith("http") else ""
+    return {"branch": branch, "link": link}
 
 
 def markdown(message: str, reasons: Iterable[str]) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from pygit2 import Commit
 
 from generator import settings
+from generator.catalog.catalog import Catalog
 from generator.decision import rendered
 from generator.errors import InvalidInput
 from generator.render.changeset import Read
@@ -19,7 +20,9 @@ from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.address import is_url
 from generator.staterepo.history import LogEntry
+from generator.staterepo.message import PROPOSAL
 from generator.staterepo.outbox import Slot
+from generator.staterepo.proposals import Waiting, waiting
 from generator.staterepo.snapshot import Progress, Snapshot
 
 
@@ -84,6 +87,22 @@ class Reader:
         tree = snapshots.commit_of(self._repository.objects, self.commit(revision)).tree
         return lambda path: trees.read_text(tree, path)
 
+    def catalog(self) -> Catalog:
+        """Return the configuration at the newest commit.
+
+        Raises:
+            InvalidInput, StateRepoError: where it holds no valid one.
+        """
+        return snapshots.catalog_at(snapshots.commit_of(self._repository.objects, self._tip).tree)
+
+    def proposals(self) -> list[Waiting]:
+        """Return the demands that await approval, by branch.
+
+        Raises:
+            RemoteAway: where the remote does not answer.
+        """
+        return list(waiting(self._repository))
+
     def log(self, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
         first, dots, last = (spec or "").partition("..")
@@ -101,7 +120,7 @@ class Reader:
         commit = snapshots.commit_of(self._repository.objects, revision)
         entry = history.entry_of(commit)
         if not entry.by_generator:
-            return Verdict(entry.commit, entry.summary, True, "made by a person")
+            return Verdict(entry.commit, entry.summary, True, _not_ours(entry))
         version = entry.one("Render-Version")
         if version != str(RENDER_VERSION):
             return Verdict(
@@ -132,6 +151,10 @@ class Reader:
         snapshot = snapshots.load(self._repository.objects, sound)
         later = snapshots.advance(self._repository.objects, snapshot, commit.id).snapshot
         return replace(later, state=replace(snapshot.state, ledger=later.state.ledger))
+
+
+def _not_ours(entry: LogEntry) -> str:
+    return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
 
 
 def _differing(wanted: dict[str, str], commit: Commit) -> tuple[str, ...]:
