@@ -28,16 +28,16 @@ class GitHub:
         self._pulls = f"/repos/{quote(owner, safe='')}/{quote(name, safe='')}/pulls"
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the open pull request for a branch, or a new one."""
+        """Return the pull request for a branch, or a new one where there was none."""
         found = self.find(branch, target)
-        if found is not None and found.state == "open":
+        if found is not None:
             return found
         content = {"title": title, "head": branch, "base": target, "body": body}
         try:
             return _read(self._api.call("POST", self._pulls, _HEADERS, content))
         except ForgeError as error:
             found = self.find(branch, target) if error.status == _EXISTS else None
-            if found is None or found.state != "open":
+            if found is None:
                 raise
             return found  # the answer to an earlier call was lost
 

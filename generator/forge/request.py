@@ -21,7 +21,10 @@ class Forge(Protocol):
     """A project on a forge. Every method raises ``ForgeError`` where the forge does not comply."""
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the request for a branch: the open one where there is one, else a new one."""
+        """Return the request for a branch, or a new one where there was none.
+
+        A branch is never proposed twice, so one that was closed is not opened again.
+        """
 
     def find(self, branch: str, target: str) -> PullRequest | None:
         """Return the newest request for a branch, whatever became of it."""
