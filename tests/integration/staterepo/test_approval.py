@@ -5,7 +5,6 @@ The person's part is played by git itself: merges, squashes, rebases, deleted br
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,11 @@ from typing import Any
 import pytest
 import staterepo_rig as rig
 import yaml
+from approving import Petra, Proposed, branches
 from staterepo_rig import git, goal, leave
 
 from generator.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
-from generator.service import Generator, Ticket, approval
-
-POLICY = "policy/access-domains.yaml"
+from generator.service import approval
 
 
 @pytest.fixture(autouse=True)
@@ -28,85 +26,11 @@ def _eager(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(approval, "ASK_REMOTE_S", 0.1)
 
 
-class Petra:
-    """The platform engineer, with a clone of her own."""
-
-    def __init__(self, bare: Path, folder: Path) -> None:
-        self.bare, self.folder = bare, folder
-        self._person = rig.Person(bare, folder)
-
-    def policy(self, **changed: Any) -> None:
-        """Change every access domain."""
-        self.fetch()
-        data = yaml.safe_load(git(self.folder, "show", f"origin/main:{POLICY}"))
-        for domain in data["domains"]:
-            domain.update(changed)
-        self._person.change({POLICY: yaml.safe_dump(data)}, "Demands need approval")
-
-    def change(self, files: dict[str, str | None], text: str = "By hand") -> str:
-        return self._person.change(files, text)
-
-    def fetch(self) -> None:
-        git(self.folder, "fetch", "--quiet", "--prune", "origin")
-        git(self.folder, "reset", "--quiet", "--hard", "origin/main")
-
-    def merge(self, branch: str, *options: str) -> None:
-        self.fetch()
-        git(self.folder, "merge", "--quiet", *options, f"origin/{branch}")
-        git(self.folder, "push", "--quiet", "origin", "HEAD:main")
-
-    def squash(self, branch: str, message: str) -> None:
-        self.fetch()
-        git(self.folder, "merge", "--quiet", "--squash", f"origin/{branch}")
-        git(self.folder, "commit", "--quiet", "--message", message)
-        git(self.folder, "push", "--quiet", "origin", "HEAD:main")
-
-    def rebase(self, branch: str, *options: str) -> None:
-        self.fetch()
-        git(self.folder, "checkout", "--quiet", "-B", "work", f"origin/{branch}")
-        git(self.folder, "rebase", "--quiet", *options, "origin/main")
-        git(self.folder, "push", "--quiet", "origin", "HEAD:main")
-        git(self.folder, "checkout", "--quiet", "-")
-
-    def delete(self, branch: str) -> None:
-        git(self.folder, "push", "--quiet", "origin", f":{branch}")
-
-
 @pytest.fixture
 def petra(bare: Path, tmp_path: Path) -> Petra:
     made = Petra(bare, tmp_path / "petra")
     made.policy(approval="required")
     return made
-
-
-def branches(bare: Path) -> list[str]:
-    refs = git(bare, "for-each-ref", "--format=%(refname:short)", "refs/heads/demand")
-    return refs.splitlines()
-
-
-class Proposed:
-    """A demand handed in, and the branch that it waits on."""
-
-    def __init__(self, generator: Generator, made: Any, operation: str | None = None) -> None:
-        self.told: list[tuple[str, str]] = []
-        self._seen = threading.Event()
-        self.ticket: Ticket = generator.submit(made, operation, self._listen)
-
-    def _listen(self, stage: str, text: str) -> None:
-        self.told.append((stage, text))
-        if stage == "proposed":
-            self._seen.set()
-
-    @property
-    def branch(self) -> str:
-        if not self._seen.wait(rig.PATIENCE_S):
-            raise AssertionError(f"never proposed: {self.told} {self.ticket.future}")
-        text = [text for stage, text in self.told if stage == "proposed"][-1]
-        assert text.startswith("awaiting approval: demand/")
-        return text.split()[2]
-
-    def outcome(self) -> str:
-        return rig.receipt(self.ticket).outcome
 
 
 def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_it(
