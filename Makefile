@@ -7,7 +7,7 @@ STAMP  := $(VENV)/.setup-done
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test e2e e2e-argocd check format golden bench wheel clean
+.PHONY: help setup demo test e2e e2e-argocd check format golden bench load wheel clean
 
 help:  ## Show what there is to make
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -55,6 +55,9 @@ golden: setup  ## Write the golden folders anew; review the diff
 
 bench: setup  ## Measure what a commit costs, beside the floor
 	@$(PY) -m tests.benchmarks.commits
+
+load: setup  ## Four generators and a person write at once, 2,000 demands, connections are cut
+	@DEMANDOPS_LOAD_DEMANDS=2000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/staterepo/test_many_writers.py
 
 wheel: setup  ## Build the wheel into dist/
 	@$(PY) -m build --wheel --outdir dist .

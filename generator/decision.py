@@ -139,11 +139,15 @@ def _approval(request: DemandRequest, changes: Changes, catalog: Catalog) -> tup
     """Return what asks for approval; what renews or gives up needs none."""
     if not request.operation.asks:
         return ()
-    asked = (
+    asked = [
         change.after
         for change in changes.claims
-        if change.after and (change.before is None or change.before.booked != change.after.booked)
-    )
+        if change.after
+        and (
+            change.before is None
+            or replace(change.after, lease=change.before.lease) != change.before
+        )
+    ]
     return approval.asked_by(asked, catalog)
 
 

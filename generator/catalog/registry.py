@@ -6,6 +6,7 @@ chart repository.
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
@@ -34,6 +35,10 @@ class ChartSource(Frozen):
             raise ValueError(
                 "needs exactly one of folder, oci and http"
                 + (f", not {' and '.join(given)}" if given else "")
+            )
+        if re.search(r"://[^/\s]*@", self.http or self.oci or ""):
+            raise ValueError(
+                "must hold no user or password; give it to the GitOps controller as a Secret"
             )
         if self.folder and ".." in self.folder.split("/"):
             raise ValueError("folder must stay inside the state repo; remove '..'")

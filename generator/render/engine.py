@@ -14,13 +14,13 @@ from typing import Any
 
 from jinja2 import BaseLoader, Environment, FileSystemLoader, StrictUndefined, TemplateError
 from jinja2.environment import Template
-from jinja2.exceptions import SecurityError, TemplateNotFound, TemplateSyntaxError
-from jinja2.runtime import Context, Undefined
-from jinja2.sandbox import ImmutableSandboxedEnvironment
+from jinja2.exceptions import TemplateNotFound, TemplateSyntaxError
+from jinja2.runtime import Undefined
 
 from generator import yamlio
 from generator.errors import InvalidInput, fault
 from generator.plan import naming
+from generator.render.sandbox import Sandbox
 from generator.settings import data_folder
 
 _TEMPLATE_FAULTS = (
@@ -31,8 +31,6 @@ _TEMPLATE_FAULTS = (
     LookupError,
     RecursionError,
 )  # what a template can make happen: its author's to mend, whatever it is
-_MAX_LENGTH = 100_000
-_MAX_POWER = 64
 
 
 class _Verbatim(str):
@@ -50,25 +48,6 @@ class _CatalogLoader(BaseLoader):
         if template not in self._files:
             raise TemplateNotFound(template)
         return self._files[template], template, lambda: True
-
-
-class _Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja's sandbox, which also keeps arithmetic from eating the machine's memory."""
-
-    intercepted_binops = frozenset({"*", "**"})
-
-    def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:  # noqa: ANN401
-        """Refuse products and powers that no value of a chart needs."""
-        sized = (str, list, tuple)
-        if operator == "**":
-            large = isinstance(right, int | float) and right > _MAX_POWER
-        elif isinstance(left, sized) and isinstance(right, int):
-            large = len(left) * right > _MAX_LENGTH
-        else:
-            large = isinstance(right, sized) and len(right) * left > _MAX_LENGTH
-        if large:
-            raise SecurityError(f"the result of '{operator}' is too large")
-        return super().call_binop(context, operator, left, right)
 
 
 def _finalize(value: object) -> object:
@@ -137,7 +116,7 @@ class Engine:
         self._own = _configure(
             Environment(loader=FileSystemLoader(data_folder("templates")), **_OPTIONS)  # noqa: S701 - YAML, not HTML
         )
-        self._catalog = _configure(_Sandbox(loader=_CatalogLoader(files), **_OPTIONS))
+        self._catalog = _configure(Sandbox(loader=_CatalogLoader(files), **_OPTIONS))
 
     def text(self, template: str, **context: object) -> str:
         """Render a template of the program (``flux/release.yaml.j2``)."""
@@ -175,14 +154,7 @@ class Engine:
                     )
                 ]
             ) from None
-        except (
-            TemplateError,
-            TypeError,
-            ValueError,
-            ArithmeticError,
-            LookupError,
-            RecursionError,
-        ) as error:
+        except _TEMPLATE_FAULTS as error:
             raise InvalidInput(
                 [fault(_line(error, template), f"{error}; mend the template").within(template)]
             ) from None

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import random
 import threading
+import time
 import uuid
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,7 +34,7 @@ from generator.service.throttle import Throttle
 from generator.service.ticket import Receipt, Ticket
 from generator.service.waiting import TAKEN_BACK, Waiting
 from generator.staterepo import history, writer
-from generator.staterepo import snapshot as snapshots
+from generator.staterepo.ahead import Ahead
 from generator.staterepo.repository import PushDenied, RemoteAway, StateRepository
 from generator.staterepo.snapshot import Snapshot
 
@@ -41,6 +42,9 @@ log = logging.getLogger("demandops")
 
 _FIRST_PAUSE_S = 0.05
 _LONGEST_PAUSE_S = 10.0
+"""Between two tries of a remote that is away."""
+_LONGEST_TURN_S = 1.0
+"""Between two tries where another writer was first."""
 _BATCH_LIMIT_EMBEDDED = 20
 _BATCH_LIMIT_REMOTE = 200
 """Demands that are published together: a push costs some 50 ms, moving a branch less than one."""
@@ -76,6 +80,7 @@ class Settler:
         self._throttle = Throttle()
         self._clock = LeaseClock()
         self._tried: dict[str, datetime] = {}
+        self._ahead = Ahead()
         self._giving_up = threading.Event()
         embedded = repository.always_current
         self._batch_limit = _BATCH_LIMIT_EMBEDDED if embedded else _BATCH_LIMIT_REMOTE
@@ -105,17 +110,25 @@ class Settler:
             ShuttingDown: where it was given up; the demands are still in the batch.
             DemandOpsError: where the state repo cannot be used; likewise.
         """
-        pause = _FIRST_PAUSE_S
+        pause = away = _FIRST_PAUSE_S
+        share = self._batch_limit
         verdict_is_current = self._repository.always_current
-        while True:
-            self._waiting.dismiss_withdrawn(batch)
+        stale = False
+        while batch:
             try:
-                self._approvals.give_up(batch, self.snapshot.state)
+                if stale:
+                    self._repository.refresh()
+                    stale, verdict_is_current = False, True
+                self._waiting.dismiss_withdrawn(batch)
+                part = batch[:share]
+                self._approvals.give_up(part, self.snapshot.state)
                 line = self._line()
-                arrived = self._arrived(line.start, batch)
+                arrived = self._arrived(line.start, part)
+                began = time.monotonic()
                 results: list[_Result] = []
-                for ticket in batch:
+                for ticket in part:
                     results.append((ticket, self._judge(line, ticket, arrived, results)))
+                judged = time.monotonic()
                 nothing_to_push = line.head.commit == line.start.commit
                 if nothing_to_push and not verdict_is_current:
                     # only a push would have shown that the remote has moved
@@ -125,20 +138,26 @@ class Settler:
                         continue
                 if self._publish(line, results):
                     self._answer(results)
-                    batch.clear()
-                    return
-                log.info("the state repo has moved; judging %d demands again", len(batch))
-                _doubt(batch, line.start)
-                self._repository.refresh()
-                pause = min(pause, 1.0)
+                    del batch[: len(part)]
+                    pause, away, share = _FIRST_PAUSE_S, _FIRST_PAUSE_S, self._batch_limit
+                    continue
+                log.info("the state repo has moved; judging %d demands again", len(part))
+                _doubt(part, line.start)
+                # judging for longer than the push takes loses to faster writers for ever
+                pushing = (time.monotonic() - judged) / max(judged - began, 1e-9)
+                share = max(1, int(len(part) * min(1.0, pushing)))
+                wait, pause = pause, min(pause * 2, _LONGEST_TURN_S)
+                stale, away = True, _FIRST_PAUSE_S
             except RemoteAway as error:
                 _doubt(batch, self.snapshot)
-                log.warning("%s; trying again in %.1f s", error, pause)
-            if self._giving_up.wait(pause * random.uniform(0.5, 1.0)):  # noqa: S311 - no secret
+                verdict_is_current = self._repository.always_current
+                wait, away = away, min(away * 2, _LONGEST_PAUSE_S)
+                log.warning("%s; trying again in %.1f s", error, wait)
+            # waited before the fetch: what is judged then is pushed while it is fresh
+            if self._giving_up.wait(wait * random.uniform(0.5, 1.0)):  # noqa: S311 - no secret
                 raise ShuttingDown(
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
-            pause = min(pause * 2, _LONGEST_PAUSE_S)
             self._take_up(batch)
 
     def _answer(self, results: list[_Result]) -> None:
@@ -236,7 +255,7 @@ class Settler:
         before = self.snapshot
         if tip == before.commit and not before.problems:
             return writer.Line(self._repository, before)
-        advance = snapshots.advance(self._repository.objects, before, tip)
+        advance = self._ahead.advance(self._repository.objects, before, tip)
         line = writer.Line(self._repository, advance.snapshot)
         line.follow(advance, before, _now())
         for found in line.head.problems:

@@ -118,10 +118,12 @@ class ClonedRepository(StateRepository):
             self._talk(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
         except git.GitCommandError as error:
             text = without_secrets(f"{error.stdout}\n{error.stderr}")
+            if _BEHIND.search(text):  # git looked at the remote first: nothing was sent
+                return False
             tip = self.refresh()
             if tip == commit or self.objects.descendant_of(tip, commit):
                 return True  # it was taken, and the answer got lost
-            if tip != expected or _BEHIND.search(text):
+            if tip != expected:
                 return False
             raise self._why_not(text) from None
         self.objects.references.create(_REMOTE_MAIN, commit, force=True)
@@ -226,6 +228,7 @@ class ClonedRepository(StateRepository):
 
 
 def _last_line(text: str) -> str:
+    text = text.replace("stderr: '", "")  # GitPython's, in front of what git said
     lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
     fatal = [line for line in lines if line.startswith(("fatal:", "error:", "remote:", "!"))]
     return (fatal or lines or ["git gave no reason"])[-1]

@@ -66,6 +66,14 @@ class Advance:
     subjects: tuple[Subject, ...]
     catalog_changed: bool
 
+    def then(self, further: Advance) -> Advance:
+        """Return both steps as one: ``further`` starts where this one ends."""
+        return Advance(
+            further.snapshot,
+            tuple(dict.fromkeys((*self.subjects, *further.subjects))),
+            self.catalog_changed or further.catalog_changed,
+        )
+
 
 def commit_of(repo: Repository, revision: str | Oid) -> Commit:
     """Return a commit by any name that Git knows.

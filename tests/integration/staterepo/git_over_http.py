@@ -9,7 +9,7 @@ import gzip
 import os
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -33,6 +33,9 @@ class Faults:
     """With the cut, the server goes away."""
     hang: threading.Event | None = None
     """Requests wait for this before anything is done."""
+    cuts: Callable[[], bool] = lambda: False
+    """Asked twice for each request: whether the connection is cut before it is carried out, and
+    whether it is cut before the answer."""
 
 
 @dataclass
@@ -45,6 +48,8 @@ class Server:
     """Pushes that were carried out, whether or not the answer got through."""
     refused: int = 0
     """Requests answered with an error on order."""
+    cut: int = 0
+    """Connections cut at random."""
 
 
 @contextmanager
@@ -87,6 +92,8 @@ class _Handler(BaseHTTPRequestHandler):
         if faults.hang is not None:
             faults.hang.wait(60)
         body = self._body()
+        if self._cut(server):
+            return
         push = self.command == "POST" and self.path.endswith("/git-receive-pack")
         about_to = self.path.endswith("/info/refs?service=git-receive-pack")
         with _LOCK:
@@ -108,7 +115,16 @@ class _Handler(BaseHTTPRequestHandler):
             if cut:
                 self.connection.close()
                 return
-        self._relay(answer)
+        if not self._cut(server):
+            self._relay(answer)
+
+    def _cut(self, server: Server) -> bool:
+        with _LOCK:
+            cut = server.faults.cuts()
+            server.cut += cut
+        if cut:
+            self.connection.close()
+        return cut
 
     def _body(self) -> bytes:
         body = b""

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -204,6 +205,11 @@ class Told:
     answers: dict[str, dict[str, Any]] = field(default_factory=dict)
     withdrawn: list[str] = field(default_factory=list)
     finished: bool | None = None
+    waits: dict[str, float] = field(default_factory=dict)
+    """Seconds from a demand to its answer."""
+    first: float = 0.0
+    last: float = 0.0
+    """When the first demand was sent and the last was answered, on this machine's clock."""
 
 
 class Run:
@@ -217,16 +223,21 @@ class Run:
 
     def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
         """Read what the process says to its end."""
+        sent: dict[str, float] = {}
         with self._pipe.open() as lines:
             for line in lines:
                 event = json.loads(line)
+                self._told.last = time.monotonic()
                 if "ready" in event:
                     self.pid = event["ready"]
                     on_ready()
                 elif "sent" in event:
                     self._told.sent.append(event["sent"])
+                    sent[event["sent"]] = self._told.last
+                    self._told.first = self._told.first or self._told.last
                 elif "answer" in event:
                     self._told.answers[event["answer"]] = event
+                    self._told.waits[event["answer"]] = self._told.last - sent[event["answer"]]
                 elif "withdrawn" in event:
                     self._told.withdrawn.append(event["withdrawn"])
                 elif "failed" in event:
@@ -293,6 +304,23 @@ class Drivers:
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()
+
+
+def listen_to_all(
+    drivers: Drivers, runs: list[Run], on_ready: Callable[[], object] = lambda: None
+) -> list[Told]:
+    """Hear every process to its end; where the test is stopped, so are they.
+
+    Args:
+        on_ready: called once, when all have their clones.
+    """
+    waited_for = threading.Barrier(len(runs), on_ready)
+    with ThreadPoolExecutor(len(runs)) as pool:
+        try:
+            return list(pool.map(lambda run: run.listen(lambda: waited_for.wait(60)), runs))
+        except BaseException:
+            drivers.kill_runs()  # else the pool would wait for them for ever
+            raise
 
 
 # ---- a person ----

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -85,8 +84,7 @@ def test_two_processes_on_one_machine_lose_and_double_nothing(
         for item in demands:
             lanes[int(item["name"].rpartition("-")[2]) // 2 % 3].append(item)
         runs.append(drivers.start(address, lanes))
-    with ThreadPoolExecutor(len(runs)) as pool:
-        told = list(pool.map(rig.Run.listen, runs))
+    told = rig.listen_to_all(drivers, runs)
     answers = {name: answer for one in told for name, answer in one.answers.items()}
     assert [a for a in answers.values() if a["outcome"] not in ("booked", "released")] == []
     assert [one.finished for one in told] == [True, True]

@@ -293,6 +293,13 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
         CHARTS, FOLDER, "",
         ["charts.object-detection: needs exactly one of folder, oci and http"],
     ),
+    "a chart's address with a password": (
+        CHARTS, FOLDER, "    http: https://me:secret@charts.example.org\n",
+        [
+            "charts.object-detection: must hold no user or password; give it to the GitOps "
+            "controller as a Secret"
+        ],
+    ),
     "an OCI address that is none": (
         CHARTS, FOLDER, "    oci: https://ghcr.io/x\n",
         [rf"charts.object-detection.oci: 'https://ghcr.io/x' {NAME} ^oci://[^\s]+$"],

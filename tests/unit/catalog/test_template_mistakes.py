@@ -141,6 +141,44 @@ def test_whatever_a_template_does_it_is_told_as_the_templates_fault(text: str) -
     assert found.startswith(f"{TEMPLATE}: ")
 
 
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "'a' * 1000000000",
+        "[1] * 1000000000",
+        "10 ** 1000",
+        "'%1000000000d' % 1",
+        "'%*d' % (1000000000, 1)",
+        "'%1000000000d' | format(1)",
+        "'{:>1000000000}'.format(1)",
+        "'{:>{w}}'.format(1, w=1000000000)",
+        "'{x:>1000000000}'.format_map({'x': 1})",
+        "'a'.ljust(1000000000)",
+        "'a'.center(1000000000)",
+        "'1'.zfill(1000000000)",
+        "'a' | center(1000000000)",
+        "'a' | indent(1000000000, true)",
+        "[1] | batch(1000000000, 'x') | list",
+        "[1] | slice(1000000000) | list",
+    ],
+)
+def test_what_would_eat_the_memory_is_refused_before_it_is_made(expression: str) -> None:
+    (found,) = appended("x: {{ " + expression + " }}\n")
+    assert found.startswith(f"{TEMPLATE}: line {LAST}: ")
+    assert " too large" in found
+
+
+def test_formats_of_usual_size_work() -> None:
+    used = (
+        "[{{ '%03d' % 7 }}, {{ '{:>5}'.format(1) }}, {{ 'a'.ljust(8) }}, {{ 'a' | indent(4) }}, "
+        "{{ '%s' | format(1) }}, {{ 7 % 4 }}]"
+    )
+    assert appended("extra: " + used + "\n") == [
+        f"{TEMPLATE}: values: Additional properties are not allowed ('extra' was unexpected); "
+        f"mend the template or {CHART}"
+    ]
+
+
 def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
     for name in ("other.yaml.j2", "../../../../etc/passwd", "/etc/passwd", "demandops.yaml"):
         (found,) = appended("{% include '" + name + "' %}\n")

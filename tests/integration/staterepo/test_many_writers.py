@@ -1,0 +1,148 @@
+"""Four generators and a person write to one state repo at once, and connections are cut at random.
+
+A small load in `make test`; `make load` runs it with 2,000 demands and prints what each writer saw.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import statistics
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import git_over_http
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Drivers, Goal
+
+GENERATORS = 4
+DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "120"))
+SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
+LANES = 8
+"""Requesters that wait for an answer before they send again, at each generator."""
+CUTS = 0.01
+"""The share of requests whose connection is cut, once before and once after they are done."""
+PERSONS_PAUSE_S = (0.5, 3.0)
+
+
+def _lanes(who: int) -> list[list[tuple[str, Goal]]]:
+    """Return what one generator is asked for: of every three that join, one leaves again."""
+    lanes: list[list[tuple[str, Goal]]] = [[] for _ in range(LANES)]
+    left = DEMANDS // GENERATORS
+    turn = 0
+    while left > 0:
+        number = GENERATORS * turn + who
+        lane = lanes[turn % LANES]
+        lane.append((f"join-{number}", rig.goal(number)))
+        left -= 1
+        if turn % 3 == 2 and left > 0:
+            lane.append((f"leave-{number}", rig.leave(number)))
+            left -= 1
+        turn += 1
+    return lanes
+
+
+@dataclass
+class _Person:
+    """Keeps changing the state repo as people do: fetch, commit, push, and again when refused."""
+
+    person: rig.Person
+    pushed: list[str] = field(default_factory=list)
+    tries: list[int] = field(default_factory=list)
+
+    def work(self, over: threading.Event) -> None:
+        number, dice = 0, random.Random(SEED)
+        while not over.wait(dice.uniform(*PERSONS_PAUSE_S)):
+            number += 1
+            files = {f"notes/{number}.md": f"{number}\n"}
+            if number % 5 == 0:  # one that everything has to be rendered anew for
+                files["registry/images.yaml"] = _images(number)
+            for attempt in range(1, 200):
+                try:
+                    self.pushed.append(self.person.change(files, f"Note {number}"))
+                    self.tries.append(attempt)
+                    break
+                except AssertionError:
+                    if over.is_set():
+                        return
+
+
+def _images(number: int) -> str:
+    text = rig.git(Path(os.environ["PERSONS_CLONE"]), "show", "origin/main:registry/images.yaml")
+    kept = [line for line in text.splitlines() if not line.startswith("# change")]
+    return "\n".join([f"# change {number}", *kept]) + "\n"
+
+
+@pytest.mark.limit(60 + DEMANDS)
+def test_many_writers_end_where_one_would(
+    drivers: Drivers,
+    bare: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clone = tmp_path / "person"
+    monkeypatch.setenv("PERSONS_CLONE", str(clone))
+    lanes = [_lanes(who) for who in range(GENERATORS)]
+    over = threading.Event()
+    with git_over_http.serving(bare.parent) as server:
+        person = _Person(rig.Person(bare, clone))
+        started = time.monotonic()
+        runs = [
+            drivers.start(
+                f"{server.url}/{bare.name}",
+                [[rig.demand(*one) for one in lane] for lane in each],
+            )
+            for each in lanes
+        ]
+        people = threading.Thread(target=person.work, args=(over,), daemon=True)
+        people.start()
+        try:
+            told = rig.listen_to_all(drivers, runs, lambda: _begin_to_cut(server))
+        finally:
+            over.set()
+        took = time.monotonic() - started
+        people.join(60)
+        cut = server.cut
+    with capsys.disabled():
+        _print(told, person, took, cut)
+    _assert_one_would_have_done_the_same(bare, lanes, told, person)
+    assert cut, "no connection was cut, so nothing was tried"
+
+
+def _begin_to_cut(server: git_over_http.Server) -> None:
+    dice = random.Random(SEED)
+    server.faults.cuts = lambda: dice.random() < CUTS
+
+
+def _assert_one_would_have_done_the_same(
+    bare: Path, lanes: list[list[list[tuple[str, Goal]]]], told: list[rig.Told], person: _Person
+) -> None:
+    demands = [one for each in lanes for lane in each for one in lane]
+    answers = {name: answer for one in told for name, answer in one.answers.items()}
+    assert [a for a in answers.values() if a["outcome"] not in ("booked", "released")] == []
+    assert [one.finished for one in told] == [True] * GENERATORS
+    assert sorted(answers) == sorted(name for name, _ in demands)
+    rig.assert_sound(bare, verify_last=20)
+    assert sorted(rig.operations(bare)) == sorted(f"op-{name}" for name, _ in demands)
+    assert rig.books(bare) == rig.books_after(made for _, made in demands)
+    told_commits = {answer["commit"] for answer in answers.values()}
+    there = set(rig.git(bare, "rev-list", "main").splitlines())
+    assert told_commits <= there
+    assert person.pushed
+    assert set(person.pushed) <= there
+
+
+def _print(told: list[rig.Told], person: _Person, took: float, cut: int) -> None:
+    print(f"\n{DEMANDS} demands in {took:.1f} s ({DEMANDS / took:.0f} a second), {cut} cuts")
+    start = min(one.first for one in told)
+    for who, one in enumerate(told):
+        waits = sorted(one.waits.values())
+        print(
+            f"  generator {who}: {len(waits)} answered, the last after {one.last - start:.1f} s; "
+            f"median {statistics.median(waits):.2f} s, longest {waits[-1]:.2f} s"
+        )
+    print(f"  person: {len(person.pushed)} pushed, at most {max(person.tries)} tries for one")
