@@ -37,7 +37,11 @@ def proposals(state_repo: str, output: str) -> None:
     if not rows:
         console().print("nothing awaits approval")
         return
-    table = Table("Branch", "Demand", "Requesters", "Since (UTC)", "What", "Link")
+    table = Table()
+    table.add_column("Branch", no_wrap=True)  # to be copied whole
+    for name in ("Demand", "Requesters", "Since (UTC)", "What"):
+        table.add_column(name)
+    table.add_column("Link", overflow="fold")
     for row in rows:
         table.add_row(
             row["branch"],

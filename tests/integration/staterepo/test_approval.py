@@ -6,6 +6,7 @@ The person's part is played by git itself: merges, squashes, rebases, deleted br
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ import pytest
 import staterepo_rig as rig
 import yaml
 from approving import Petra, Proposed, branches
+from git_over_http import serving
 from staterepo_rig import git, goal, leave
 
 from generator.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
-from generator.service import approval
+from generator.service import Ticket, approval
 
 
 @pytest.fixture(autouse=True)
@@ -456,3 +458,85 @@ def test_a_server_that_refuses_the_branch_is_told_to_the_requester(
     with rig.running(url) as generator, refused:
         rig.receipt(generator.submit(goal(1)))
     assert branches(bare) == []
+
+
+@pytest.mark.parametrize(
+    "point", ["journaled:1", "journaled:2", "journaled:3", "proposing", "proposed", "journaled:4"]
+)
+def test_killed_while_proposing_there_is_one_branch_after_the_restart(
+    drivers: rig.Drivers, address: str, bare: Path, petra: Petra, point: str
+) -> None:
+    drivers.start(address, [[rig.demand("one", goal(1))]], die_at=point).listen()
+    with rig.running(address) as generator:
+        other = Proposed(generator, goal(2))
+        other_branch = other.branch
+        rig.wait_until(lambda: len(branches(bare)) == 2, "both wait")
+        [branch] = [one for one in branches(bare) if one != other_branch]
+        assert [c.one("Operation-Id") for c in rig.commits(bare, f"main..{branch}")] == ["op-one"]
+        petra.merge(branch)
+        rig.wait_until(lambda: branches(bare) == [other_branch], "the merge was seen")
+    assert rig.books(bare) == rig.books_after([goal(1)])
+
+
+def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the_restart(
+    drivers: rig.Drivers, address: str, bare: Path, petra: Petra
+) -> None:
+    lanes = [[rig.demand("leave", leave(1))]]
+    opening = rig.demand("join", goal(1))
+    drivers.start(address, lanes, opening=opening, die_at="retracting").listen()
+    with rig.running(address) as generator:
+        rig.wait_until(lambda: not branches(bare), "the branch is deleted")
+        rig.wait_until(lambda: generator._waiting.operations == (), "both are answered")
+    assert rig.claims(bare) == []
+
+
+def test_two_generators_that_take_one_demand_agree_once_it_is_merged(
+    address: str, bare: Path, petra: Petra
+) -> None:
+    with rig.running(address) as one, rig.running(address) as two:
+        first, second = Proposed(one, goal(1)), Proposed(two, goal(1))
+        assert len({first.branch, second.branch}) == 2
+        petra.merge(first.branch)
+        assert (first.outcome(), second.outcome()) == ("booked", "booked")
+        rig.wait_until(lambda: branches(bare) == [], "neither branch is left")
+    assert rig.books(bare) == rig.books_after([goal(1)])
+
+
+def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
+    bare: Path, petra: Petra
+) -> None:
+    with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        assert [proposed.branch] == branches(bare)
+        server.faults.away = True
+        assert generator.withdraw("op-1") is True
+        rig.wait_until(lambda: server.refused, "it was tried in vain")
+        server.faults.away = False
+        with pytest.raises(Withdrawn):
+            rig.receipt(proposed.ticket)
+        assert branches(bare) == []
+
+
+def test_a_push_whose_answer_got_lost_makes_no_second_branch(bare: Path, petra: Petra) -> None:
+    with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
+        server.faults.cut_answers = 1
+        proposed = Proposed(generator, goal(1), "op-1")
+        assert [proposed.branch] == branches(bare)
+        petra.merge(proposed.branch)
+        assert proposed.outcome() == "booked"
+
+
+def _is_decided_or_waits(ticket: Ticket) -> bool:
+    return ticket.future.done() or bool(ticket.proposal and ticket.proposal.pushed)
+
+
+def test_odd_ids_give_branches_that_git_takes(bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        for number, id in enumerate(["", "..", "a..b/.lock", "Ä ö", "x" * 900, "-o", "@{0}"]):
+            made = goal(number) | {"id": id}
+            ticket = generator.submit(made, f"op-{number}")
+            done = partial(_is_decided_or_waits, ticket)
+            rig.wait_until(done, f"{id!r} is refused, or waits on a branch")
+        names = branches(bare)
+    assert len(names) >= 4
+    assert all(len(name) < 70 and name.isascii() for name in names)
