@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,8 +40,10 @@ log = logging.getLogger("demandops")
 ASK_EMBEDDED_S = 1.0
 ASK_REMOTE_S = 5.0
 """Between two looks at the branches: that one was deleted shows nowhere else."""
-_BUSY_S = 1.0
-"""While demands come in, proposals are compared with main no more often than that."""
+_SHARE = 9
+"""Comparing proposals with a main that keeps moving may take a tenth of the time, not more."""
+
+_IN_TROUBLE = "trouble"
 
 GIVEN_UP = "was given up by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
@@ -70,8 +73,8 @@ class Approvals:
         self._proposals: dict[Key, Proposal] = {}
         self._gave_up: set[str] = set()
         self._every = ASK_EMBEDDED_S if repository.always_current else ASK_REMOTE_S
-        self._urgent = False
-        self._looked, self._last, self._next = "", 0.0, 0.0
+        self._changed: deque[str] = deque()
+        self._looked, self._began, self._rested, self._next = "", 0.0, 0.0, 0.0
 
     # ---- while a batch is judged ----
 
@@ -91,7 +94,7 @@ class Approvals:
                 proposal = self._proposals[key] = Proposal(key, record, seen=ticket.base)
             proposal.tickets.append(ticket)
             proposal.requests += [request] if request else []
-            self._urgent = True
+            self._changed.append(proposal.branch)
 
     def give_up(self, batch: Iterable[Ticket], state: State) -> None:
         """Take away proposals that demands of the batch give up, before these are judged.
@@ -155,7 +158,7 @@ class Approvals:
         self._proposals[key] = proposal
         proposal.tickets.append(ticket)
         proposal.requests.append(request)
-        self._urgent = True
+        self._changed.append(proposal.branch)
 
     def replaced_by(self, request: DemandRequest) -> None:
         """Give up the proposal of a demand that was put anew and needs no approval."""
@@ -170,14 +173,14 @@ class Approvals:
         if not self._proposals:
             return False
         now = time.monotonic()
+        if now < self._next and self._looked == _IN_TROUBLE:
+            return False
         tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)
-        if now < self._next and self._looked == "trouble":
-            return False
-        if self._urgent or any(ticket.state == "withdrawn" for ticket in tickets):
+        if self._changed or any(ticket.state == "withdrawn" for ticket in tickets):
             return True
-        if self._waiting.anything and now - self._last < _BUSY_S:
-            return False
-        return tip != self._looked or now >= self._next
+        if tip != self._looked and now < self._rested:
+            self._next = min(self._next, self._rested)
+        return now >= self._next or (tip != self._looked and now >= self._rested)
 
     def pause(self, longest: float) -> float:
         """Return the seconds until the next look is due, ``longest`` where nothing waits."""
@@ -187,8 +190,8 @@ class Approvals:
 
     def heads(self) -> Heads:
         """Ask where the branches are; the next look is due after a while, whatever comes."""
-        self._last = time.monotonic()
-        self._next, self._looked = self._last + self._every, "trouble"
+        self._began = time.monotonic()
+        self._next, self._looked = self._began + self._every, _IN_TROUBLE
         return self._keeper.heads()
 
     def look(self, snapshot: Snapshot, heads: Heads) -> None:
@@ -201,17 +204,23 @@ class Approvals:
         Raises:
             RemoteAway: where the remote does not answer any more; the rest is for the next time.
         """
-        self._urgent = False
+        while self._changed:
+            branch = self._changed.popleft()
+            for proposal in self._proposals.values():
+                if proposal.branch == branch:
+                    proposal.looked = ""
         for proposal in list(self._proposals.values()):
             try:
-                self._look_at(proposal, snapshot, heads)
+                if not proposal.stands(str(snapshot.commit), heads.branches):
+                    self._look_at(proposal, snapshot, heads)
             except BranchMoved as error:
                 log.info("%s; looking again", error)
-                self._urgent = True
+                self._changed.append(proposal.branch)
             except PushDenied as error:
                 self._waiting.answer([(ticket, error) for ticket in proposal.tickets])
                 self._forget(proposal, close=True)
-        self._looked = str(snapshot.commit)
+        ended = time.monotonic()
+        self._looked, self._rested = str(snapshot.commit), ended + _SHARE * (ended - self._began)
 
     def _look_at(self, proposal: Proposal, snapshot: Snapshot, heads: Heads) -> None:
         objects = self._repository.objects
@@ -239,8 +248,10 @@ class Approvals:
         if done and proposal.branch not in heads.branches:  # what was not merged goes on
             proposal.record = replace(proposal.record, pushed=False)
         head = heads.branches.get(proposal.branch, "")
-        if not self._keeper.keep_up(proposal, left, snapshot, head):
-            self._urgent = True
+        if self._keeper.keep_up(proposal, left, snapshot, head):
+            proposal.looked = str(snapshot.commit)
+        else:
+            self._changed.append(proposal.branch)
 
     def _verdict(
         self, ticket: Ticket, snapshot: Snapshot, arrived: dict[str, Arrival]
@@ -287,9 +298,9 @@ class Approvals:
 
     # ---- the end ----
 
-    def _on_news(self) -> None:
+    def _on_news(self, branch: str) -> None:
         """Have the answer of a forge told; from the desk's thread."""
-        self._urgent = True
+        self._changed.append(branch)
         self._waiting.wake()
 
     def suspend(self) -> None:

@@ -34,7 +34,7 @@ class _Task:
 class Desk:
     """Opens, watches and closes requests. All but :meth:`_run` is for one other thread."""
 
-    def __init__(self, token_file: Path | None, on_news: Callable[[], None]) -> None:
+    def __init__(self, token_file: Path | None, on_news: Callable[[str], None]) -> None:
         self._token_file = token_file
         self._on_news = on_news
         self._orders: queue.Queue[tuple[_Task, bool]] = queue.Queue()
@@ -123,4 +123,4 @@ class Desk:
             news = task.branch not in self._answers or self._answers[task.branch] != found
             self._answers[task.branch] = found
         if news:
-            self._on_news()
+            self._on_news(task.branch)

@@ -35,7 +35,7 @@ class Keeper:
         repository: StateRepository,
         waiting: Waiting,
         token_file: Path | None,
-        on_news: Callable[[], None],
+        on_news: Callable[[str], None],
     ) -> None:
         self._repository = repository
         self._waiting = waiting
@@ -102,6 +102,8 @@ class Keeper:
             self._waiting.answer(faulty)
             dropped = [ticket for ticket, _ in faulty]
             proposal.tickets = [t for t in proposal.tickets if t not in dropped]
+            if not steps:
+                return False
             files = {path: text for _, d in steps for path, text in d.files.items()}
             made = self._branches.tree(snapshot.commit, files)
             stands = head and self._branches.is_fresh(snapshot.commit, head, record.base, made)

@@ -6,7 +6,7 @@ What one is found by, which requests give it up, and how it is described to the 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from generator.decision import State, admit
@@ -22,7 +22,10 @@ _NEWS = "awaiting approval: "
 
 @dataclass(eq=False)
 class Proposal:
-    """Demands of one key; ``requests`` are what they ask, ``reasons`` what asks for approval."""
+    """Demands of one key; ``requests`` are what they ask, ``reasons`` what asks for approval.
+
+    Main up to ``seen`` holds none of it, and with main at ``looked`` all was done about it.
+    """
 
     key: Key
     record: Record
@@ -30,13 +33,19 @@ class Proposal:
     requests: list[DemandRequest] = field(default_factory=list)
     reasons: tuple[str, ...] = ()
     seen: str = ""
-    link: str = ""
+    looked: str = ""
     edited: bool = False
 
     @property
     def branch(self) -> str:
         """The branch that is to be merged."""
         return self.record.branch
+
+    def stands(self, tip: str, branches: Mapping[str, str]) -> bool:
+        """Tell whether nothing happened to it since it was looked at, with main at ``tip``."""
+        head = branches.get(self.branch)
+        waits = all(ticket.state == "waiting" for ticket in self.tickets)
+        return waits and self.looked == tip and head in self.record.commits[-1:]
 
     def requesters(self) -> set[str]:
         """Return in whose name it stands."""
