@@ -43,7 +43,9 @@ class Throttle:
                     yield fault("", message, code="quota")
 
     def _counted(self, key: tuple[str, str], operation: str, received: datetime) -> int:
-        seen = self._seen.setdefault(key, deque())
+        self._forget(received)
+        seen = self._seen.pop(key, None) or deque()
+        self._seen[key] = seen  # the one that sent last stands last
         while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
             seen.popleft()
         places = [known for _, known in seen]
@@ -51,3 +53,11 @@ class Throttle:
             return places.index(operation) + 1
         seen.append((received, operation))
         return len(seen)
+
+    def _forget(self, now: datetime) -> None:
+        """Drop the requesters that have sent nothing for a minute: vehicles come and go."""
+        while self._seen:
+            key = next(iter(self._seen))
+            if self._seen[key] and abs(now - self._seen[key][-1][0]) <= _WINDOW:
+                return
+            del self._seen[key]

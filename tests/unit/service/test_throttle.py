@@ -1,0 +1,89 @@
+"""How many demands a requester may send in a minute, and what is remembered for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+
+from generator.catalog.catalog import CONFIG_ROOTS, Catalog
+from generator.catalog.loading import load
+from generator.demand.request import ApplicationDemand, DemandRequest, Operation
+from generator.service.throttle import Throttle
+from generator.staterepo import layout
+
+START = datetime(2026, 3, 1, 12, 0, tzinfo=timezone.utc)
+
+
+def limited(most: int) -> Catalog:
+    files = {p: t for p, t in layout.files().items() if p.split("/")[0] in CONFIG_ROOTS}
+    domains = files["policy/access-domains.yaml"]
+    files["policy/access-domains.yaml"] = domains.replace(
+        "    namespace:", f"    quotas: {{demandsPerMinute: {most}}}\n    namespace:", 1
+    )
+    return load(files)
+
+
+def request(requester: str) -> DemandRequest:
+    app = ApplicationDemand(
+        id="edge/fusion",
+        appdef="object-detection-fusion",
+        node="edge",
+        requesters=(requester,),
+        inputs={},
+    )
+    return DemandRequest(id="one", operation=Operation.JOIN, applications=(app,))
+
+
+class Sending:
+    """Sends demands to a throttle that allows two a minute."""
+
+    def __init__(self) -> None:
+        self.throttle = Throttle()
+        self._catalog = limited(2)
+        self._count = 0
+
+    def send(self, requester: str, at_s: float, operation: str = "") -> bool:
+        """Send one and tell whether it was let through."""
+        self._count += 1
+        moment = START + timedelta(seconds=at_s)
+        faults = self.throttle.faults(
+            request(requester), self._catalog, operation or f"op-{self._count}", moment
+        )
+        return not list(faults)
+
+
+def test_a_third_within_a_minute_is_too_much_and_one_after_it_is_not() -> None:
+    sending = Sending()
+    assert [sending.send("vehicle00", at) for at in (0, 20, 40)] == [True, True, False]
+    assert sending.send("vehicle01", 41)
+    assert sending.send("vehicle00", 101)
+
+
+def test_a_hand_in_that_is_judged_again_counts_once() -> None:
+    sending = Sending()
+    assert [sending.send("vehicle00", 0, "same") for _ in range(5)] == [True] * 5
+    assert sending.send("vehicle00", 1)
+    assert not sending.send("vehicle00", 2)
+
+
+def test_giving_up_is_not_limited() -> None:
+    sending = Sending()
+    for number in range(5):
+        release = replace(request("vehicle00"), operation=Operation.SHUTDOWN)
+        found = sending.throttle.faults(release, limited(1), f"op-{number}", START)
+        assert list(found) == []
+
+
+def test_who_sends_no_more_is_forgotten() -> None:
+    sending = Sending()
+    for number in range(500):
+        assert sending.send(f"vehicle{number}", number)
+    assert len(sending.throttle._seen) <= 62
+    assert sending.send("vehicle499", 499.5)
+    assert not sending.send("vehicle499", 499.6)
+
+
+def test_a_clock_that_is_set_back_does_not_shut_anybody_out() -> None:
+    sending = Sending()
+    assert [sending.send("vehicle00", at) for at in (5000, 5001)] == [True, True]
+    assert sending.send("vehicle00", 0)
