@@ -57,7 +57,9 @@ class Proposal:
 
     def is_given_up_by(self, request: DemandRequest) -> bool:
         """Tell whether a request gives up all of it, in the name of one of its requesters."""
-        if key_of(request) != self.key or not self.requesters() & set(request.requesters()):
+        if key_of(request) not in map(key_of, self.requests) or not self.requesters() & set(
+            request.requesters()
+        ):
             return False
         whole = request.operation is Operation.RELEASE
         return whole or self.subjects() <= set(subjects_of(request))

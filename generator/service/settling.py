@@ -245,8 +245,8 @@ class Settler:
         return True
 
     def _taken(self, line: writer.Line) -> None:
-        self.snapshot = line.head
-        if line.head.commit != line.start.commit:
+        before, self.snapshot = self.snapshot, line.head
+        if line.head.commit != before.commit:  # a merge may ask for no commit of our own
             self._on_published(line.head.state.catalog)
 
     def _line(self) -> writer.Line:

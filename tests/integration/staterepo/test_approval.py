@@ -5,6 +5,7 @@ The person's part is played by git itself: merges, squashes, rebases, deleted br
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -540,3 +541,46 @@ def test_odd_ids_give_branches_that_git_takes(bare: Path, petra: Petra) -> None:
         names = branches(bare)
     assert len(names) >= 4
     assert all(len(name) < 70 and name.isascii() for name in names)
+
+
+def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petra: Petra) -> None:
+    """The reference's demands add up, so both are on the branch, one commit each."""
+    more = goal(1, vehicle=2) | {"connections": []}
+    with rig.running(bare) as generator:
+        first = Proposed(generator, goal(1), "op-1")
+        branch = first.branch
+        second = Proposed(generator, more, "op-2")
+        assert second.branch == branch
+        found = rig.commits(bare, f"main..{branch}")
+        assert [commit.one("Operation-Id") for commit in found] == ["op-1", "op-2"]
+        assert generator.withdraw("op-2")
+        with pytest.raises(Withdrawn):
+            rig.receipt(second.ticket)
+        rig.wait_until(lambda: len(rig.commits(bare, f"main..{branch}")) == 1, "one is left")
+        petra.merge(branch)
+        assert first.outcome() == "booked"
+    assert rig.books(bare) == rig.books_after([goal(1)])
+
+
+def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Petra) -> None:
+    """The latched bookkeeping and the clusters' wake-up hang on it; nothing else is published."""
+    heard = threading.Event()
+    with rig.running(bare) as generator:
+        proposed = Proposed(generator, goal(1))
+        branch = proposed.branch
+        generator.watch(lambda catalog: heard.set())
+        petra.merge(branch, "--ff-only")
+        assert proposed.outcome() == "booked"
+        assert heard.wait(rig.PATIENCE_S)
+
+
+def test_a_proposal_passes_the_check_of_pull_requests(
+    bare: Path, petra: Petra, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from generator.cli.main import run
+
+    with rig.running(bare) as generator:
+        branch = Proposed(generator, put("d", 1, 600)).branch
+    petra.fetch()
+    git(petra.folder, "checkout", "--quiet", f"origin/{branch}")
+    assert run(["check", str(petra.folder)]) == 0, capsys.readouterr()
