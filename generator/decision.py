@@ -10,20 +10,22 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
+from datetime import datetime
+from types import MappingProxyType
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
 from generator.demand import admission, approval, carriers, own, permission, wire
 from generator.demand.claim import Subject
-from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
+from generator.demand.request import DemandRequest, Operation
 from generator.errors import Fault, InvalidInput, Refused
 from generator.ledger import ledger as booking
 from generator.ledger.ledger import Changes, Ledger
-from generator.plan import derived, quota
+from generator.plan import denial, derived, keeping, quota
 from generator.plan.clients import is_bridged
 from generator.plan.planner import affected, all_keys
-from generator.render import changeset
+from generator.plan.standing import in_force
+from generator.render import changeset, tryout
 from generator.render.changeset import Read, ReleaseChange
 from generator.render.engine import Engine
 
@@ -71,6 +73,8 @@ class Decision:
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
     approval: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
+    """The files of the overrides that shaped what is written."""
 
     @property
     def lease_s(self) -> int | None:
@@ -106,10 +110,7 @@ def decide(
     request = goal if isinstance(goal, DemandRequest) else admit(state, goal, throttle)
     on_stage("admitted")
     try:
-        ledger, changes = booking.apply(state.ledger, request, now)
-        over = list(quota.faults(state.ledger, ledger, changes, state.catalog))
-        if over:
-            raise Refused(over)
+        ledger, changes = _booked(state, request, now)
         keys = affected(state.ledger, ledger, state.catalog, changes.subjects())
         made = changeset.of_change(
             state.ledger, ledger, changes.claims, keys, (state.catalog, state.engine, read)
@@ -130,25 +131,28 @@ def decide(
         warnings=(
             *_uncarried(request, ledger, state.catalog),
             *_bridged(request, state.catalog),
+            *denial.warnings(request, ledger, state.catalog),
         ),
-        approval=_approval(request, changes, state.catalog),
+        approval=approval.asked_by(
+            request, ((c.before, c.after) for c in changes.claims), state.catalog
+        ),
+        overrides=made.overrides,
     )
 
 
-def _approval(request: DemandRequest, changes: Changes, catalog: Catalog) -> tuple[str, ...]:
-    """Return what asks for approval; what renews or gives up needs none."""
-    if not request.operation.asks:
-        return ()
-    asked = [
-        change.after
-        for change in changes.claims
-        if change.after
-        and (
-            change.before is None
-            or replace(change.after, lease=change.before.lease) != change.before
-        )
-    ]
-    return approval.asked_by(asked, catalog)
+def _booked(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+    """Book a request; what overrides keep gives way to it, and what it gives up they may keep.
+
+    Raises:
+        Refused: where the books, an override or a quota do not allow it.
+    """
+    asked, catalog = keeping.requested(request), state.catalog
+    ledger, changes = booking.apply(keeping.giving_way(state.ledger, asked), request, now)
+    refusals = list(denial.faults(request, ledger, changes, catalog))
+    refusals = refusals or list(quota.faults(state.ledger, ledger, changes, catalog))
+    if refusals:
+        raise Refused(refusals)
+    return keeping.settled(state.ledger, ledger, changes, asked, (catalog, now))
 
 
 def admit(
@@ -201,10 +205,14 @@ def consequence(
     return changeset.of_change(before, state.ledger, (), keys, (state.catalog, state.engine, read))
 
 
-def rendered(state: State) -> dict[str, str]:
-    """Return every file below ``clusters/`` that the state asks for."""
+def rendered(state: State, standing: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+    """Return every generated file that the state asks for.
+
+    Args:
+        standing: the generated files as they are, of which overrides may hold some.
+    """
     keys = all_keys(state.ledger, state.catalog)
-    return changeset.render_all(state.ledger, state.catalog, state.engine, keys)
+    return changeset.render_all(state.ledger, state.catalog, state.engine, keys, standing)
 
 
 def _told(field: str, told: Iterable[str]) -> bool:
@@ -240,6 +248,7 @@ def _uncarried(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> Iter
     """Yield a warning for each input that no connection brings to the application's node."""
     if not request.operation.asks:
         return
+    ledger = in_force(ledger, catalog)
     for app in request.applications:
         for foreign in derived.foreign_inputs(app, catalog):
             topic = foreign.topic
@@ -270,39 +279,9 @@ def explain(error: InvalidInput) -> str:
 
 
 def rehearse(state: State) -> None:
-    """Render every service of every appdef once, for invented claims on a real node.
-
-    An appdef that nobody has demanded yet is checked before the first demand comes.
+    """Try every appdef and every override in force on invented demands.
 
     Raises:
-        Refused, InvalidInput: naming the template or the values that do not work.
+        Refused, InvalidInput: naming the template, the values or the override that does not work.
     """
-    place = next(iter(sorted(state.catalog.domain_of)), None)
-    if place is None:
-        return
-    faults: list[Fault] = []
-    for appdef in state.catalog.appdefs.values():
-        request = DemandRequest(
-            id="rehearsal",
-            operation=Operation.JOIN,
-            applications=(
-                ApplicationDemand(
-                    id=f"rehearsal/{appdef.name}",
-                    appdef=appdef.name,
-                    node=place,
-                    requesters=("rehearsal",),
-                    inputs={
-                        role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", place),)
-                        for role in appdef.inputs
-                    },
-                ),
-            ),
-        )
-        ledger, changes = booking.apply(Ledger(), request, datetime.fromtimestamp(0, timezone.utc))
-        for key in affected(Ledger(), ledger, state.catalog, changes.subjects()):
-            try:
-                changeset.render_all(ledger, state.catalog, state.engine, [key])
-            except InvalidInput as error:
-                faults += error.faults
-    if faults:
-        raise InvalidInput(dict.fromkeys(faults))
+    tryout.rehearse(state.catalog, state.engine)

@@ -13,7 +13,7 @@ from importlib.metadata import EntryPoint, entry_points
 import click
 
 from generator import __version__
-from generator.cli import proposals, repo, request, schema, status, views
+from generator.cli import overrides, proposals, repo, request, schema, status, views
 from generator.cli.output import errors
 from generator.errors import DemandOpsError, InvalidInput
 
@@ -73,6 +73,7 @@ cli.add_command(request.request)
 cli.add_command(views.bookkeeping)
 cli.add_command(views.log)
 cli.add_command(views.diff)
+cli.add_command(overrides.overrides)
 cli.add_command(repo.check)
 cli.add_command(repo.verify)
 cli.add_command(schema.schema)

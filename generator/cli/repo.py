@@ -95,11 +95,14 @@ def check(directory: Path, base: str | None, output: str) -> None:
                     for one in found.faults
                 ],
                 "outdated": list(found.outdated),
+                "warnings": [{"file": one.file, "message": one.message} for one in found.warnings],
             }
         )
     else:
         for one in found.faults:
             errors.print(f"error: {one}")
+        for one in found.warnings:
+            errors.print(f"warning: {one}")
         if not found.faults:
             console().print(f"{directory}: all files are valid and everything renders")
         if found.outdated:

@@ -40,6 +40,8 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     out = console()
     out.print(services_table(books))
     out.print(connections_table(books))
+    if books.suspended:
+        out.print(suspended_table(books))
     out.print(f"at {commit}")
 
 
@@ -70,6 +72,16 @@ def connections_table(books: Bookkeeping) -> Table:
         )
     if not books.connections:
         table.add_row(_NONE, *[""] * 4)
+    return table
+
+
+def suspended_table(books: Bookkeeping) -> Table:
+    """Return the claims that overrides keep from running, as a table."""
+    table = Table("Subject", "Demand", "Requesters", "By", "Reason", title="Suspended")
+    for entry in books.suspended:
+        subject = f"{entry.kind} {entry.id}"
+        requesters = "\n".join(entry.requesters)
+        table.add_row(subject, entry.demand, requesters, entry.override, entry.reason)
     return table
 
 

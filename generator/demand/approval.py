@@ -11,7 +11,13 @@ from dataclasses import replace
 
 from generator.catalog.catalog import Catalog
 from generator.catalog.policy import AccessDomain, matches
-from generator.demand.claim import ApplicationClaim, Claim, ConnectionClaim
+from generator.demand.claim import (
+    ApplicationClaim,
+    Claim,
+    ConnectionClaim,
+    Subject,
+    SubjectKind,
+)
 from generator.demand.lease import Term
 from generator.demand.permission import asked_at_ends, missing, places
 from generator.demand.request import ConnectionType, DemandRequest
@@ -19,10 +25,40 @@ from generator.demand.request import ConnectionType, DemandRequest
 Asked = Iterable[tuple[str, str]]
 
 
-def asked_by(claims: Iterable[Claim], catalog: Catalog) -> tuple[str, ...]:
-    """Return what asks for approval of the claims, each once: ``access domain 'edge'``."""
-    found = (who for claim in claims for who in _asked_by(claim, catalog))
-    return tuple(dict.fromkeys(found))
+def asked_by(
+    request: DemandRequest, changes: Iterable[tuple[Claim | None, Claim | None]], catalog: Catalog
+) -> tuple[str, ...]:
+    """Return what asks for approval of a request, each once: ``access domain 'edge'``.
+
+    What renews or gives up needs none, nor does what overrides keep beside it.
+
+    Args:
+        request: an admitted request.
+        changes: each claim that it changes, before and after.
+        catalog: the access domains and application definitions.
+    """
+    if not request.operation.asks:
+        return ()
+    listed = set(subjects_of(request))
+    asked = (
+        after
+        for before, after in changes
+        if after and after.subject in listed and _says_more(before, after)
+    )
+    return tuple(dict.fromkeys(who for claim in asked for who in _asked_by(claim, catalog)))
+
+
+def subjects_of(request: DemandRequest) -> list[Subject]:
+    """Return the applications and connections that a request lists."""
+    return [
+        *(Subject(SubjectKind.APPLICATION, app.id) for app in request.applications),
+        *(Subject(SubjectKind.CONNECTION, one.id) for one in request.connections),
+    ]
+
+
+def _says_more(before: Claim | None, after: Claim) -> bool:
+    """Tell whether a claim is new, or differs in more than how long it holds."""
+    return before is None or replace(after, lease=before.lease) != before
 
 
 def _asked_by(claim: Claim, catalog: Catalog) -> Iterator[str]:

@@ -17,6 +17,9 @@ from generator.demand.lease import LONGEST_S, Term
 from generator.demand.route import Route
 from generator.errors import Fault, fault
 
+OVERRIDE_PREFIX = "override:"
+"""What the demand id of an override's own claim starts with, and no other demand's."""
+
 
 class Operation(Enum):
     """What a request does to the ledger.
@@ -158,6 +161,10 @@ def _named(request: DemandRequest) -> Iterator[Fault]:
     if request.operation.is_reference:
         return
     yield from _id("demand", request.demand)
+    if request.demand.startswith(OVERRIDE_PREFIX):
+        yield fault(
+            "demand", f"starts with '{OVERRIDE_PREFIX}', as overrides do; choose another demand id"
+        )
     if not (request.applications or request.connections):  # else told for each of these
         yield from _requesters("requesters", request.named_by)
     if request.lease_s is not None and not 0 < request.lease_s <= LONGEST_S:

@@ -11,21 +11,28 @@ from types import MappingProxyType
 
 from generator.catalog.appdef import ApplicationDefinition, Parameter, Service
 from generator.catalog.catalog import Catalog
+from generator.catalog.override import Override
 from generator.catalog.registry import ChartSource
 from generator.demand.claim import ApplicationClaim, Subject, SubjectKind
 from generator.demand.request import InputTopic
 from generator.errors import Refused, fault
 from generator.ledger.ledger import Ledger
-from generator.plan import clients, naming, parameters, scaling
+from generator.plan import clients, naming, overrides, parameters, scaling
 from generator.plan.clients import BridgeKey, EndKey
 from generator.plan.place import place
 from generator.plan.release import Release, ServiceKey, ServiceRelease
+from generator.plan.standing import in_force
 
 ReleaseKey = ServiceKey | EndKey | BridgeKey
 
 
 def keys_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
-    """Yield what must run because ``subject`` is held."""
+    """Yield what must run because ``subject`` is held and no override denies it."""
+    yield from keys_booked(in_force(ledger, catalog), catalog, subject)
+
+
+def keys_booked(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
+    """Yield what ``subject`` needs by the claims of ``ledger``, suspended or not."""
     if subject.kind is SubjectKind.CONNECTION:
         yield from clients.keys_of(ledger, subject.id)
         return
@@ -67,12 +74,26 @@ def all_keys(ledger: Ledger, catalog: Catalog) -> tuple[ReleaseKey, ...]:
 
 
 def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
-    """Return the release at ``key``, or nothing where no claim needs it.
+    """Return the release at ``key`` as overrides shape it, or nothing where no claim needs it.
 
     Raises:
         Refused: where claims contradict each other in a parameter, or what a claim names is no
             longer in the catalog.
     """
+    ledger = in_force(ledger, catalog)
+    release = _unshaped(ledger, catalog, key)
+    return overrides.shaped(release, ledger, catalog) if release else None
+
+
+def denied(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> tuple[Release, Override] | None:
+    """Return the release that is needed at ``key`` and the override that denies it, or nothing."""
+    ledger = in_force(ledger, catalog)
+    release = _unshaped(ledger, catalog, key)
+    by = overrides.denying(release, ledger, catalog) if release else None
+    return (release, by) if release and by else None
+
+
+def _unshaped(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
     if isinstance(key, EndKey):
         return clients.end(ledger, catalog, key)
     if isinstance(key, BridgeKey):

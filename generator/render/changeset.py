@@ -17,7 +17,7 @@ from generator.ledger import format as ledger_format
 from generator.ledger.ledger import ClaimChange, Ledger
 from generator.plan.planner import ReleaseKey, plan
 from generator.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
-from generator.render import gitops
+from generator.render import gitops, marking
 from generator.render.check import check_files
 from generator.render.engine import Engine
 from generator.render.paths import path_of
@@ -44,6 +44,8 @@ class Changeset:
 
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
+    overrides: tuple[str, ...] = ()
+    """The files of the overrides that shaped what is written."""
 
 
 def of_change(
@@ -72,34 +74,45 @@ def of_change(
         for change in claims
     }
     releases = []
+    shaped: set[str] = set()
     for key in keys:
         old, new = _plan_leniently(before, catalog, key), plan(after, catalog, key)
         old_path = path_of(old) if old else None
         new_path = path_of(new) if new else None
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
-        text = gitops.render(new, catalog, engine) if new else None
         standing = read(new_path) if new_path else None
+        text = marking.text_of(new, catalog, engine, standing) if new else None
         if new_path and text != standing:
             files[new_path] = text
+            shaped |= {override.path for override, _ in new.shaping.by} if new else set()
         if text is not None and text == standing:
             continue
         if old or new:
             releases.append(_described(old, new, standing is not None))
     check_files(files)
-    return Changeset(files=files, releases=tuple(sorted(releases, key=_order)))
+    return Changeset(files, tuple(sorted(releases, key=_order)), tuple(sorted(shaped)))
 
 
 def render_all(
-    ledger: Ledger, catalog: Catalog, engine: Engine, keys: Iterable[ReleaseKey]
+    ledger: Ledger,
+    catalog: Catalog,
+    engine: Engine,
+    keys: Iterable[ReleaseKey],
+    standing: Mapping[str, str],
 ) -> dict[str, str]:
-    """Return every generated file below ``clusters/`` that ledger and catalog ask for."""
+    """Return every generated file that ledger and catalog ask for.
+
+    Args:
+        standing: the generated files as they are, of which overrides may hold some.
+    """
     files = gitops.standing_files(catalog, engine)
     for key in keys:
         release = plan(ledger, catalog, key)
         if release is not None:
-            files[path_of(release)] = gitops.render(release, catalog, engine)
-    return files
+            path = path_of(release)
+            files[path] = marking.text_of(release, catalog, engine, standing.get(path))
+    return files | marking.charts_kept(files, standing, catalog)
 
 
 def _plan_leniently(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
@@ -128,7 +141,8 @@ def _described(old: Release | None, new: Release | None, stood: bool) -> Release
     kind: Change = "stop" if not new else "start"
     if new and stood:
         kind = "change"
-    details = _differences(old, new) if kind == "change" else ()
+    held = new is not None and new.shaping.held
+    details = _differences(old, new) if kind == "change" and not held else ()
     return ReleaseChange(release.name, kind, what, details)
 
 

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from generator.decision import State, admit
-from generator.demand.claim import Subject, SubjectKind
+from generator.demand.approval import subjects_of
+from generator.demand.claim import Subject
 from generator.demand.request import DemandRequest, Operation
 from generator.errors import InvalidInput
 from generator.service.ticket import Record, Ticket
@@ -63,14 +64,6 @@ class Proposal:
             return False
         whole = request.operation is Operation.RELEASE
         return whole or self.subjects() <= set(subjects_of(request))
-
-
-def subjects_of(request: DemandRequest) -> list[Subject]:
-    """Return the applications and connections that a request lists."""
-    return [
-        *(Subject(SubjectKind.APPLICATION, app.id) for app in request.applications),
-        *(Subject(SubjectKind.CONNECTION, one.id) for one in request.connections),
-    ]
 
 
 def key_of(request: DemandRequest) -> Key:

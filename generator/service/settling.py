@@ -29,6 +29,7 @@ from generator.errors import (
 )
 from generator.service.approval import GIVEN_UP, Approvals, Deferred
 from generator.service.expiry import LeaseClock
+from generator.service.overriding import OverrideClock
 from generator.service.targets import of_decision as targets_of
 from generator.service.throttle import Throttle
 from generator.service.ticket import Receipt, Ticket
@@ -79,6 +80,7 @@ class Settler:
         self._since_tidy = 0
         self._throttle = Throttle()
         self._clock = LeaseClock()
+        self._overrides = OverrideClock()
         self._tried: dict[str, datetime] = {}
         self._ahead = Ahead()
         self._giving_up = threading.Event()
@@ -184,9 +186,11 @@ class Settler:
             log.warning("%s; the demands that await approval wait on", error)
 
     def pause(self) -> float:
-        """Return the seconds until the next look at the leases, and at what awaits approval."""
+        """Return the seconds until the next look at leases, overrides and what awaits approval."""
+        state = self.snapshot.state
         longest = self._approvals.pause(_LONGEST_WAIT_S)
-        return self._clock.pause(self.snapshot.state.ledger, longest)
+        leases = self._clock.pause(state.ledger, longest)
+        return self._overrides.pause(state.catalog, _now(), leases)
 
     def expired(self) -> list[Ticket]:
         """Return a ticket for each demand whose lease ran out; nobody waits for its receipt.
@@ -215,15 +219,22 @@ class Settler:
             self._take_in()
 
     def notice(self) -> None:
-        """Take in what others published in a repository on this disk: its leases end here too."""
-        if self._repository.always_current and self._repository.tip() != self.snapshot.commit:
+        """Take in what others published in a repository on this disk, and end overrides."""
+        moved = self._repository.always_current and self._repository.tip() != self.snapshot.commit
+        if moved or self._overrides.anything(self.snapshot.state.catalog, _now()):
             self._take_in()
 
     def _take_in(self) -> None:
         """Bring the snapshot to the newest tip, and publish what follows from people's changes."""
         line = self._line()
-        if line.publish():
-            self._taken(line)
+        try:
+            if line.publish():
+                self._taken(line)
+            else:
+                self._repository.refresh()
+        except (PushDenied, RemoteAway) as error:
+            log.warning("%s; trying again later", error)
+            self._overrides.put_off(_now())
 
     def tidy(self) -> None:
         """Every few hundred commits: a demand leaves some twenty loose objects behind."""
@@ -254,12 +265,15 @@ class Settler:
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems:
-            return writer.Line(self._repository, before)
+            line = writer.Line(self._repository, before)
+            self._overrides.end(line, _now())
+            return line
         advance = self._ahead.advance(self._repository.objects, before, tip)
         line = writer.Line(self._repository, advance.snapshot)
         line.follow(advance, before, _now())
         for found in line.head.problems:
             log.error("%s (its last valid version stays in force)", found)
+        self._overrides.end(line, _now())
         return line
 
     def _judge(

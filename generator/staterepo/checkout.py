@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 
 import pygit2
@@ -16,10 +17,14 @@ from pygit2 import Commit, Repository
 from generator import yamlio
 from generator.catalog.catalog import CONFIG_ROOTS, Catalog
 from generator.catalog.loading import load
+from generator.catalog.override import written
 from generator.decision import State, rehearse, rendered
 from generator.errors import Fault, InvalidInput, StateRepoError, fault
 from generator.ledger import format as ledger_format
+from generator.ledger import markers
 from generator.ledger.ledger import Ledger
+from generator.plan.following import due
+from generator.plan.survey import survey, warnings
 from generator.settings import GENERATED_ROOTS, MAIN_BRANCH
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
@@ -29,19 +34,23 @@ _UPSTREAM = f"refs/remotes/origin/{MAIN_BRANCH}"
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What a check found: faults to mend, and generated files that the generator will rewrite."""
+    """What a check found: faults to mend, generated files that the generator will rewrite, and
+    what is no fault and may still not be meant.
+    """
 
     faults: tuple[Fault, ...]
     outdated: tuple[str, ...]
+    warnings: tuple[Fault, ...] = ()
 
 
-def check(folder: Path, base: str | None = None) -> Checked:
+def check(folder: Path, base: str | None = None, now: datetime | None = None) -> Checked:
     """Check the files of a folder, and that everything renders.
 
     Args:
         folder: a checked-out state repo, or an unpacked one without Git.
         base: the commit that the edit started from; where left out, where it left origin/main,
             or else HEAD.
+        now: overrides that ended by then are not tried; the time of the day where left out.
 
     Raises:
         StateRepoError: where it is no state repo, or ``base`` is no commit.
@@ -52,22 +61,37 @@ def check(folder: Path, base: str | None = None) -> Checked:
         )
     files = dict(_texts(folder))
     before = _base_files(folder, base)
-    faults = [] if before is None else list(_hand_edits(files, before))
+    edits = [] if before is None else list(_hand_edits(files, before))
+    faults = list[Fault]()
     try:
         catalog = load({p: t for p, t in files.items() if p.split("/")[0] in CONFIG_ROOTS})
         if before is not None:
             faults += _unversioned_charts(catalog, files, before)
+        now = now or datetime.now(timezone.utc)
+        catalog = _with_ended(catalog, files, now)
         state = State.of(catalog, _ledger(files, faults))
         rehearse(state)
-        wanted = rendered(state)
+        generated = {p: text for p, text in files.items() if p.split("/")[0] in GENERATED_ROOTS}
+        wanted = rendered(state, generated)
     except InvalidInput as error:
-        return Checked((*faults, *error.faults), ())
+        return Checked((*edits, *faults, *error.faults), ())
+    # what follows from the books was not written by hand: a proposal brings both
+    faults = [found for found in edits if wanted.get(found.file) != files.get(found.file)] + faults
     outdated = tuple(
         path
         for path in sorted({*wanted, *(p for p in files if p.split("/")[0] in GENERATED_ROOTS)})
         if wanted.get(path) != files.get(path) and not trees.is_note(path)
     )
-    return Checked(tuple(faults), outdated)
+    idle = warnings(survey(state.ledger, catalog, now))
+    return Checked(tuple(faults), outdated, tuple(fault("", text).within(p) for p, text in idle))
+
+
+def _with_ended(catalog: Catalog, files: Mapping[str, str], now: datetime) -> Catalog:
+    """Return the catalog without the overrides that a generator ended, or would at once."""
+    marked = {p: text for p, text in files.items() if p.startswith(f"{markers.MARKERS_ROOT}/")}
+    catalog = catalog.with_ended(markers.read(marked))
+    over = {one.name: written(one.end) for one in due(catalog, now) if one.end}
+    return catalog.with_ended({**catalog.ended, **over})
 
 
 def _ledger(files: Mapping[str, str], faults: list[Fault]) -> Ledger:

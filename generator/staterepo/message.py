@@ -12,8 +12,9 @@ from datetime import datetime, timezone
 
 import pygit2
 
+from generator.catalog.override import OVERRIDES_ROOT, Override, written
 from generator.decision import Decision
-from generator.demand.claim import SubjectKind
+from generator.demand.claim import KEPT, ClaimKey, SubjectKind
 from generator.demand.request import Operation
 from generator.errors import Fault
 from generator.ledger import format as ledger_format
@@ -78,6 +79,7 @@ def of_decision(
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
         *(("Connection", s.id) for s in subjects if s.kind is SubjectKind.CONNECTION),
         ("Request-Id", request.id),
+        *_overrides(decision),
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
@@ -164,6 +166,46 @@ def of_follow(
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
+
+
+def of_ended(
+    override: Override,
+    releases: tuple[ReleaseChange, ...],
+    more: Iterable[tuple[str, str]] = (),
+) -> str:
+    """Return the message of the commit that ends an override at the time that it names."""
+    body = [
+        f"End override {override.name}",
+        "",
+        f"Why: {override.path} of {override.owner} ({override.reason}) expired at "
+        f"{written(override.end) if override.end else ''}.",
+        "",
+        *_desired_state(releases),
+    ]
+    trailers = [
+        ("Operation", "expire-override"),
+        *of_overrides([override.path]),
+        *more,
+        ("Render-Version", str(RENDER_VERSION)),
+    ]
+    return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
+
+
+def of_overrides(paths: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the trailers that name overrides."""
+    return [("Override", path) for path in sorted(set(paths))]
+
+
+def _overrides(decision: Decision) -> list[tuple[str, str]]:
+    """Return the trailers that name the overrides that shaped a demand's commit."""
+    keys = (change.key for change in decision.changes.claims)
+    return of_overrides([*decision.overrides, *keeping(keys)])
+
+
+def keeping(keys: Iterable[ClaimKey]) -> list[str]:
+    """Return the files of the overrides whose own claims these are."""
+    demands = (key.demand for key in keys if key.demand.startswith(KEPT))
+    return [f"{OVERRIDES_ROOT}/{demand.removeprefix(KEPT)}.yaml" for demand in demands]
 
 
 def _trailers(pairs: Iterable[tuple[str, str]]) -> list[str]:

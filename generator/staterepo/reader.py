@@ -135,7 +135,7 @@ class Reader:
             why = f"a person's file was not valid then: {error.faults[0]}"
             return Verdict(entry.commit, entry.summary, True, why)
         try:
-            wanted = rendered(snapshot.state)
+            wanted = rendered(snapshot.state, _held_from(commit, snapshot.state.catalog))
         except InvalidInput as error:  # the generator did render it then, so it must now
             return Verdict(entry.commit, entry.summary, False, fault=str(error.faults[0]))
         differing = _differing(wanted, commit)
@@ -150,7 +150,17 @@ class Reader:
             return snapshots.load(self._repository.objects, commit.id)
         snapshot = snapshots.load(self._repository.objects, sound)
         later = snapshots.advance(self._repository.objects, snapshot, commit.id).snapshot
-        return replace(later, state=replace(snapshot.state, ledger=later.state.ledger))
+        catalog = snapshot.state.catalog.with_ended(later.state.catalog.ended)
+        return replace(
+            later, state=replace(snapshot.state, catalog=catalog, ledger=later.state.ledger)
+        )
+
+
+def _held_from(commit: Commit, catalog: Catalog) -> dict[str, str]:
+    """Return the files as they were before a commit, where overrides hold some of them."""
+    if not commit.parents or not any(override.hold for override in catalog.in_force):
+        return {}
+    return trees.texts(commit.parents[0].tree, GENERATED_ROOTS)
 
 
 def _not_ours(entry: LogEntry) -> str:

@@ -22,6 +22,7 @@ from generator.decision import State, rehearse
 from generator.demand.claim import Claim, ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.ledger import format as ledger_format
+from generator.ledger import markers
 from generator.ledger.ledger import Ledger
 from generator.settings import GENERATED_ROOTS, RENDER_VERSION
 from generator.staterepo import message
@@ -125,6 +126,7 @@ def load_last_valid(
     except InvalidInput as error:
         problems += error.faults
         catalog = _last_valid_catalog(repo, commit, error)
+        catalog = catalog.with_ended(markers.read(markers_at(commit.tree)))
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
     for path in dict.fromkeys(found.file for found in faults):
         claim = _last_valid_claim(commit, path)
@@ -209,7 +211,12 @@ def catalog_at(tree: Tree) -> Catalog:
         raise StateRepoError(
             "this is no state repo, for it has no demandops.yaml; `demandops init DIR` makes one"
         )
-    return load_catalog(files)
+    return load_catalog(files).with_ended(markers.read(markers_at(tree)))
+
+
+def markers_at(tree: Tree) -> dict[str, str]:
+    """Return path → text of the files that say which overrides ended."""
+    return trees.texts(tree, (markers.MARKERS_ROOT,))
 
 
 def _ledger_at(
@@ -260,6 +267,10 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             state = State(catalog, State.of(catalog, state.ledger).engine, state.ledger)
         except (InvalidInput, StateRepoError) as error:
             problems += _as_faults(error)
+    ended = markers.read(markers_at(after))
+    if ended != state.catalog.ended:
+        state = replace(state, catalog=state.catalog.with_ended(ended))
+        catalog_changed = True
     ledger, keys, subjects = state.ledger, snapshot.keys, list[Subject]()
     seen = set()
     for path, blob in trees.differences(

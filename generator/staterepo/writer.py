@@ -11,15 +11,21 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
+from types import MappingProxyType
 from typing import Literal
 
 import pygit2
 from pygit2 import Oid, Signature
 
+from generator.catalog.catalog import Catalog
+from generator.catalog.override import Override
 from generator.decision import Decision, State, consequence, rendered
-from generator.demand.claim import Subject
+from generator.demand.claim import ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger
+from generator.plan import keeping
+from generator.plan.following import TakenIn, differing, ended, files_of, taken_in
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
 from generator.staterepo import history, message
@@ -87,50 +93,95 @@ class Line:
         snapshot = advance.snapshot
         state, problems = snapshot.state, list(snapshot.problems)
         change = Changeset({}, ())
+        keys: tuple[ClaimKey, ...] = ()
         if advance.catalog_changed:
             try:
-                change = self._everything(state)
+                state, change, keys = self._taken_in(state, before, advance.subjects, now)
             except InvalidInput as error:
                 problems += error.faults
-                state = replace(before.state, ledger=state.ledger)
+                catalog = before.state.catalog.with_ended(state.catalog.ended)
+                state = replace(before.state, ledger=state.ledger, catalog=catalog)
                 advance = replace(advance, catalog_changed=False)
         if not advance.catalog_changed:
-            state, change = self._carried_out(state, before, advance.subjects, problems)
+            state, change, keys = self._carried_out(
+                state, before, advance.subjects, (problems, now)
+            )
         state, begun = _with_leases_begun(state, now)
         change = replace(change, files={**change.files, **begun})
         sound = before.sound if problems else snapshot.commit
         self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
         if change.files:
+            overrides = [*differing(before.state.catalog, state.catalog), *change.overrides]
+            overrides += message.keeping(keys)
             text = message.of_follow(
                 change.releases,
                 str(snapshot.commit),
                 str(before.commit),
                 problems,
-                _in_force(self.head),
+                [*message.of_overrides(overrides), *_in_force(self.head)],
             )
             made = self._write(change.files, text, message.generator_signature(now), now)
-            self.head = self.head.after(made, state, ())
+            self.head = self.head.after(made, state, keys)
+
+    def _taken_in(
+        self, state: State, before: Snapshot, subjects: Iterable[Subject], now: datetime
+    ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
+        """Render everything for a configuration that changed."""
+        marked = snapshots.markers_at(self._tree)
+        taken = taken_in(_books(before.state), _books(state), subjects, marked, now)
+        state = _with(state, taken)
+        return state, self._everything(state, taken.files), taken.keys
+
+    def end(self, override: Override, now: datetime) -> None:
+        """Commit that an override's time is over, and what follows.
+
+        Raises:
+            Refused, InvalidInput: where what is left cannot be planned or rendered.
+        """
+        state = self.head.state
+        taken = ended(_books(state), override, now)
+        state = _with(state, taken)
+        change = self._everything(state, taken.files)
+        text = message.of_ended(override, change.releases, _in_force(self.head))
+        made = self._write(change.files, text, message.generator_signature(now), now)
+        self.head = self.head.after(made, state, taken.keys)
 
     def _carried_out(
-        self, state: State, before: Snapshot, subjects: Iterable[Subject], problems: list[Fault]
-    ) -> tuple[State, Changeset]:
+        self,
+        state: State,
+        before: Snapshot,
+        subjects: Iterable[Subject],
+        noted: tuple[list[Fault], datetime],
+    ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
         """Plan and render the subjects that people changed; one that fails stays as it was."""
-        good = []
+        problems, now = noted
+        good, keys = list[Subject](), list[ClaimKey]()
+        books = before.state.ledger
+        files: dict[str, str | None] = {}
         for subject in subjects:
+            ledger, own = keeping.kept(books, state.ledger, [subject], (state.catalog, now))
+            tried = replace(state, ledger=ledger)
             try:
-                consequence(state, before.state.ledger, [subject], self.read)
-                good.append(subject)
+                consequence(tried, books, [subject], self.read)
             except InvalidInput as error:
                 problems += error.faults
-                state = replace(state, ledger=state.ledger.restored(subject, before.state.ledger))
-        return state, consequence(state, before.state.ledger, good, self.read)
+                state = replace(state, ledger=state.ledger.restored(subject, books))
+                continue
+            files |= files_of(state.ledger, ledger, own)
+            state = tried
+            good.append(subject)
+            keys += own
+        change = consequence(state, books, good, self.read)
+        return state, replace(change, files={**files, **change.files}), tuple(keys)
 
-    def _everything(self, state: State) -> Changeset:
-        files: dict[str, str | None] = dict(rendered(state))
+    def _everything(
+        self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
+    ) -> Changeset:
+        """Return all generated files that differ, with ``more`` files of the ledger."""
+        generated = trees.texts(self._tree, GENERATED_ROOTS)
+        files: dict[str, str | None] = dict(rendered(state, generated))
         changes = []
-        standing = {
-            path for path in trees.texts(self._tree, GENERATED_ROOTS) if path.endswith(".yaml")
-        }
+        standing = {path for path in generated if path.endswith(".yaml")}
         for path in standing - set(files):
             files[path] = None
         for path in sorted(files):
@@ -141,7 +192,7 @@ class Line:
             kind: Change = "stop" if files[path] is None else "start" if old is None else "change"
             name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
             changes.append(ReleaseChange(name, kind, path, ()))
-        return Changeset(files, tuple(changes))
+        return Changeset({**more, **files}, tuple(changes))
 
     def _write(
         self, files: Mapping[str, str | None], text: str, author: Signature, now: datetime
@@ -186,6 +237,14 @@ def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, st
         ledger = ledger.replace(claim.key, begun)
         files[ledger_format.path_of(claim.key)] = ledger_format.write(begun)
     return replace(state, ledger=ledger), files
+
+
+def _books(state: State) -> tuple[Ledger, Catalog]:
+    return state.ledger, state.catalog
+
+
+def _with(state: State, taken: TakenIn) -> State:
+    return replace(state, ledger=taken.ledger, catalog=taken.catalog)
 
 
 def _in_force(snapshot: Snapshot) -> list[tuple[str, str]]:
