@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from generator.catalog.model import DnsLabel, FileModel, Frozen
+from generator.errors import shown
 
 ROOT_FILE = "demandops.yaml"
 
@@ -35,13 +37,21 @@ class ArgoCd(Frozen):
     namespace: DnsLabel = "argocd"
 
 
-WebUrl = Annotated[
-    str,
-    StringConstraints(
-        pattern=r"^(https://[^\s:@/?#]+|http://(127\.0\.0\.1|localhost|\[::1\]))(:\d+)?(/[^\s?#]*)?$"
-    ),
-]
-"""An address by https, or by http on this machine: an access token is sent there."""
+_WEB_URL = re.compile(
+    r"(https://[^\s:@/?#]+|http://(127\.0\.0\.1|localhost|\[::1\]))(:\d+)?(/[^\s?#]*)?"
+)
+
+
+def _web_url(text: str) -> str:
+    if not _WEB_URL.fullmatch(text):
+        raise ValueError(
+            f"{shown(text)} is no address that a token is sent to; write https://HOST/PATH, "
+            "without a user (plain http only for this machine)"
+        )
+    return text
+
+
+WebUrl = Annotated[str, AfterValidator(_web_url)]
 
 
 class Proposals(Frozen):

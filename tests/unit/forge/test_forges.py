@@ -187,7 +187,10 @@ def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
     [
         ("{forge: github}", "proposals: forge: github needs url, the project's address"),
         ("{forge: github, url: 'https://github.com/its'}", "needs url, the project's address"),
-        ("{forge: gitea, url: 'http://git.example.org/a/b'}", "proposals.url: "),
+        (
+            "{forge: gitea, url: 'http://git.example.org/a/b'}",
+            "proposals.url: 'http://git.example.org/a/b' is no address that a token is sent to",
+        ),
         ("{forge: gitea, url: 'https://me:secret@x.org/a/b'}", "proposals.url: "),
         ("{forge: none, api: 'https://x.org/a'}", "api: is not used with forge: none"),
         ("{forge: gitea, url: 'https://x.org/a/b', labels: [x]}", "labels: only GitLab's push"),
