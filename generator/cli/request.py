@@ -210,6 +210,7 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
     """Decide every request on top of the one before, in memory only."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
+        repo.refuse_other_rendering()
         state = repo.snapshot(progress=tell).state
         standing, written = repo.file_reader(), dict[str, str | None]()
 
@@ -240,11 +241,16 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
 
 
 def _show_consequence(index: int, decision: Decision) -> None:
-    out = console()
     outcome = "proposed" if decision.approval else decision.outcome
-    out.print(f"Request {index}: '{decision.request.id}' would be {outcome}")
+    console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
     for who in decision.approval:
-        out.print(f"  needs approval: {who} asks for it")
+        console().print(f"  needs approval: {who} asks for it")
+    show_releases(decision)
+
+
+def show_releases(decision: Decision) -> None:
+    """Print what a decision changes: releases, and the files that are written or removed."""
+    out = console()
     for release in decision.releases:
         out.print(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
         for detail in release.details:

@@ -84,6 +84,7 @@ class Approvals:
             batch.remove(ticket)
             request = admitted(state, ticket.goal)
             record = ticket.proposal or Record("")
+            ticket.state = "withdrawn" if record.withdrawn else ticket.state
             proposal = next(
                 (p for p in self._proposals.values() if p.branch == record.branch), None
             )

@@ -11,6 +11,7 @@ from pathlib import Path
 from generator import settings
 from generator.catalog.catalog import Catalog
 from generator.errors import DemandOpsError, ShuttingDown, StateRepoError
+from generator.service import following
 from generator.service.approval import Approvals
 from generator.service.settling import Settler
 from generator.service.ticket import Listener, Ticket, handed_in
@@ -27,7 +28,7 @@ _STOP_TIMEOUT_S = 20.0
 class Generator:
     """Takes demands from any thread and turns them into commits of one state repo."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - each is a choice of its own
         self,
         state_repo: str,
         *,
@@ -35,6 +36,7 @@ class Generator:
         queue_limit: int = settings.QUEUE_LIMIT,
         patient: bool = True,
         with_targets: bool = False,
+        fetch_interval: float = 0.0,
         progress: Progress = lambda done, total: None,
         on_published: Callable[[Catalog], None] = lambda catalog: None,
     ) -> None:
@@ -46,6 +48,8 @@ class Generator:
             queue_limit: how many demands may wait.
             patient: whether to start while the remote is away, from what was fetched last.
             with_targets: whether receipts say which releases a demand needs.
+            fetch_interval: seconds between two looks at what others published, while no demand
+                comes; 0: a repository on this disk only, and seldom.
             progress: told (files read, files in all) while the ledger is loaded.
             on_published: called in the worker thread after every push, with the catalog in force;
                 must return at once.
@@ -76,6 +80,7 @@ class Generator:
             self._tell_watchers,
             with_targets,
             self._approvals,
+            fetch_interval,
         )
         self._finished: Future[bool] | None = None
         self._stop_lock = threading.Lock()
@@ -88,6 +93,15 @@ class Generator:
     def snapshot(self) -> Snapshot:
         """The newest published state; safe to read from any thread."""
         return self._settler.snapshot
+
+    @property
+    def condition(self) -> following.Condition:
+        """How it is with the state repo; safe to read from any thread."""
+        return following.condition(self._settler.follower.link, self.snapshot, self._waiting)
+
+    def look(self) -> None:
+        """Have the state repo looked at now, for somebody pushed to it; from any thread."""
+        self._settler.follower.nudge()
 
     def submit(
         self,
