@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
-from generator.demand import admission, carriers, leaving, own, permission, wire
+from generator.demand import admission, approval, carriers, leaving, own, permission, wire
 from generator.demand.claim import Subject
 from generator.demand.request import DemandRequest, Operation
 from generator.errors import Fault, InvalidInput, Refused
@@ -61,7 +61,10 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What a demand does. ``files`` is empty where it changes nothing."""
+    """What a demand does. ``files`` is empty where it changes nothing.
+
+    ``approval`` names what asks for a person's approval first: access domains, rules, appdefs.
+    """
 
     request: DemandRequest
     outcome: Outcome
@@ -70,6 +73,7 @@ class Decision:
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
+    approval: tuple[str, ...] = ()
     overrides: tuple[str, ...] = ()
     """The files of the overrides that shaped what is written."""
 
@@ -130,6 +134,9 @@ def decide(
             *_bridged(request, state.catalog),
             *made.waiting,
             *denial.warnings(request, ledger, state.catalog),
+        ),
+        approval=approval.asked_by(
+            request, ((c.before, c.after) for c in changes.claims), state.catalog
         ),
         overrides=made.overrides,
     )

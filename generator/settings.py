@@ -54,6 +54,12 @@ def data_folder(name: str) -> Path:
     return _PACKAGE.parent / {"skeleton": "state-repo-skeleton"}.get(name, name)
 
 
+def forge_token_file() -> Path | None:
+    """Return the file with the token for the forge, as ``DEMANDOPS_FORGE_TOKEN_FILE`` names it."""
+    named = os.environ.get("DEMANDOPS_FORGE_TOKEN_FILE")
+    return Path(named).expanduser() if named else None
+
+
 def data_home(state_repo: str) -> Path:
     """Return where the generator keeps its outbox and clone for one state repo.
 

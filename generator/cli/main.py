@@ -17,6 +17,7 @@ from generator.cli import (
     check,
     decommission,
     overrides,
+    proposals,
     repo,
     request,
     schema,
@@ -90,6 +91,7 @@ cli.add_command(repo.verify)
 cli.add_command(upgrade.upgrade)
 cli.add_command(schema.schema)
 cli.add_command(status.status)
+cli.add_command(proposals.proposals)
 
 
 def main(args: list[str] | None = None) -> None:

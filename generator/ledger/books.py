@@ -20,6 +20,7 @@ from generator.demand.claim import (
     Subject,
     SubjectKind,
 )
+from generator.demand.lease import UNSTARTED
 from generator.demand.request import ConnectionType
 
 Claims: TypeAlias = "HashTrieMap[str, Claim]"
@@ -125,6 +126,12 @@ class Ledger:
             return None
         first = self._claims(_ENDS, min(self.minutes))
         return min(claim.lease.ends for claim in first if claim.lease)
+
+    def unstarted(self) -> tuple[Claim, ...]:
+        """Return the claims whose lease has not begun: approved, and not yet taken in."""
+        later = (minute for minute in self.minutes if minute >= _minute(UNSTARTED))
+        found = (claim for minute in sorted(later) for claim in self._claims(_ENDS, minute))
+        return tuple(claim for claim in found if claim.lease and not claim.lease.has_started)
 
     def ended(self, now: datetime) -> tuple[Claim, ...]:
         """Return the claims whose lease ended before ``now``, the first to end first."""

@@ -12,6 +12,7 @@ from generator import settings
 from generator.catalog.catalog import Catalog
 from generator.errors import DemandOpsError, ShuttingDown, StateRepoError
 from generator.service import following
+from generator.service.approval import Approvals
 from generator.service.settling import Settler
 from generator.service.ticket import Listener, Ticket, handed_in
 from generator.service.waiting import Waiting
@@ -27,7 +28,7 @@ _STOP_TIMEOUT_S = 20.0
 class Generator:
     """Takes demands from any thread and turns them into commits of one state repo."""
 
-    def __init__(  # noqa: PLR0913 - each is a choice of its own
+    def __init__(
         self,
         state_repo: str,
         *,
@@ -66,12 +67,16 @@ class Generator:
         self.queue_limit = queue_limit
         self._waiting = Waiting(self._slot.outbox, queue_limit)
         self._watchers: list[Callable[[Catalog], None]] = []
+        self._approvals = Approvals(
+            repository, self._waiting, with_targets, settings.forge_token_file()
+        )
         self._settler = Settler(
             repository,
             snapshot,
             self._waiting,
             self._tell_watchers,
             with_targets,
+            self._approvals,
             fetch_interval,
         )
         self._finished: Future[bool] | None = None
@@ -193,10 +198,11 @@ class Generator:
                 self._settler.take_up(batch)
                 if not batch:
                     self._settler.notice()
-                    continue
-                self._settler.settle(batch)
-                self._settler.catch_up()
-                self._settler.tidy()
+                else:
+                    self._settler.settle(batch)
+                    self._settler.catch_up()
+                    self._settler.tidy()
+                self._settler.attend()
             except ShuttingDown as error:
                 self._waiting.fail(batch, error, keep=True)
             except DemandOpsError as error:
@@ -205,3 +211,4 @@ class Generator:
                 log.exception("a fault of the generator")
                 told = StateRepoError(f"a fault of the generator: {error!r}; its log says more")
                 self._waiting.fail(batch, told)
+        self._approvals.suspend()

@@ -28,6 +28,7 @@ from generator.errors import (
     Withdrawn,
     fault,
 )
+from generator.service.approval import GIVEN_UP, Approvals, Deferred
 from generator.service.expiry import LeaseClock
 from generator.service.following import Follower
 from generator.service.overriding import OverrideClock
@@ -54,7 +55,7 @@ _TIDY_EVERY = 300
 _LONGEST_WAIT_S = 60.0
 """Between two looks at the leases: a clock may be set meanwhile."""
 
-_Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError]
+_Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Deferred]
 
 
 class Settler:
@@ -70,9 +71,11 @@ class Settler:
         waiting: Waiting,
         on_published: Callable[[Catalog], None],
         with_targets: bool,
+        approvals: Approvals,
         fetch_interval: float = 0.0,
     ) -> None:
         self.snapshot = snapshot
+        self._approvals = approvals
         self._repository = repository
         self._waiting = waiting
         self._on_published = on_published
@@ -100,9 +103,13 @@ class Settler:
 
         A renewal that waits was received before: it is judged first, or nothing expires yet.
         """
-        self._waiting.take_up(batch, self._batch_limit)
+        self._take_up(batch)
         if not self._waiting.anything:
             batch += self.expired()
+
+    def _take_up(self, batch: list[Ticket]) -> None:
+        self._waiting.take_up(batch, self._batch_limit)
+        self._approvals.resume(batch, self.snapshot.state)
 
     def settle(self, batch: list[Ticket]) -> None:
         """Bring a batch to an end, with what comes in while the remote moves, and empty it.
@@ -123,10 +130,13 @@ class Settler:
                     stale, verdict_is_current = False, True
                 self._waiting.dismiss_withdrawn(batch)
                 part = batch[:share]
+                self._approvals.give_up(part, self.snapshot.state)
                 line = self._line()
                 arrived = self._arrived(line.start, part)
                 began = time.monotonic()
-                results = [(ticket, self._judge(line, ticket, arrived)) for ticket in part]
+                results: list[_Result] = []
+                for ticket in part:
+                    results.append((ticket, self._judge(line, ticket, arrived, results)))
                 judged = time.monotonic()
                 nothing_to_push = line.head.commit == line.start.commit
                 if nothing_to_push and not verdict_is_current:
@@ -136,7 +146,7 @@ class Settler:
                     if tip != line.start.commit:
                         continue
                 if self._publish(line, results):
-                    self._waiting.answer(results)
+                    self._answer(results)
                     del batch[: len(part)]
                     pause, away, share = _FIRST_PAUSE_S, _FIRST_PAUSE_S, self._batch_limit
                     continue
@@ -158,7 +168,30 @@ class Settler:
                 raise ShuttingDown(
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
-            self._waiting.take_up(batch, self._batch_limit)
+            self._take_up(batch)
+
+    def _answer(self, results: list[_Result]) -> None:
+        """Answer what is settled; what needs approval waits on."""
+        told = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
+        self._waiting.answer(told)
+        for ticket, result in results:
+            if isinstance(result, Deferred):
+                self._approvals.take(ticket, result.decision)
+
+    def attend(self) -> None:
+        """Look after the demands that await approval, with main as it is now."""
+        if not self._approvals.is_due(str(self.snapshot.commit)):
+            return
+        try:
+            heads = self._approvals.heads()
+            if heads.main != str(self.snapshot.commit):
+                self._repository.refresh()
+                self.follower.catch_up()
+            # a branch that is gone may have been merged: only a newer main tells
+            if self._repository.includes(str(self.snapshot.commit), heads.main):
+                self._approvals.look(self.snapshot, heads)
+        except (RemoteAway, PushDenied) as error:
+            log.warning("%s; the demands that await approval wait on", error)
 
     def _linger(self, batch: list[Ticket], seconds: float) -> None:
         """Let a while pass; demands that come in meanwhile are kept, and told why they wait."""
@@ -175,9 +208,9 @@ class Settler:
             told = self._waiting.keep(left)
 
     def pause(self) -> float:
-        """Return the seconds after which to look at leases, overrides or the state repo again."""
+        """Return the seconds until leases, overrides, proposals or the state repo are due."""
         state = self.snapshot.state
-        ends = self._clock.pause(state.ledger, _LONGEST_WAIT_S)
+        ends = self._clock.pause(state.ledger, self._approvals.pause(_LONGEST_WAIT_S))
         ends = self._overrides.pause(state.catalog, _now(), ends)
         look = self.follower.pause()
         return ends if look is None else min(ends, look)
@@ -236,8 +269,8 @@ class Settler:
         return True
 
     def _taken(self, line: writer.Line) -> None:
-        self.snapshot = line.head
-        if line.head.commit != line.start.commit:
+        before, self.snapshot = self.snapshot, line.head
+        if line.head.commit != before.commit:  # a merge may ask for no commit of our own
             self._on_published(line.head.state.catalog)
 
     def _line(self) -> writer.Line:
@@ -256,13 +289,21 @@ class Settler:
         return line
 
     def _judge(
-        self, line: writer.Line, ticket: Ticket, arrived: dict[str, history.Arrival]
-    ) -> Receipt | DemandOpsError:
+        self,
+        line: writer.Line,
+        ticket: Ticket,
+        arrived: dict[str, history.Arrival],
+        earlier: list[_Result],
+    ) -> Receipt | DemandOpsError | Deferred:
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
         if ticket.operation in arrived:
             return _published_before(ticket, arrived[ticket.operation])
         try:
+            gone = self._approvals.gave_up(ticket, line.head.state, earlier)
+            earlier[:] = [
+                (t, Withdrawn(GIVEN_UP) if t.operation in gone else r) for t, r in earlier
+            ]
             decision = decide(
                 line.head.state,
                 ticket.goal,
@@ -273,12 +314,18 @@ class Settler:
                     request, catalog, ticket.operation, ticket.received
                 ),
             )
+            if decision.approval:
+                return Deferred(decision)
             if not self._waiting.hold(ticket):
                 return Withdrawn(TAKEN_BACK)
+            self._approvals.replaced_by(decision.request)
             before = line.head.state.ledger
             targets = targets_of(before, decision) if self._with_targets else ()
             return replace(_commit(line, ticket, decision), targets=targets)
         except InvalidInput as error:
+            if self._approvals.released(ticket):  # what was proposed, and nothing else
+                line.note(ticket.operation, "Unchanged")
+                return _released(ticket, str(line.head.commit))
             line.note(ticket.operation, "Refused")
             return error
         except Exception as error:  # one demand that the program cannot handle stops no other
@@ -328,6 +375,12 @@ def _published_before(ticket: Ticket, arrival: history.Arrival) -> Receipt | Dem
         outcome = "unchanged"
     name = goal.get("id") or goal.get("request") or goal.get("demand") or goal.get("name") or ""
     return Receipt(ticket.operation, str(name), outcome, arrival.commit)
+
+
+def _released(ticket: Ticket, commit: str) -> Receipt:
+    goal = ticket.goal
+    name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
+    return Receipt(ticket.operation, str(name), "released", commit)
 
 
 def _doubt(batch: list[Ticket], start: Snapshot) -> None:

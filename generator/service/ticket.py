@@ -8,7 +8,7 @@ import re
 import uuid
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from generator.staterepo.outbox import Entry
 
 log = logging.getLogger("demandops")
 
-Stage = Literal["away", "admitted", "booked", "committed", "pushed"]
+Stage = Literal["away", "admitted", "booked", "committed", "proposed", "pushed"]
 """``away``: the state repo cannot be reached or takes nothing for now; the text says why."""
 Listener = Callable[[Stage, str], None]
 
@@ -48,6 +48,23 @@ class Receipt:
     changes: tuple[ClaimChange, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What the journal keeps of a proposal: enough to take it up again.
+
+    ``commits`` are those that the branch was put to or is about to be, the newest last, and
+    ``base`` the main below the newest. ``pushed`` tells that the branch was there once, ``link``
+    where the server says that a person finds it, ``withdrawn`` why it is to go, where it is.
+    """
+
+    branch: str
+    commits: tuple[str, ...] = ()
+    base: str = ""
+    pushed: bool = False
+    link: str = ""
+    withdrawn: str = ""
+
+
 @dataclass(eq=False)
 class Ticket:
     """A demand under way. ``future`` gives its receipt, or raises why there is none.
@@ -65,15 +82,17 @@ class Ticket:
     maybe_published: bool = False
     state: Literal["waiting", "committed", "withdrawn", "done"] = "waiting"
     told: set[str] = field(default_factory=set)
+    proposal: Record | None = None
 
     def __post_init__(self) -> None:
         self.future.set_running_or_notify_cancel()  # `withdraw` takes a demand back, not cancel
 
     def tell(self, stage: Stage, text: str) -> None:
-        """Tell a stage once, also where the demand is judged again."""
-        if stage in self.told:
+        """Tell a stage once, also where the demand is judged again; of a proposal each news."""
+        news = text if stage == "proposed" else stage
+        if news in self.told:
             return
-        self.told.add(stage)
+        self.told.add(news)
         try:
             self.listener(stage, text)
         except Exception:
@@ -86,7 +105,8 @@ class Ticket:
 
     def entry(self) -> Entry:
         """Return what the outbox keeps of it."""
-        return Entry(self.operation, self.goal, self.received.isoformat(), self.base)
+        kept = asdict(self.proposal) if self.proposal else None
+        return Entry(self.operation, self.goal, self.received.isoformat(), self.base, kept)
 
 
 def handed_in(goal: object, operation: str | None, listener: Listener) -> Ticket:
@@ -111,4 +131,7 @@ def left_over(entry: Entry) -> Ticket:
     received = datetime.fromisoformat(entry.received)
     ticket = Ticket(entry.operation, entry.goal, received, lambda stage, text: None)
     ticket.doubt(entry.base)
+    if entry.proposal is not None:
+        kept = entry.proposal
+        ticket.proposal = Record(**{**kept, "commits": tuple(kept["commits"])})
     return ticket

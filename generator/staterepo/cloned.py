@@ -9,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -137,9 +137,56 @@ class ClonedRepository(StateRepository):
         self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         return True
 
+    def listed(self, *patterns: str) -> dict[str, str]:
+        """Ask the remote for its references that match, and return name → commit.
+
+        Raises:
+            RemoteAway: where it cannot be reached.
+        """
+        try:
+            out, _ = self._talk(self._git, "ls-remote", "--quiet", "origin", *patterns)
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+            raise RemoteAway(f"{self.address} cannot be asked: {_last_line(text)}") from None
+        pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
+        return {name: commit for commit, name in pairs}
+
+    def fetch_branches(self, prefix: str) -> None:
+        """Fetch the branches whose names begin so, and forget those that are gone.
+
+        Raises:
+            RemoteAway: where the remote cannot be reached.
+        """
+        spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
+        try:
+            self._talk(self._git, "fetch", "--no-tags", "--quiet", "--prune", "origin", spec)
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+            raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
+
+    def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
+        """Push one reference and return what the remote had to say.
+
+        Args:
+            spec: what goes where.
+            lease: ``<reference>:<commit>``, what the remote must have, or nothing there.
+            options: what the server is told (``git push --push-option``).
+
+        Raises:
+            git.GitCommandError: where the remote did not take it.
+        """
+        told = [f"--push-option={option}" for option in options]
+        expects = f"--force-with-lease={lease}"
+        out, err = self._talk(self._git, "push", "--porcelain", *told, expects, "origin", spec)
+        return f"{out}\n{err}"
+
+    def why_not(self, error: git.GitCommandError) -> StateRepoError:
+        """Return why a push was not taken: to be tried again, or denied."""
+        return self._why_not(without_secrets(f"{error.stdout}\n{error.stderr}"))
+
     def _talk(
         self, repo: git.Repo, *command: str, urgent: Callable[[], bool] = lambda: False
-    ) -> None:
+    ) -> tuple[str, str]:
         if self._given_up:
             raise RemoteAway(f"{self.address} was given up")
         with repo.git.custom_environment(**ENVIRONMENT):
@@ -159,6 +206,7 @@ class ClonedRepository(StateRepository):
             self._talking = None
         if process.returncode:
             raise git.GitCommandError(list(command), process.returncode, err, out)
+        return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
 
     def give_up(self) -> None:
         """End what git is waiting for, and start nothing more."""

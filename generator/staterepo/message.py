@@ -25,6 +25,9 @@ from generator.settings import RENDER_VERSION
 GENERATOR_NAME = "DemandOps generator"
 GENERATOR_EMAIL = "generator@demandops.invalid"
 
+PROPOSAL = "Proposal"
+"""The trailer of a commit that awaits approval, or did: the branch that it was proposed on."""
+
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
 _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
@@ -32,8 +35,11 @@ _MAX_SUBJECT = 90
 
 
 def is_generators(message: str) -> bool:
-    """Tell whether a commit is the generator's, so that its files fit its books."""
-    return "\nRender-Version: " in message
+    """Tell whether a commit is the generator's, so that its files fit its books.
+
+    A proposal is merged by a person, perhaps onto others' changes: its files are looked at anew.
+    """
+    return "\nRender-Version: " in message and f"\n{PROPOSAL}: " not in message
 
 
 def generator_signature(moment: datetime) -> pygit2.Signature:

@@ -20,7 +20,9 @@ from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.address import is_url
 from generator.staterepo.history import LogEntry
+from generator.staterepo.message import PROPOSAL
 from generator.staterepo.outbox import Slot
+from generator.staterepo.proposals import Waiting, waiting
 from generator.staterepo.repository import StateRepository
 from generator.staterepo.snapshot import Progress, Snapshot
 
@@ -122,6 +124,22 @@ class Reader:
         tree = snapshots.commit_of(self._repository.objects, self.commit(revision)).tree
         return lambda path: trees.read_text(tree, path)
 
+    def catalog(self) -> Catalog:
+        """Return the configuration at the newest commit.
+
+        Raises:
+            InvalidInput, StateRepoError: where it holds no valid one.
+        """
+        return snapshots.catalog_at(snapshots.commit_of(self._repository.objects, self._tip).tree)
+
+    def proposals(self) -> list[Waiting]:
+        """Return the demands that await approval, by branch.
+
+        Raises:
+            RemoteAway: where the remote does not answer.
+        """
+        return list(waiting(self._repository))
+
     def log(self, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
         first, dots, last = (spec or "").partition("..")
@@ -139,7 +157,7 @@ class Reader:
         commit = snapshots.commit_of(self._repository.objects, revision)
         entry = history.entry_of(commit)
         if not entry.by_generator:
-            return Verdict(entry.commit, entry.summary, True, "made by a person")
+            return Verdict(entry.commit, entry.summary, True, _not_ours(entry))
         version = entry.one("Render-Version")
         if version != str(RENDER_VERSION):
             return Verdict(
@@ -186,6 +204,10 @@ def _held_from(commit: Commit, catalog: Catalog) -> dict[str, str]:
     if not commit.parents or not any(override.hold for override in catalog.in_force):
         return {}
     return trees.texts(commit.parents[0].tree, GENERATED_ROOTS)
+
+
+def _not_ours(entry: LogEntry) -> str:
+    return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
 
 
 def _differing(wanted: dict[str, str], commit: Commit) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from generator.catalog.override import Override
 from generator.decision import Decision, State, consequence, rendered
 from generator.demand.claim import ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
+from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger
 from generator.plan import keeping
 from generator.plan.following import TakenIn, differing, ended, files_of, taken_in
@@ -52,11 +53,23 @@ class Line:
         """Return a file as it is at the head of the line."""
         return trees.read_text(self._tree, path)
 
-    def commit(self, decision: Decision, operation: str, received: datetime, now: datetime) -> str:
-        """Commit one demand on top of the line and return the commit's id."""
-        text = message.of_decision(
-            decision, operation, received, [*self._settled, *_in_force(self.head)]
-        )
+    def commit(
+        self,
+        decision: Decision,
+        operation: str,
+        received: datetime,
+        now: datetime,
+        proposal: str = "",
+    ) -> str:
+        """Commit one demand on top of the line and return the commit's id.
+
+        Args:
+            proposal: the branch that it awaits approval on; nothing where it needs none.
+        """
+        more = [*self._settled, *_in_force(self.head)]
+        if proposal:
+            more.append((message.PROPOSAL, proposal))
+        text = message.of_decision(decision, operation, received, more)
         self._settled = []
         made = self._write(decision.files, text, message.author(decision, received), now)
         keys = [change.key for change in decision.changes.claims]
@@ -113,6 +126,8 @@ class Line:
                 problems += found
         if not whole:
             state, change, keys = self._carried_out(state, before, good, (problems, now))
+        state, begun = _with_leases_begun(state, now)
+        change = replace(change, files={**change.files, **begun})
         sound = before.sound if problems else snapshot.commit
         self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
         files = {**change.files, **self._report(problems, before)}
@@ -250,6 +265,20 @@ class Line:
         if self.head.commit == self.start.commit:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)
+
+
+def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, str]]:
+    """Start the leases of claims that a person approved; return their files as well.
+
+    A lease that counted from the demand could be over before anybody has approved it.
+    """
+    ledger, files = state.ledger, {}
+    for claim in ledger.unstarted():
+        assert claim.lease is not None  # noqa: S101 - that is what was looked for
+        begun = replace(claim, lease=claim.lease.begun(now))
+        ledger = ledger.replace(claim.key, begun)
+        files[ledger_format.path_of(claim.key)] = ledger_format.write(begun)
+    return replace(state, ledger=ledger), files
 
 
 def _books(state: State) -> tuple[Ledger, Catalog]:
