@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
-from generator.demand import admission, carriers, own, permission, wire
+from generator.demand import admission, carriers, leaving, own, permission, wire
 from generator.demand.claim import Subject
 from generator.demand.request import DemandRequest, Operation
 from generator.errors import Fault, InvalidInput, Refused
@@ -38,6 +38,7 @@ _OUTCOMES: dict[Operation, Outcome] = {
     Operation.SHUTDOWN: "released",
     Operation.RELEASE: "released",
     Operation.EXPIRE: "released",
+    Operation.DECOMMISSION: "released",
 }
 
 Throttle = Callable[[DemandRequest, Catalog], Iterable[Fault]]
@@ -127,6 +128,7 @@ def decide(
         warnings=(
             *_uncarried(request, ledger, state.catalog),
             *_bridged(request, state.catalog),
+            *made.waiting,
             *denial.warnings(request, ledger, state.catalog),
         ),
         overrides=made.overrides,
@@ -157,6 +159,8 @@ def admit(
         Refused: with every fault of form and content together.
     """
     catalog = state.catalog
+    if isinstance(goal, dict) and leaving.is_leaving(goal):
+        return leaving.parse(goal)
     if isinstance(goal, dict) and own.is_own(goal):
         request, faults = own.parse(goal)
         request = permission.with_terms(request, catalog)
@@ -230,6 +234,8 @@ def _in_goals_words(
     """Return faults named by the fields of the goal that the request came as."""
 
     def field(path: str) -> str:
+        if request.operation is Operation.DECOMMISSION:
+            return path
         if request.operation.is_reference:
             return wire.wire_field(path, request, catalog.appdefs)
         return own.field(path, request)

@@ -35,6 +35,10 @@ QUEUE_LIMIT = 10_000
 GENERATED_ROOTS = ("bootstrap", "clusters")
 """The top-level folders whose every file follows from ledger and configuration."""
 
+NOTES_ROOT = ".demandops"
+"""The top-level folder of what the generator tells people by files; nothing is read back from it
+that a decision depends on."""
+
 _PACKAGE = Path(__file__).parent
 
 

@@ -101,6 +101,13 @@ Patterns = Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_some)
 Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)]
 
 
+def _filled_in(model: Frozen) -> None:
+    """Raise for a field that is written down and empty: it would say less than it seems to."""
+    empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
+    if empty:
+        raise ValueError(f"{' and '.join(empty)}: nothing stands there; fill it in, or remove it")
+
+
 class Selector(Frozen):
     """What an override is for: a release or claim that every field given here fits.
 
@@ -120,6 +127,7 @@ class Selector(Frozen):
     def _sensible(self) -> Selector:
         if not self.model_fields_set:
             raise ValueError("selects nothing; give at least one field, nodes: ['*'] say")
+        _filled_in(self)
         others = [name for name in ("applications", "appdefs", "services") if getattr(self, name)]
         if self.connections and others:
             raise ValueError(
@@ -173,6 +181,7 @@ class OverrideFile(FileModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> OverrideFile:
+        _filled_in(self)
         problems = [*_contradictions(self.effects()), *self._misplaced()]
         if problems:
             raise ValueError("; ".join(problems))

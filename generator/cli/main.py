@@ -13,7 +13,17 @@ from importlib.metadata import EntryPoint, entry_points
 import click
 
 from generator import __version__
-from generator.cli import overrides, repo, request, schema, status, views
+from generator.cli import (
+    check,
+    decommission,
+    overrides,
+    repo,
+    request,
+    schema,
+    status,
+    upgrade,
+    views,
+)
 from generator.cli.output import errors
 from generator.errors import DemandOpsError, InvalidInput
 
@@ -70,12 +80,14 @@ def cli(verbose: bool) -> None:
 
 cli.add_command(repo.init)
 cli.add_command(request.request)
+cli.add_command(decommission.decommission)
 cli.add_command(views.bookkeeping)
 cli.add_command(views.log)
 cli.add_command(views.diff)
 cli.add_command(overrides.overrides)
-cli.add_command(repo.check)
+cli.add_command(check.check)
 cli.add_command(repo.verify)
+cli.add_command(upgrade.upgrade)
 cli.add_command(schema.schema)
 cli.add_command(status.status)
 

@@ -1,4 +1,4 @@
-"""``demandops init``, ``check`` and ``verify``: the state repo itself."""
+"""``demandops init`` and ``verify``: the state repo itself."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import click
 
 from generator.cli.output import (
     console,
-    errors,
     output_option,
     print_json,
     progress,
     state_repo_option,
 )
-from generator.staterepo import checkout, layout, reader
+from generator.staterepo import layout, reader
 
 
 @click.command()
@@ -65,52 +64,6 @@ def init(directory: Path, gitops: str, bare: bool, url: str, output: str) -> Non
     else:
         out.print("next: edit inventory/ and policy/, commit, push it to your Git server, and run")
         out.print("      demandops serve --state-repo URL")
-
-
-@click.command()
-@click.argument(
-    "directory",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    metavar="DIR",
-    default=Path(),
-)
-@click.option(
-    "--base",
-    metavar="REV",
-    help="The commit that the edit started from; by default where it left origin/main, or HEAD.",
-)
-@output_option
-def check(directory: Path, base: str | None, output: str) -> None:
-    """Check a checked-out state repo before its edits are merged.
-
-    All files are valid, every application renders, no generated file is edited by hand, and a
-    chart that changed has a new version.
-    """
-    found = checkout.check(directory, base)
-    if output == "json":
-        print_json(
-            {
-                "faults": [
-                    {"file": one.file, "field": one.field, "message": one.message}
-                    for one in found.faults
-                ],
-                "outdated": list(found.outdated),
-                "warnings": [{"file": one.file, "message": one.message} for one in found.warnings],
-            }
-        )
-    else:
-        for one in found.faults:
-            errors.print(f"error: {one}")
-        for one in found.warnings:
-            errors.print(f"warning: {one}")
-        if not found.faults:
-            console().print(f"{directory}: all files are valid and everything renders")
-        if found.outdated:
-            console().print(f"the generator will write {len(found.outdated)} files anew:")
-            for path in found.outdated:
-                console().print(f"  {path}")
-    if found.faults:
-        click.get_current_context().exit(1)
 
 
 @click.command()

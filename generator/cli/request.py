@@ -164,6 +164,7 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
     """Decide every request on top of the one before, in memory only."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
+        repo.refuse_other_rendering()
         state = repo.snapshot(progress=tell).state
         standing, written = repo.file_reader(), dict[str, str | None]()
 
@@ -193,8 +194,13 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
 
 
 def _show_consequence(index: int, decision: Decision) -> None:
+    console().print(f"Request {index}: '{decision.request.id}' would be {decision.outcome}")
+    show_releases(decision)
+
+
+def show_releases(decision: Decision) -> None:
+    """Print what a decision changes: releases, and the files that are written or removed."""
     out = console()
-    out.print(f"Request {index}: '{decision.request.id}' would be {decision.outcome}")
     for release in decision.releases:
         out.print(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
         for detail in release.details:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from generator.plan.release import Release, ServiceRelease
 from generator.service import targets
 from generator.staterepo import reader
 from generator.staterepo.reader import Reader
+from generator.staterepo.reports import Problem
 
 _SHORT = 10
 
@@ -44,6 +46,7 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
     """Show for each release what is desired, what its cluster has seen, and how it is."""
     clusters = access.read(access_file).clusters if access_file else {}
     with reader.opened(state_repo) as repo:
+        problems = repo.problems()
         with progress("reading the ledger") as tell:
             snapshot = repo.snapshot(progress=tell)
         found = targets.of_state(snapshot.state)
@@ -51,12 +54,27 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
         commit = str(snapshot.commit)
         rows = [_row(release, target, commit, stores, repo) for release, target in found]
     if output == "json":
-        print_json({"commit": commit, "releases": rows})
+        told = [asdict(problem) for problem in problems]
+        print_json({"commit": commit, "releases": rows, "problems": told})
         return
+    _print_problems(problems)
     console().print(_table(rows))
     console().print(f"desired: {commit}")
     if not clusters:
         errors.print("no access to the clusters, so nothing is known of them: give --clusters FILE")
+
+
+def _print_problems(problems: Iterable[Problem]) -> None:
+    """Print what is not valid in the state repo, as the generator reported it there."""
+    lines = [f"  {problem}" for problem in problems]
+    if lines:
+        console().print(f"{_counted(len(lines))}; of each file the last valid version is in force:")
+    for line in lines:
+        console().print(line, soft_wrap=True)
+
+
+def _counted(number: int) -> str:
+    return f"{number} problem{'s' if number > 1 else ''}"
 
 
 def _read(

@@ -149,6 +149,15 @@ class Ledger:
         """Return the connections of a type that end at ``node``, sorted."""
         return self._ids("link", kind.name, node)
 
+    def connected(self, node: str) -> tuple[str, ...]:
+        """Return the connections that end at a node or go by a broker that was asked for there."""
+        found = {id for kind in ConnectionType for id in self.at(kind, node)}
+        return tuple(sorted(found | set(self._ids("broker", node))))
+
+    def names(self, entry: str) -> set[str]:
+        """Return what the index has of one kind, the requesters say; costs as much as there is."""
+        return {known[-1] for known in self.index if known[0] == entry}
+
     def get(self, key: ClaimKey) -> Claim | None:
         """Return one claim."""
         held = self.claims.get(key.subject)
@@ -209,6 +218,8 @@ def _entries(claim: Claim | None) -> set[Entry]:
     else:
         for end in (claim.source, claim.target):
             entries.add(("link", claim.type.name, end))
+        if claim.broker:
+            entries.add(("broker", claim.broker))
         for route in claim.topics.values():
             _, taking = route.ends(claim.source, claim.target)
             entries.add(("brings", taking, route.written))

@@ -6,7 +6,7 @@ bytes it has already does not appear, so an unchanged release costs no commit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -46,6 +46,8 @@ class Changeset:
     releases: tuple[ReleaseChange, ...]
     overrides: tuple[str, ...] = ()
     """The files of the overrides that shaped what is written."""
+    waiting: tuple[str, ...] = ()
+    """What does not reach a release, for an override holds it."""
 
 
 def of_change(
@@ -75,6 +77,7 @@ def of_change(
     }
     releases = []
     shaped: set[str] = set()
+    waiting: list[str] = []
     for key in keys:
         old, new = _plan_leniently(before, catalog, key), plan(after, catalog, key)
         old_path = path_of(old) if old else None
@@ -82,6 +85,7 @@ def of_change(
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
         standing = read(new_path) if new_path else None
+        waiting += _waiting(old, new) if standing is not None else ()
         text = marking.text_of(new, catalog, engine, standing) if new else None
         if new_path and text != standing:
             files[new_path] = text
@@ -89,9 +93,10 @@ def of_change(
         if text is not None and text == standing:
             continue
         if old or new:
-            releases.append(_described(old, new, standing is not None))
+            releases.append(described(old, new, standing is not None))
     check_files(files)
-    return Changeset(files, tuple(sorted(releases, key=_order)), tuple(sorted(shaped)))
+    told = tuple(sorted(releases, key=_order))
+    return Changeset(files, told, tuple(sorted(shaped)), tuple(waiting))
 
 
 def render_all(
@@ -127,7 +132,8 @@ def _order(change: ReleaseChange) -> tuple[int, str]:
     return ["start", "change", "stop"].index(change.change), change.name
 
 
-def _described(old: Release | None, new: Release | None, stood: bool) -> ReleaseChange:
+def described(old: Release | None, new: Release | None, stood: bool) -> ReleaseChange:
+    """Return in words what becomes of a release; ``stood``: there is a file of it."""
     release = new or old
     assert release is not None  # noqa: S101 - the caller has one of them
     if isinstance(release, ServiceRelease):
@@ -141,17 +147,31 @@ def _described(old: Release | None, new: Release | None, stood: bool) -> Release
     kind: Change = "stop" if not new else "start"
     if new and stood:
         kind = "change"
-    held = new is not None and new.shaping.held
-    details = _differences(old, new) if kind == "change" and not held else ()
+    details = _differences(old, new) if kind == "change" else ()
     return ReleaseChange(release.name, kind, what, details)
 
 
 def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
-    before, after = _facts(old), _facts(new)
+    held = new is not None and new.shaping.held  # nothing else reaches its file
+    before, after = _overrides(old), _overrides(new)
+    before, after = (before, after) if held else (_facts(old) + before, _facts(new) + after)
     known, wanted = frozenset(before), frozenset(after)
     gone = [f"- {fact}" for fact in before if fact not in wanted]
     come = [f"+ {fact}" for fact in after if fact not in known]
     return (*gone, *come)
+
+
+def _waiting(old: Release | None, new: Release | None) -> Iterator[str]:
+    """Yield a warning where a release that is held would otherwise change."""
+    if new is None or not new.shaping.held or _facts(old) == _facts(new):
+        return
+    by = " and ".join(one.path for one, effects in new.shaping.by if "hold" in effects)
+    yield f"{new.name} is held by {by}, so what is asked of it waits until it is let go"
+
+
+def _overrides(release: Release | None) -> list[str]:
+    by = release.shaping.by if release is not None else ()
+    return [f"{override.path}: {', '.join(effects)}" for override, effects in by]
 
 
 def _facts(release: Release | None) -> list[str]:

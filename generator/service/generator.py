@@ -11,6 +11,7 @@ from pathlib import Path
 from generator import settings
 from generator.catalog.catalog import Catalog
 from generator.errors import DemandOpsError, ShuttingDown, StateRepoError
+from generator.service import following
 from generator.service.settling import Settler
 from generator.service.ticket import Listener, Ticket, handed_in
 from generator.service.waiting import Waiting
@@ -34,6 +35,7 @@ class Generator:
         queue_limit: int = settings.QUEUE_LIMIT,
         patient: bool = True,
         with_targets: bool = False,
+        fetch_interval: float = 0.0,
         progress: Progress = lambda done, total: None,
     ) -> None:
         """Open the state repo and start the worker; what an earlier run left over comes first.
@@ -44,6 +46,8 @@ class Generator:
             queue_limit: how many demands may wait.
             patient: whether to start while the remote is away, from what was fetched last.
             with_targets: whether receipts say which releases a demand needs.
+            fetch_interval: seconds between two looks at what others published, while no demand
+                comes; 0: a repository on this disk only, and seldom.
             progress: told (files read, files in all) while the ledger is loaded.
 
         Raises:
@@ -63,7 +67,12 @@ class Generator:
         self._waiting = Waiting(self._slot.outbox, queue_limit)
         self._watchers: list[Callable[[Catalog], None]] = []
         self._settler = Settler(
-            repository, snapshot, self._waiting, self._tell_watchers, with_targets
+            repository,
+            snapshot,
+            self._waiting,
+            self._tell_watchers,
+            with_targets,
+            fetch_interval,
         )
         self._finished: Future[bool] | None = None
         self._stop_lock = threading.Lock()
@@ -76,6 +85,15 @@ class Generator:
     def snapshot(self) -> Snapshot:
         """The newest published state; safe to read from any thread."""
         return self._settler.snapshot
+
+    @property
+    def condition(self) -> following.Condition:
+        """How it is with the state repo; safe to read from any thread."""
+        return following.condition(self._settler.follower.link, self.snapshot, self._waiting)
+
+    def look(self) -> None:
+        """Have the state repo looked at now, for somebody pushed to it; from any thread."""
+        self._settler.follower.nudge()
 
     def submit(
         self,

@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 from generator.catalog.catalog import Catalog
 from generator.decision import Decision, Outcome, decide
+from generator.demand import leaving
 from generator.demand.request import DemandRequest, Operation
 from generator.errors import (
     DemandOpsError,
@@ -28,6 +29,7 @@ from generator.errors import (
     fault,
 )
 from generator.service.expiry import LeaseClock
+from generator.service.following import Follower
 from generator.service.overriding import OverrideClock
 from generator.service.targets import of_decision as targets_of
 from generator.service.throttle import Throttle
@@ -68,6 +70,7 @@ class Settler:
         waiting: Waiting,
         on_published: Callable[[Catalog], None],
         with_targets: bool,
+        fetch_interval: float = 0.0,
     ) -> None:
         self.snapshot = snapshot
         self._repository = repository
@@ -82,12 +85,15 @@ class Settler:
         self._ahead = Ahead()
         self._giving_up = threading.Event()
         embedded = repository.always_current
+        self.follower = Follower(repository, waiting, fetch_interval, self._line, self._taken)
         self._batch_limit = _BATCH_LIMIT_EMBEDDED if embedded else _BATCH_LIMIT_REMOTE
 
     def give_up(self) -> None:
         """Stop waiting for a remote that is away; from any thread."""
         self._giving_up.set()
+        self.follower.give_up()
         self._repository.give_up()
+        self._waiting.wake()
 
     def take_up(self, batch: list[Ticket]) -> None:
         """Move what waits into ``batch``, and behind it the demands whose lease ran out.
@@ -111,7 +117,8 @@ class Settler:
         stale = False
         while batch:
             try:
-                if stale:
+                # of a remote that is away nothing is judged: what is committed stays in
+                if stale or self.follower.link.is_away:
                     self._repository.refresh()
                     stale, verdict_is_current = False, True
                 self._waiting.dismiss_withdrawn(batch)
@@ -142,21 +149,38 @@ class Settler:
                 stale, away = True, _FIRST_PAUSE_S
             except RemoteAway as error:
                 _doubt(batch, self.snapshot)
+                self.follower.out_of_touch(error)
                 verdict_is_current = self._repository.always_current
                 wait, away = away, min(away * 2, _LONGEST_PAUSE_S)
-                log.warning("%s; trying again in %.1f s", error, wait)
             # waited before the fetch: what is judged then is pushed while it is fresh
-            if self._giving_up.wait(wait * random.uniform(0.5, 1.0)):  # noqa: S311 - no secret
+            self._linger(batch, wait * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
+            if self._giving_up.is_set():
                 raise ShuttingDown(
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
             self._waiting.take_up(batch, self._batch_limit)
 
+    def _linger(self, batch: list[Ticket], seconds: float) -> None:
+        """Let a while pass; demands that come in meanwhile are kept, and told why they wait."""
+        end = time.monotonic() + seconds
+        told = list(batch)
+        while not self._giving_up.is_set():
+            if self.follower.link.is_away:
+                for ticket in told:
+                    ticket.tell("away", f"waiting: {self.follower.link.contact.trouble}")
+            self._waiting.dismiss_withdrawn(batch)
+            left = end - time.monotonic()
+            if left <= 0:
+                return
+            told = self._waiting.keep(left)
+
     def pause(self) -> float:
-        """Return the seconds after which to look at leases and overrides again."""
+        """Return the seconds after which to look at leases, overrides or the state repo again."""
         state = self.snapshot.state
-        leases = self._clock.pause(state.ledger, _LONGEST_WAIT_S)
-        return self._overrides.pause(state.catalog, _now(), leases)
+        ends = self._clock.pause(state.ledger, _LONGEST_WAIT_S)
+        ends = self._overrides.pause(state.catalog, _now(), ends)
+        look = self.follower.pause()
+        return ends if look is None else min(ends, look)
 
     def expired(self) -> list[Ticket]:
         """Return a ticket for each demand whose lease ran out; nobody waits for its receipt.
@@ -182,24 +206,12 @@ class Settler:
     def catch_up(self) -> None:
         """Try again what people changed and could not be carried out: a release may allow it."""
         if self.snapshot.problems:
-            self._take_in()
+            self.follower.catch_up()
 
     def notice(self) -> None:
-        """Take in what others published in a repository on this disk, and end overrides."""
-        moved = self._repository.always_current and self._repository.tip() != self.snapshot.commit
-        if moved or self._overrides.anything(self.snapshot.state.catalog, _now()):
-            self._take_in()
-
-    def _take_in(self) -> None:
-        """Bring the snapshot to the newest tip, and publish what follows from people's changes."""
-        line = self._line()
-        try:
-            if line.publish():
-                self._taken(line)
-            else:
-                self._repository.refresh()
-        except (PushDenied, RemoteAway) as error:
-            log.warning("%s; trying again later", error)
+        """Take in what others published, while no demand comes, and end overrides."""
+        due = self._overrides.anything(self.snapshot.state.catalog, _now())
+        if not self.follower.notice(self.snapshot, due):
             self._overrides.put_off(_now())
 
     def tidy(self) -> None:
@@ -214,9 +226,11 @@ class Settler:
             published = line.publish()
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
+            self.follower.link.denied(str(error))
             return True
         if not published:
             return False
+        self.follower.in_touch(pushed=line.head.commit != line.start.commit)
         self._taken(line)
         self._since_tidy += len(results)
         return True
@@ -237,8 +251,7 @@ class Settler:
         advance = self._ahead.advance(self._repository.objects, before, tip)
         line = writer.Line(self._repository, advance.snapshot)
         line.follow(advance, before, _now())
-        for found in line.head.problems:
-            log.error("%s (its last valid version stays in force)", found)
+        self.follower.tell(line.head.problems)
         self._overrides.end(line, _now())
         return line
 
@@ -299,6 +312,7 @@ def _commit(line: writer.Line, ticket: Ticket, decision: Decision) -> Receipt:
         warnings=decision.warnings,
         not_held=decision.changes.not_held,
         lease_s=decision.lease_s,
+        changes=decision.changes.claims,
     )
 
 
@@ -308,10 +322,11 @@ def _published_before(ticket: Ticket, arrival: history.Arrival) -> Receipt | Dem
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal if isinstance(ticket.goal, dict) else {}
     gives_up = goal.get("shutdown") or goal.get("operation") == Operation.RELEASE.value
+    gives_up = gives_up or leaving.is_leaving(goal)
     outcome: Outcome = "released" if gives_up else "booked"
     if arrival.outcome == "unchanged":
         outcome = "unchanged"
-    name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
+    name = goal.get("id") or goal.get("request") or goal.get("demand") or goal.get("name") or ""
     return Receipt(ticket.operation, str(name), outcome, arrival.commit)
 
 

@@ -15,11 +15,13 @@ from typing import Any, Literal
 from generator.cluster.health import Target
 from generator.decision import Outcome
 from generator.errors import Refused, fault
+from generator.ledger.ledger import ClaimChange
 from generator.staterepo.outbox import Entry
 
 log = logging.getLogger("demandops")
 
-Stage = Literal["admitted", "booked", "committed", "pushed"]
+Stage = Literal["away", "admitted", "booked", "committed", "pushed"]
+"""``away``: the state repo cannot be reached or takes nothing for now; the text says why."""
 Listener = Callable[[Stage, str], None]
 
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
@@ -31,7 +33,8 @@ class Receipt:
 
     ``commit`` is the tip where the demand changed nothing. ``lease_s`` is for how many seconds
     it holds unless it is renewed, nothing where it has no end. ``targets`` are the releases that
-    it needs or gave up, where the generator was asked to say so.
+    it needs or gave up, where the generator was asked to say so. ``changes`` are the claims that it
+    changed; none where that was published before and nobody could be told.
     """
 
     operation: str
@@ -42,6 +45,7 @@ class Receipt:
     not_held: tuple[str, ...] = ()
     lease_s: int | None = None
     targets: tuple[Target, ...] = ()
+    changes: tuple[ClaimChange, ...] = ()
 
 
 @dataclass(eq=False)

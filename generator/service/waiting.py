@@ -19,7 +19,10 @@ TAKEN_BACK = "the demand was taken back before it was committed"
 
 
 class Waiting:
-    """A bounded queue over an outbox."""
+    """A bounded queue over an outbox.
+
+    ``blocked`` says why nothing gets on, for whoever finds the queue full; empty where it does.
+    """
 
     def __init__(self, outbox: Outbox, limit: int) -> None:
         self._outbox = outbox
@@ -27,7 +30,9 @@ class Waiting:
         self._changed = threading.Condition()
         self._queue = deque(left_over(entry) for entry in outbox.pending.values())
         self._tickets = {ticket.operation: ticket for ticket in self._queue}
-        self._closed = False
+        self._unkept: list[Ticket] = []
+        self._closed = self._woken = False
+        self.blocked = ""
 
     @property
     def operations(self) -> tuple[str, ...]:
@@ -55,8 +60,12 @@ class Waiting:
             if self._closed:
                 raise ShuttingDown("the generator is shutting down; send the demand again later")
             if len(self._queue) >= self._limit:
-                raise QueueFull(f"{self._limit} demands are waiting already; send it again later")
+                why = f" for the state repo: {self.blocked}" if self.blocked else ""
+                raise QueueFull(
+                    f"{self._limit} demands are waiting already{why}; send it again later"
+                )
             self._queue.append(ticket)
+            self._unkept.append(ticket)
             self._tickets[ticket.operation] = ticket
             self._changed.notify()
 
@@ -69,21 +78,53 @@ class Waiting:
     def wait(self, timeout: float | None) -> bool:
         """Wait until something is there or ``timeout`` has passed; false once all is settled."""
         with self._changed:
-            if not self._queue and not self._closed:
+            if not self._queue and not self._closed and not self._woken:
                 self._changed.wait(timeout)
+            self._woken = False
             return bool(self._queue) or not self._closed
 
+    def wake(self) -> None:
+        """End a wait although nothing came; from any thread."""
+        with self._changed:
+            self._woken = True
+            self._changed.notify()
+
+    @property
+    def urgent(self) -> bool:
+        """Whether something is to do that must not wait for a look at the remote."""
+        return bool(self._queue) or self._closed
+
+    def keep(self, timeout: float) -> list[Ticket]:
+        """Wait for demands that come in and journal them, for nothing gets on at the moment.
+
+        Returns:
+            Those that came; none where ``timeout`` seconds passed, one was taken back, or it was
+            woken.
+        """
+        with self._changed:
+            if not self._unkept and not self._woken:
+                self._changed.wait(timeout)
+            self._woken = False
+            return self._journal()
+
+    def _journal(self) -> list[Ticket]:
+        """Put what came in since the last time into the outbox."""
+        fresh = [
+            ticket
+            for ticket in self._unkept
+            if ticket.state == "waiting" and ticket.operation not in self._outbox.pending
+        ]
+        self._outbox.append(ticket.entry() for ticket in fresh)
+        self._unkept = []
+        return fresh
+
     def take_up(self, batch: list[Ticket], limit: int) -> None:
-        """Move what waits into the batch, up to ``limit`` in all, and journal it."""
+        """Move what waits into the batch, up to ``limit`` in all; all that waits is journaled."""
         with self._changed:  # held while journaling: a demand is taken back before it or after
             room = limit - len(batch)
             fresh = [self._queue.popleft() for _ in range(min(room, len(self._queue)))]
             batch += fresh
-            self._outbox.append(
-                ticket.entry()
-                for ticket in fresh
-                if ticket.state == "waiting" and ticket.operation not in self._outbox.pending
-            )
+            self._journal()
 
     def withdraw(self, operation: str) -> bool:
         """Take a demand back. False once it is committed, or was never known."""
@@ -93,6 +134,8 @@ class Waiting:
                 return ticket is not None and ticket.state == "withdrawn"
             ticket.state = "withdrawn"
             self._outbox.done([operation], durably=True)  # nor may a restart take it up
+            self._woken = True
+            self._changed.notify()  # it is answered although nothing gets on
         return True
 
     def hold(self, ticket: Ticket) -> bool:
@@ -104,8 +147,13 @@ class Waiting:
 
     def dismiss_withdrawn(self, batch: list[Ticket]) -> None:
         """Answer those that were taken back at once: the remote may be away for long."""
-        for ticket in [ticket for ticket in batch if ticket.state == "withdrawn"]:
-            batch.remove(ticket)
+        with self._changed:
+            gone = [ticket for ticket in self._queue if ticket.state == "withdrawn"]
+            if gone:
+                self._queue = deque(one for one in self._queue if one.state != "withdrawn")
+        withdrawn = [ticket for ticket in batch if ticket.state == "withdrawn"]
+        batch[:] = [ticket for ticket in batch if ticket.state != "withdrawn"]
+        for ticket in [*withdrawn, *gone]:
             self._forget(ticket)
             ticket.future.set_exception(Withdrawn(TAKEN_BACK))
 

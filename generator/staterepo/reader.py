@@ -15,12 +15,13 @@ from generator.decision import rendered
 from generator.errors import InvalidInput
 from generator.render.changeset import Read
 from generator.settings import GENERATED_ROOTS, RENDER_VERSION
-from generator.staterepo import history, remote
+from generator.staterepo import history, holding, remote, reports
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.address import is_url
 from generator.staterepo.history import LogEntry
 from generator.staterepo.outbox import Slot
+from generator.staterepo.repository import StateRepository
 from generator.staterepo.snapshot import Progress, Snapshot
 
 
@@ -62,6 +63,20 @@ class Reader:
         if self._slot is not None:
             self._slot.close()
 
+    @property
+    def repository(self) -> StateRepository:
+        """The state repo itself, for a command that writes to it."""
+        return self._repository
+
+    def refuse_other_rendering(self) -> None:
+        """Raise where a generator of another version writes this repo, as a generator does.
+
+        Raises:
+            StateRepoError: saying which version it is and what to do.
+        """
+        tip = snapshots.commit_of(self._repository.objects, self._tip)
+        snapshots.refuse_other_rendering(tip.tree)
+
     def commit(self, revision: str | None = None) -> str:
         """Return the id of a commit; the newest where no revision is given."""
         return str(snapshots.commit_of(self._repository.objects, revision or self._tip).id)
@@ -77,12 +92,30 @@ class Reader:
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Load the books and the configuration at a commit.
+        """Load the books and the configuration that are in force at a commit.
+
+        Where the generator reported that people broke a file, these are its last valid versions.
 
         Raises:
             InvalidInput, StateRepoError: where it holds no valid state repo.
         """
-        return snapshots.load(self._repository.objects, self.commit(revision), progress)
+        commit = snapshots.commit_of(self._repository.objects, self.commit(revision))
+        told = self._told_at(commit)
+        if told:
+            return self._in_force_at(commit, told)
+        return snapshots.load(self._repository.objects, commit.id, progress)
+
+    def _told_at(self, commit: Commit) -> str:
+        """Return the commit whose configuration the generator told to be in force, if another."""
+        base = history.last_generated(self._repository.objects, commit.id)
+        if base is None:
+            return ""
+        made = snapshots.commit_of(self._repository.objects, base)
+        return history.entry_of(made).one("In-Force")
+
+    def problems(self) -> tuple[reports.Problem, ...]:
+        """Return what the generator reports not to be valid at the newest commit."""
+        return reports.read(self.file_reader()(reports.PATH))
 
     def file_reader(self, revision: str | None = None) -> Read:
         """Return a function that gives the text of a file at a commit."""
@@ -135,11 +168,17 @@ class Reader:
         if not sound:
             return snapshots.load(self._repository.objects, commit.id)
         snapshot = snapshots.load(self._repository.objects, sound)
-        later = snapshots.advance(self._repository.objects, snapshot, commit.id).snapshot
-        catalog = snapshot.state.catalog.with_ended(later.state.catalog.ended)
-        return replace(
-            later, state=replace(snapshot.state, catalog=catalog, ledger=later.state.ledger)
-        )
+        advance = snapshots.advance(self._repository.objects, snapshot, commit.id)
+        ledger, ended = advance.snapshot.state.ledger, advance.snapshot.state.catalog.ended
+        catalog = snapshot.state.catalog.with_ended(ended)
+        state = replace(snapshot.state, catalog=catalog, ledger=ledger)
+        return holding.held_back(
+            self._repository.objects,
+            replace(advance.snapshot, state=state),
+            snapshot,
+            advance.subjects,
+            lambda path: None,
+        )[0]
 
 
 def _held_from(commit: Commit, catalog: Catalog) -> dict[str, str]:

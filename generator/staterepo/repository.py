@@ -7,6 +7,7 @@ chooses.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 
 import git
@@ -23,6 +24,10 @@ ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
 
 class RemoteAway(StateRepoError):
     """The remote did not answer; what is kept in the outbox goes there when it is back."""
+
+
+class CutShort(StateRepoError):
+    """A look at the remote was ended because something more urgent came."""
 
 
 class PushDenied(StateRepoError):
@@ -46,6 +51,15 @@ class StateRepository(ABC):
         Raises:
             RemoteAway: where it cannot be reached.
         """
+
+    def look(self, urgent: Callable[[], bool]) -> Oid:
+        """As :meth:`refresh`, but ended as soon as ``urgent`` says that something else is to do.
+
+        Raises:
+            RemoteAway: where it cannot be reached.
+            CutShort: where it was ended.
+        """
+        return self.refresh()
 
     @abstractmethod
     def publish(self, expected: Oid, commit: Oid) -> bool:

@@ -27,7 +27,7 @@ from generator.plan import keeping
 from generator.plan.following import TakenIn, differing, ended, files_of, taken_in
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
-from generator.staterepo import history, message
+from generator.staterepo import history, holding, message, people, reports
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
@@ -63,6 +63,23 @@ class Line:
         self.head = self.head.after(made, decision.state, keys)
         return str(made)
 
+    def record(
+        self,
+        files: Mapping[str, str | None],
+        state: State,
+        text: str,
+        author: Signature,
+        now: datetime,
+        keys: Iterable[ClaimKey] = (),
+    ) -> str:
+        """Commit what a person had done by a command.
+
+        ``state`` is what the files give then, ``keys`` the claims that changed with them.
+        """
+        made = self._write(files, text, author, now)
+        self.head = self.head.after(made, state, keys)
+        return str(made)
+
     def note(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
         """Have the next commit name a demand that changed nothing, if there is a next one.
 
@@ -77,36 +94,57 @@ class Line:
         What cannot be planned or rendered (a node that is in use is gone from the inventory) is
         left as it was before, and told in the head's problems.
         """
-        snapshot = advance.snapshot
-        state, problems = snapshot.state, list(snapshot.problems)
+        snapshot, good, found = self._held_back(advance.snapshot, before, advance.subjects)
+        state, problems = snapshot.state, [*snapshot.problems, *found]
         change = Changeset({}, ())
         keys: tuple[ClaimKey, ...] = ()
-        if advance.catalog_changed:
+        whole = advance.catalog_changed
+        if whole:
             try:
-                state, change, keys = self._taken_in(state, before, advance.subjects, now)
+                state, change, keys = self._taken_in(state, before, good, now)
             except InvalidInput as error:
                 problems += error.faults
                 catalog = before.state.catalog.with_ended(state.catalog.ended)
                 state = replace(before.state, ledger=state.ledger, catalog=catalog)
-                advance = replace(advance, catalog_changed=False)
-        if not advance.catalog_changed:
-            state, change, keys = self._carried_out(
-                state, before, advance.subjects, (problems, now)
-            )
+                snapshot, good, found = self._held_back(
+                    replace(snapshot, state=state), before, good
+                )
+                state, whole = snapshot.state, False
+                problems += found
+        if not whole:
+            state, change, keys = self._carried_out(state, before, good, (problems, now))
         sound = before.sound if problems else snapshot.commit
         self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
-        if change.files:
+        files = {**change.files, **self._report(problems, before)}
+        if files:
             overrides = [*differing(before.state.catalog, state.catalog), *change.overrides]
             overrides += message.keeping(keys)
+            causes = people.since(self._objects, before.sound or before.commit, snapshot.commit)
             text = message.of_follow(
                 change.releases,
                 str(snapshot.commit),
                 str(before.commit),
                 problems,
-                [*message.of_overrides(overrides), *_in_force(self.head)],
+                [
+                    *message.of_overrides(overrides),
+                    *people.trailers(causes),
+                    *_in_force(self.head),
+                ],
             )
-            made = self._write(change.files, text, message.generator_signature(now), now)
+            made = self._write(files, text, people.author(causes, now), now)
             self.head = self.head.after(made, state, keys)
+
+    def _held_back(
+        self, snapshot: Snapshot, before: Snapshot, subjects: Iterable[Subject]
+    ) -> tuple[Snapshot, list[Subject], list[Fault]]:
+        return holding.held_back(self._objects, snapshot, before, subjects, self.read)
+
+    def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
+        """Return the report on what is not valid, where it is not what stands there already."""
+        standing = self.read(reports.PATH)
+        origin = people.Origins(self._objects, before.sound or before.commit, self.start.commit)
+        wanted = reports.write(reports.reported(problems, reports.read(standing), origin))
+        return {} if wanted == standing else {reports.PATH: wanted}
 
     def _taken_in(
         self, state: State, before: Snapshot, subjects: Iterable[Subject], now: datetime
@@ -115,7 +153,7 @@ class Line:
         marked = snapshots.markers_at(self._tree)
         taken = taken_in(_books(before.state), _books(state), subjects, marked, now)
         state = _with(state, taken)
-        return state, self._everything(state, taken.files), taken.keys
+        return state, self.everything(state, taken.files), taken.keys
 
     def end(self, override: Override, now: datetime) -> None:
         """Commit that an override's time is over, and what follows.
@@ -126,7 +164,7 @@ class Line:
         state = self.head.state
         taken = ended(_books(state), override, now)
         state = _with(state, taken)
-        change = self._everything(state, taken.files)
+        change = self.everything(state, taken.files)
         text = message.of_ended(override, change.releases, _in_force(self.head))
         made = self._write(change.files, text, message.generator_signature(now), now)
         self.head = self.head.after(made, state, taken.keys)
@@ -159,10 +197,14 @@ class Line:
         change = consequence(state, books, good, self.read)
         return state, replace(change, files={**files, **change.files}), tuple(keys)
 
-    def _everything(
+    def everything(
         self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
     ) -> Changeset:
-        """Return all generated files that differ, with ``more`` files of the ledger."""
+        """Return all generated files that differ from what stands, with ``more`` of the ledger.
+
+        Raises:
+            Refused, InvalidInput: where a release cannot be planned or rendered.
+        """
         generated = trees.texts(self._tree, GENERATED_ROOTS)
         files: dict[str, str | None] = dict(rendered(state, generated))
         changes = []
@@ -234,7 +276,7 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
         StateRepoError: where this is no state repo.
     """
     tip = repository.tip()
-    snapshots.refuse_newer(snapshots.commit_of(repository.objects, tip).tree)
+    snapshots.refuse_other_rendering(snapshots.commit_of(repository.objects, tip).tree)
     base = history.last_generated(repository.objects, tip)
     base = base or tip
     told = history.entry_of(snapshots.commit_of(repository.objects, base)).one("In-Force")

@@ -152,7 +152,11 @@ def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
     held = file(bare, path)
     assert held.startswith("# override overrides/frozen.yaml: hold; priority 0; owner petra")
     assert body(bare, path) == before
-    rig.book(generator, rig.goal(6))  # one more input for this fusion
+    (late,) = rig.book(generator, rig.goal(6))  # one more input for this fusion
+    assert late.warnings[-1] == (
+        f"{fusion} is held by overrides/frozen.yaml, so what is asked of it waits until it is let "
+        "go"
+    )
     person.edit("registry/images.yaml", "2025-04", "2025-05")
     next_demand(generator, 3)
     assert "2025-05" in file(bare, DETECTION)

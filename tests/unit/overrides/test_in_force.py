@@ -7,16 +7,18 @@ the demands left behind one by one, and who is suspended or kept is told from th
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import timedelta
 from typing import Any
 
 import pytest
 import yaml
-from asking import CLOUD, EGO, STATION_CLOUD, Books, application, connection, goal
+from asking import CLOUD, EGO, NOW, STATION_CLOUD, Books, application, connection, goal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from generator.decision import rendered
+from generator.decision import decide, rendered
 from generator.demand.claim import KEPT, Subject, SubjectKind
+from generator.demand.request import DemandRequest, Operation
 from generator.errors import InvalidInput, Refused
 from generator.plan.bookkeeping import bookkeeping
 
@@ -237,3 +239,38 @@ def test_a_held_release_keeps_its_chart_when_the_registry_moves_on() -> None:
         assert f"{CHARTS}/object-detection-1.1.0.yaml" in after
         release = after["clusters/c-its/perception/edge/od-edge-vehicle00.yaml"]
         assert ("object-detection-1.0.0" in release) is kept
+
+
+def test_what_a_lease_ends_is_kept_too_and_a_put_that_drops_it_as_well() -> None:
+    demand = {
+        "kind": "Demand",
+        "demand": "leased",
+        "requesters": ["vehicle00"],
+        "lease": "1s",
+        "applications": [
+            {
+                "id": name,
+                "type": "object-detection-fusion",
+                "node": "edge",
+                "inputs": {"ego_data": [{"topic": EGO[0], "source": EGO[1]}]},
+            }
+            for name in ("a", "b")
+        ],
+    }
+    books = _one(select=[{"applications": ["a", "b"]}], keep=True)
+    books.send(demand)
+    books.send(demand | {"applications": demand["applications"][:1]})
+    assert _holders(books) == {"a": ["leased"], "b": ["override:tested"]}
+    over = DemandRequest(id="leased", operation=Operation.EXPIRE, demand="leased")
+    made = decide(books.state, over, NOW + timedelta(minutes=5), books.files.get)
+    books.state = made.state
+    assert _holders(books) == {"a": ["override:tested"], "b": ["override:tested"]}
+    assert made.overrides == ("overrides/tested.yaml",)
+
+
+def _holders(books: Books) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for claim in books.state.ledger:
+        if claim.subject.kind is SubjectKind.APPLICATION:
+            found.setdefault(claim.subject.id, []).append(claim.demand)
+    return found

@@ -22,10 +22,14 @@ SOUND: dict[str, Any] = {
 TAKES = "it must match ^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"
 
 
+EMPTY = object()
+
+
 def text(**changed: Any) -> str:
-    """Return a sound override with fields changed, or (nothing) left out."""
+    """Return a sound override with fields changed, left out (nothing) or left EMPTY."""
     fields = {name: value for name, value in (SOUND | changed).items() if value is not None}
-    return yaml.safe_dump(fields, sort_keys=False)
+    told = {name: None if value is EMPTY else value for name, value in fields.items()}
+    return yaml.safe_dump(told, sort_keys=False)
 
 
 def faults(**overrides: str) -> list[str]:
@@ -59,6 +63,14 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "no pattern": (
         {"select": [{"nodes": []}]},
         ["select[0].nodes: is empty or holds nothing; say what is selected"],
+    ),
+    "a pattern forgotten": (
+        {"select": [{"nodes": None, "services": ["*"]}]},
+        ["select[0]: nodes: nothing stands there; fill it in, or remove it"],
+    ),
+    "an end forgotten": (
+        {"expires": EMPTY},
+        ["expires: nothing stands there; fill it in, or remove it"],
     ),
     "a pattern that is no list": (
         {"select": [{"nodes": "edge"}]},
