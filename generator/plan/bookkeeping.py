@@ -124,7 +124,9 @@ def as_data(books: Bookkeeping, commit: str) -> dict[str, Any]:
     for entry in data["connections"].values():
         entry["topics"] = sorted(entry["topics"])
         entry["requesters"] = list(entry["requesters"])
-    data["suspended"] = [
-        entry | {"requesters": list(entry["requesters"])} for entry in data["suspended"]
+    held_back = [
+        entry | {"requesters": list(entry["requesters"])} for entry in data.pop("suspended")
     ]
+    if held_back:  # programs that know no overrides find what they always did
+        data["suspended"] = held_back
     return data | {"commit": commit}
