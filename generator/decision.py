@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
-from generator.demand import admission, carriers, own, permission, wire
+from generator.demand import admission, approval, carriers, leaving, own, permission, wire
 from generator.demand.claim import Subject
 from generator.demand.request import DemandRequest, Operation
 from generator.errors import Fault, InvalidInput, Refused
@@ -38,6 +38,7 @@ _OUTCOMES: dict[Operation, Outcome] = {
     Operation.SHUTDOWN: "released",
     Operation.RELEASE: "released",
     Operation.EXPIRE: "released",
+    Operation.DECOMMISSION: "released",
 }
 
 Throttle = Callable[[DemandRequest, Catalog], Iterable[Fault]]
@@ -60,7 +61,10 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What a demand does. ``files`` is empty where it changes nothing."""
+    """What a demand does. ``files`` is empty where it changes nothing.
+
+    ``approval`` names what asks for a person's approval first: access domains, rules, appdefs.
+    """
 
     request: DemandRequest
     outcome: Outcome
@@ -69,6 +73,7 @@ class Decision:
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
+    approval: tuple[str, ...] = ()
     overrides: tuple[str, ...] = ()
     """The files of the overrides that shaped what is written."""
 
@@ -130,6 +135,9 @@ def decide(
             *made.waiting,
             *denial.warnings(request, ledger, state.catalog),
         ),
+        approval=approval.asked_by(
+            request, ((c.before, c.after) for c in changes.claims), state.catalog
+        ),
         overrides=made.overrides,
     )
 
@@ -158,6 +166,8 @@ def admit(
         Refused: with every fault of form and content together.
     """
     catalog = state.catalog
+    if isinstance(goal, dict) and leaving.is_leaving(goal):
+        return leaving.parse(goal)
     if isinstance(goal, dict) and own.is_own(goal):
         request, faults = own.parse(goal)
         request = permission.with_terms(request, catalog)
@@ -231,6 +241,8 @@ def _in_goals_words(
     """Return faults named by the fields of the goal that the request came as."""
 
     def field(path: str) -> str:
+        if request.operation is Operation.DECOMMISSION:
+            return path
         if request.operation.is_reference:
             return wire.wire_field(path, request, catalog.appdefs)
         return own.field(path, request)

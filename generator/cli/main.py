@@ -13,7 +13,18 @@ from importlib.metadata import EntryPoint, entry_points
 import click
 
 from generator import __version__
-from generator.cli import check, overrides, repo, request, schema, status, upgrade, views
+from generator.cli import (
+    check,
+    decommission,
+    overrides,
+    proposals,
+    repo,
+    request,
+    schema,
+    status,
+    upgrade,
+    views,
+)
 from generator.cli.output import errors
 from generator.errors import DemandOpsError, InvalidInput
 
@@ -70,6 +81,7 @@ def cli(verbose: bool) -> None:
 
 cli.add_command(repo.init)
 cli.add_command(request.request)
+cli.add_command(decommission.decommission)
 cli.add_command(views.bookkeeping)
 cli.add_command(views.log)
 cli.add_command(views.diff)
@@ -79,6 +91,7 @@ cli.add_command(repo.verify)
 cli.add_command(upgrade.upgrade)
 cli.add_command(schema.schema)
 cli.add_command(status.status)
+cli.add_command(proposals.proposals)
 
 
 def main(args: list[str] | None = None) -> None:

@@ -10,7 +10,14 @@ from typing import Any
 import click
 from rich.table import Table
 
-from generator.cli.output import console, output_option, print_json, progress, state_repo_option
+from generator.cli.output import (
+    console,
+    errors,
+    output_option,
+    print_json,
+    progress,
+    state_repo_option,
+)
 from generator.plan.bookkeeping import Bookkeeping, as_data
 from generator.plan.bookkeeping import bookkeeping as derive
 from generator.staterepo import reader
@@ -23,6 +30,8 @@ _NONE = "(nothing)"
 def _books(repo: Reader, revision: str | None) -> tuple[Bookkeeping, str]:
     with progress("reading the ledger") as tell:
         snapshot = repo.snapshot(revision, tell)
+    for problem in repo.problems() if revision is None else ():
+        errors.print(f"warning: {problem}; its last valid version is in force")
     return derive(snapshot.state.ledger, snapshot.state.catalog), str(snapshot.commit)
 
 

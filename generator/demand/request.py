@@ -26,7 +26,8 @@ class Operation(Enum):
 
     The reference's goal joins and shuts down, adding to and taking from what its requesters hold.
     Our own names its demand and puts (replaces), releases or renews it; ``EXPIRE`` is the
-    generator's, for a demand whose lease ran out.
+    generator's, for a demand whose lease ran out, ``DECOMMISSION`` its operator's, for a node or a
+    requester that leaves for good.
     """
 
     JOIN = "join"
@@ -35,6 +36,7 @@ class Operation(Enum):
     RELEASE = "release"
     RENEW = "renew"
     EXPIRE = "expire"
+    DECOMMISSION = "decommission"
 
     @property
     def asks(self) -> bool:
@@ -105,6 +107,15 @@ class ConnectionDemand:
 
 
 @dataclass(frozen=True, slots=True)
+class Leaving:
+    """What is decommissioned: a name, as what (``node``, ``requester``), and who has it done."""
+
+    name: str
+    kinds: frozenset[str]
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class DemandRequest:
     """A whole request: booked as a whole or refused as a whole.
 
@@ -121,6 +132,7 @@ class DemandRequest:
     demand: str = ""
     named_by: tuple[str, ...] = ()
     lease_s: int | None = None
+    leaving: Leaving | None = None
 
     def requesters(self) -> tuple[str, ...]:
         """Return everybody in whose name something is asked, in the order listed, each once."""

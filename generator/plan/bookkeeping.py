@@ -116,7 +116,10 @@ def _suspended(ledger: Ledger, catalog: Catalog) -> Iterator[SuspendedEntry]:
 
 
 def as_data(books: Bookkeeping, commit: str) -> dict[str, Any]:
-    """Return the bookkeeping as plain data, the contract of ``bookkeeping --output json``."""
+    """Return the bookkeeping as plain data, the contract of ``bookkeeping --output json``.
+
+    ``suspended`` is there only where something is.
+    """
     data = asdict(books)
     for entry in data["services"].values():
         entry["applications"] = list(entry["applications"])
@@ -124,9 +127,7 @@ def as_data(books: Bookkeeping, commit: str) -> dict[str, Any]:
     for entry in data["connections"].values():
         entry["topics"] = sorted(entry["topics"])
         entry["requesters"] = list(entry["requesters"])
-    held_back = [
-        entry | {"requesters": list(entry["requesters"])} for entry in data.pop("suspended")
-    ]
-    if held_back:  # programs that know no overrides find what they always did
-        data["suspended"] = held_back
+    held_back = data.pop("suspended")
+    if held_back:
+        data["suspended"] = [one | {"requesters": list(one["requesters"])} for one in held_back]
     return data | {"commit": commit}

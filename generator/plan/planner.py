@@ -26,12 +26,20 @@ from generator.plan.standing import in_force
 ReleaseKey = ServiceKey | EndKey | BridgeKey
 
 
-def keys_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
-    """Yield what must run because ``subject`` is held and no override denies it."""
-    yield from keys_booked(in_force(ledger, catalog), catalog, subject)
+def keys_of(
+    ledger: Ledger, catalog: Catalog, subject: Subject, *, strict: bool = False
+) -> Iterator[ReleaseKey]:
+    """Yield what must run because ``subject`` is held and no override denies it.
+
+    Of an application whose definition is gone nobody can say: nothing, or where ``strict`` it is
+    refused, for what runs must not stop because somebody deleted a file that it still needs.
+    """
+    yield from keys_booked(in_force(ledger, catalog), catalog, subject, strict=strict)
 
 
-def keys_booked(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
+def keys_booked(
+    ledger: Ledger, catalog: Catalog, subject: Subject, *, strict: bool = False
+) -> Iterator[ReleaseKey]:
     """Yield what ``subject`` needs by the claims of ``ledger``, suspended or not."""
     if subject.kind is SubjectKind.CONNECTION:
         yield from clients.keys_of(ledger, subject.id)
@@ -39,7 +47,8 @@ def keys_booked(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[
     claims = ledger.application(subject.id)
     if not claims:
         return
-    appdef = catalog.appdefs.get(claims[0].appdef)
+    known = strict or claims[0].appdef in catalog.appdefs
+    appdef = _appdef(catalog, claims[0].appdef) if known else None
     for name, service in (appdef.services if appdef else {}).items():
         if service.each is None:
             yield ServiceKey(name, claims[0].node, application=subject.id)
@@ -57,20 +66,29 @@ def keys_booked(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[
 def affected(
     before: Ledger, after: Ledger, catalog: Catalog, subjects: Iterable[Subject]
 ) -> tuple[ReleaseKey, ...]:
-    """Return every release that a change of ``subjects`` may have added, altered or removed."""
+    """Return every release that a change of ``subjects`` may have added, altered or removed.
+
+    Raises:
+        Refused: where the definition of what is to run from now on is gone.
+    """
     keys = (
         key
         for subject in subjects
         for ledger in (before, after)
-        for key in keys_of(ledger, catalog, subject)
+        for key in keys_of(ledger, catalog, subject, strict=ledger is after)
     )
     return tuple(dict.fromkeys(keys))
 
 
 def all_keys(ledger: Ledger, catalog: Catalog) -> tuple[ReleaseKey, ...]:
-    """Return every release that the ledger asks for."""
+    """Return every release that the ledger asks for.
+
+    Raises:
+        Refused: where the definition of an application that is held is gone.
+    """
     subjects = [Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)]
-    return tuple(dict.fromkeys(key for s in subjects for key in keys_of(ledger, catalog, s)))
+    keys = (key for s in subjects for key in keys_of(ledger, catalog, s, strict=True))
+    return tuple(dict.fromkeys(keys))
 
 
 def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
@@ -258,7 +276,7 @@ def _appdef(catalog: Catalog, name: str) -> ApplicationDefinition:
                     "appdef",
                     f"'{name}' is in use, but appdefs/{name} is gone; restore it",
                     code="unknown-application",
-                )
+                ).within(f"appdefs/{name}/appdef.yaml")
             ]
         )
     return appdef

@@ -15,9 +15,9 @@ from generator.plan.release import Release
 from generator.render import consequence as consequences
 from generator.render.handedit import Suggestion, fits_too, suggest
 from generator.render.paths import BOOTSTRAP_ROOT, path_of
-from generator.settings import GENERATED_ROOTS
+from generator.settings import GENERATED_ROOTS, NOTES_ROOT
 from generator.staterepo import tree as trees
-from generator.staterepo.worktree import OWN_ROOT, Base
+from generator.staterepo.worktree import Base
 
 _LOST = "is generated, and an edit by hand is lost; take it back"
 _MOST_LEFT = 5
@@ -38,7 +38,7 @@ def _is_generators(path: str) -> bool:
         return False
     if root == ledger_format.LEDGER_ROOT:  # claims are judged as such
         return ledger_format.kind_of(path) is None
-    return root in (*GENERATED_ROOTS, OWN_ROOT)
+    return root in (*GENERATED_ROOTS, NOTES_ROOT)
 
 
 def refused(
@@ -104,7 +104,7 @@ def _message(path: str, added: bool, deleted: bool, found: Suggestion | None) ->
             more = ", …" if len(found.left) > _MOST_LEFT else ""
             rest = f" (no override changes {', '.join(found.left[:_MOST_LEFT])}{more})"
         return f"{_LOST}, and merge {found.name} as shown{rest}"
-    if path.startswith(f"{OWN_ROOT}/"):
+    if path.startswith(f"{NOTES_ROOT}/"):
         return "is the generator's own, and written anew by it; take the edit back"
     if path.startswith(f"{ledger_format.LEDGER_ROOT}/") and added:
         return "is no claim's place, and the generator removes it; take it away"

@@ -15,12 +15,14 @@ from generator.decision import rendered
 from generator.errors import InvalidInput
 from generator.render.changeset import Read
 from generator.settings import GENERATED_ROOTS, RENDER_VERSION
-from generator.staterepo import history, remote
+from generator.staterepo import history, holding, remote, reports
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.address import is_url
 from generator.staterepo.history import LogEntry
+from generator.staterepo.message import PROPOSAL
 from generator.staterepo.outbox import Slot
+from generator.staterepo.proposals import Waiting, waiting
 from generator.staterepo.repository import StateRepository
 from generator.staterepo.snapshot import Progress, Snapshot
 
@@ -85,20 +87,58 @@ class Reader:
         """Tell whether ``commit`` is ``other`` or comes after it."""
         return self._repository.includes(commit, other)
 
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Tell whether two commits hold the same under ``path``."""
+        return self._repository.unchanged(commit, other, path)
+
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Load the books and the configuration at a commit.
+        """Load the books and the configuration that are in force at a commit.
+
+        Where the generator reported that people broke a file, these are its last valid versions.
 
         Raises:
             InvalidInput, StateRepoError: where it holds no valid state repo.
         """
-        return snapshots.load(self._repository.objects, self.commit(revision), progress)
+        commit = snapshots.commit_of(self._repository.objects, self.commit(revision))
+        told = self._told_at(commit)
+        if told:
+            return self._in_force_at(commit, told)
+        return snapshots.load(self._repository.objects, commit.id, progress)
+
+    def _told_at(self, commit: Commit) -> str:
+        """Return the commit whose configuration the generator told to be in force, if another."""
+        base = history.last_generated(self._repository.objects, commit.id)
+        if base is None:
+            return ""
+        made = snapshots.commit_of(self._repository.objects, base)
+        return history.entry_of(made).one("In-Force")
+
+    def problems(self) -> tuple[reports.Problem, ...]:
+        """Return what the generator reports not to be valid at the newest commit."""
+        return reports.read(self.file_reader()(reports.PATH))
 
     def file_reader(self, revision: str | None = None) -> Read:
         """Return a function that gives the text of a file at a commit."""
         tree = snapshots.commit_of(self._repository.objects, self.commit(revision)).tree
         return lambda path: trees.read_text(tree, path)
+
+    def catalog(self) -> Catalog:
+        """Return the configuration at the newest commit.
+
+        Raises:
+            InvalidInput, StateRepoError: where it holds no valid one.
+        """
+        return snapshots.catalog_at(snapshots.commit_of(self._repository.objects, self._tip).tree)
+
+    def proposals(self) -> list[Waiting]:
+        """Return the demands that await approval, by branch.
+
+        Raises:
+            RemoteAway: where the remote does not answer.
+        """
+        return list(waiting(self._repository))
 
     def log(self, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
@@ -117,7 +157,7 @@ class Reader:
         commit = snapshots.commit_of(self._repository.objects, revision)
         entry = history.entry_of(commit)
         if not entry.by_generator:
-            return Verdict(entry.commit, entry.summary, True, "made by a person")
+            return Verdict(entry.commit, entry.summary, True, _not_ours(entry))
         version = entry.one("Render-Version")
         if version != str(RENDER_VERSION):
             return Verdict(
@@ -146,11 +186,17 @@ class Reader:
         if not sound:
             return snapshots.load(self._repository.objects, commit.id)
         snapshot = snapshots.load(self._repository.objects, sound)
-        later = snapshots.advance(self._repository.objects, snapshot, commit.id).snapshot
-        catalog = snapshot.state.catalog.with_ended(later.state.catalog.ended)
-        return replace(
-            later, state=replace(snapshot.state, catalog=catalog, ledger=later.state.ledger)
-        )
+        advance = snapshots.advance(self._repository.objects, snapshot, commit.id)
+        ledger, ended = advance.snapshot.state.ledger, advance.snapshot.state.catalog.ended
+        catalog = snapshot.state.catalog.with_ended(ended)
+        state = replace(snapshot.state, catalog=catalog, ledger=ledger)
+        return holding.held_back(
+            self._repository.objects,
+            replace(advance.snapshot, state=state),
+            snapshot,
+            advance.subjects,
+            lambda path: None,
+        )[0]
 
 
 def _held_from(commit: Commit, catalog: Catalog) -> dict[str, str]:
@@ -158,6 +204,10 @@ def _held_from(commit: Commit, catalog: Catalog) -> dict[str, str]:
     if not commit.parents or not any(override.hold for override in catalog.in_force):
         return {}
     return trees.texts(commit.parents[0].tree, GENERATED_ROOTS)
+
+
+def _not_ours(entry: LogEntry) -> str:
+    return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
 
 
 def _differing(wanted: dict[str, str], commit: Commit) -> tuple[str, ...]:

@@ -37,7 +37,7 @@ class Snapshot:
 
     ``keys`` finds the claim behind a ledger file, so that a removed file is understood.
     ``problems`` are files that are not valid and whose last valid version is in force; ``sound`` is
-    the newest commit without any.
+    the newest commit without any; ``held`` are ledger files that are not in force as they stand.
     """
 
     commit: Oid
@@ -45,6 +45,7 @@ class Snapshot:
     keys: HashTrieMap[str, ClaimKey]
     problems: tuple[Fault, ...] = ()
     sound: Oid | None = None
+    held: tuple[str, ...] = ()
 
     def after(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
         """Return the snapshot of a commit of our own, whose state is known already."""
@@ -134,7 +135,8 @@ def load_last_valid(
             ledger, keys = ledger.replace(claim.key, claim), keys.insert(path, claim.key)
     problems += faults
     sound = None if problems else commit.id
-    return Snapshot(commit.id, State.of(catalog, ledger), keys, tuple(problems), sound)
+    held = tuple(dict.fromkeys(found.file for found in faults))
+    return Snapshot(commit.id, State.of(catalog, ledger), keys, tuple(problems), sound, held)
 
 
 def refuse_other_rendering(tree: Tree) -> None:
@@ -275,14 +277,14 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     if ended != state.catalog.ended:
         state = replace(state, catalog=state.catalog.with_ended(ended))
         catalog_changed = True
-    ledger, keys, subjects = state.ledger, snapshot.keys, list[Subject]()
-    seen = set()
-    for path, blob in trees.differences(
-        repo, _subtree(before, "ledger"), _subtree(after, "ledger"), "ledger/"
-    ):
+    ledger, keys, subjects, held = state.ledger, snapshot.keys, list[Subject](), list[str]()
+    changed = dict(
+        trees.differences(repo, _subtree(before, "ledger"), _subtree(after, "ledger"), "ledger/")
+    )
+    changed |= {path: trees.blob(after, path) for path in snapshot.held}
+    for path, blob in sorted(changed.items()):
         if ledger_format.kind_of(path) is None:
             continue
-        seen.add(path)
         known = keys.get(path)
         if blob is None:
             if known is not None:
@@ -294,17 +296,15 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             claim = ledger_format.read(_text(repo, blob), path)
         except InvalidInput as error:
             problems += error.faults
+            held.append(path)
             continue
         if ledger.get(claim.key) != claim:
             ledger = ledger.replace(claim.key, claim)
             subjects.append(claim.subject)
         keys = keys.insert(path, claim.key)
-    problems += [
-        p for p in snapshot.problems if p.file.startswith("ledger/") and p.file not in seen
-    ]
-    state = replace(state, ledger=ledger)
+    state, sound = replace(state, ledger=ledger), snapshot.sound if problems else to
     return Advance(
-        Snapshot(to, state, keys, tuple(problems), snapshot.sound if problems else to),
+        Snapshot(to, state, keys, tuple(problems), sound, tuple(held)),
         tuple(dict.fromkeys(subjects)),
         catalog_changed,
     )

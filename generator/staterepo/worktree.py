@@ -13,14 +13,11 @@ from generator.catalog.catalog import CONFIG_ROOTS
 from generator.decision import State
 from generator.errors import Fault, InvalidInput, StateRepoError, fault
 from generator.ledger import format as ledger_format
-from generator.settings import GENERATED_ROOTS, MAIN_BRANCH
+from generator.settings import GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 
-OWN_ROOT = ".demandops"
-"""Where the generator keeps what is for people to read."""
-
-_ROOTS = (*CONFIG_ROOTS, ledger_format.LEDGER_ROOT, *GENERATED_ROOTS, OWN_ROOT)
+_ROOTS = (*CONFIG_ROOTS, ledger_format.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
 _SHALLOW = (
     "this clone is shallow and does not hold the commit that the edit started from; fetch all of "

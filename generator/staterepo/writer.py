@@ -22,12 +22,13 @@ from generator.catalog.override import Override
 from generator.decision import Decision, State, consequence, rendered
 from generator.demand.claim import ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
+from generator.ledger import format as ledger_format
 from generator.ledger.ledger import Ledger
 from generator.plan import keeping
 from generator.plan.following import TakenIn, differing, ended, files_of, taken_in
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
-from generator.staterepo import history, message
+from generator.staterepo import history, holding, message, people, reports
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
@@ -52,11 +53,23 @@ class Line:
         """Return a file as it is at the head of the line."""
         return trees.read_text(self._tree, path)
 
-    def commit(self, decision: Decision, operation: str, received: datetime, now: datetime) -> str:
-        """Commit one demand on top of the line and return the commit's id."""
-        text = message.of_decision(
-            decision, operation, received, [*self._settled, *_in_force(self.head)]
-        )
+    def commit(
+        self,
+        decision: Decision,
+        operation: str,
+        received: datetime,
+        now: datetime,
+        proposal: str = "",
+    ) -> str:
+        """Commit one demand on top of the line and return the commit's id.
+
+        Args:
+            proposal: the branch that it awaits approval on; nothing where it needs none.
+        """
+        more = [*self._settled, *_in_force(self.head)]
+        if proposal:
+            more.append((message.PROPOSAL, proposal))
+        text = message.of_decision(decision, operation, received, more)
         self._settled = []
         made = self._write(decision.files, text, message.author(decision, received), now)
         keys = [change.key for change in decision.changes.claims]
@@ -94,36 +107,59 @@ class Line:
         What cannot be planned or rendered (a node that is in use is gone from the inventory) is
         left as it was before, and told in the head's problems.
         """
-        snapshot = advance.snapshot
-        state, problems = snapshot.state, list(snapshot.problems)
+        snapshot, good, found = self._held_back(advance.snapshot, before, advance.subjects)
+        state, problems = snapshot.state, [*snapshot.problems, *found]
         change = Changeset({}, ())
         keys: tuple[ClaimKey, ...] = ()
-        if advance.catalog_changed:
+        whole = advance.catalog_changed
+        if whole:
             try:
-                state, change, keys = self._taken_in(state, before, advance.subjects, now)
+                state, change, keys = self._taken_in(state, before, good, now)
             except InvalidInput as error:
                 problems += error.faults
                 catalog = before.state.catalog.with_ended(state.catalog.ended)
                 state = replace(before.state, ledger=state.ledger, catalog=catalog)
-                advance = replace(advance, catalog_changed=False)
-        if not advance.catalog_changed:
-            state, change, keys = self._carried_out(
-                state, before, advance.subjects, (problems, now)
-            )
+                snapshot, good, found = self._held_back(
+                    replace(snapshot, state=state), before, good
+                )
+                state, whole = snapshot.state, False
+                problems += found
+        if not whole:
+            state, change, keys = self._carried_out(state, before, good, (problems, now))
+        state, begun = _with_leases_begun(state, now)
+        change = replace(change, files={**change.files, **begun})
         sound = before.sound if problems else snapshot.commit
         self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
-        if change.files:
+        files = {**change.files, **self._report(problems, before)}
+        if files:
             overrides = [*differing(before.state.catalog, state.catalog), *change.overrides]
             overrides += message.keeping(keys)
+            causes = people.since(self._objects, before.sound or before.commit, snapshot.commit)
             text = message.of_follow(
                 change.releases,
                 str(snapshot.commit),
                 str(before.commit),
                 problems,
-                [*message.of_overrides(overrides), *_in_force(self.head)],
+                [
+                    *message.of_overrides(overrides),
+                    *people.trailers(causes),
+                    *_in_force(self.head),
+                ],
             )
-            made = self._write(change.files, text, message.generator_signature(now), now)
+            made = self._write(files, text, people.author(causes, now), now)
             self.head = self.head.after(made, state, keys)
+
+    def _held_back(
+        self, snapshot: Snapshot, before: Snapshot, subjects: Iterable[Subject]
+    ) -> tuple[Snapshot, list[Subject], list[Fault]]:
+        return holding.held_back(self._objects, snapshot, before, subjects, self.read)
+
+    def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
+        """Return the report on what is not valid, where it is not what stands there already."""
+        standing = self.read(reports.PATH)
+        origin = people.Origins(self._objects, before.sound or before.commit, self.start.commit)
+        wanted = reports.write(reports.reported(problems, reports.read(standing), origin))
+        return {} if wanted == standing else {reports.PATH: wanted}
 
     def _taken_in(
         self, state: State, before: Snapshot, subjects: Iterable[Subject], now: datetime
@@ -229,6 +265,20 @@ class Line:
         if self.head.commit == self.start.commit:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)
+
+
+def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, str]]:
+    """Start the leases of claims that a person approved; return their files as well.
+
+    A lease that counted from the demand could be over before anybody has approved it.
+    """
+    ledger, files = state.ledger, {}
+    for claim in ledger.unstarted():
+        assert claim.lease is not None  # noqa: S101 - that is what was looked for
+        begun = replace(claim, lease=claim.lease.begun(now))
+        ledger = ledger.replace(claim.key, begun)
+        files[ledger_format.path_of(claim.key)] = ledger_format.write(begun)
+    return replace(state, ledger=ledger), files
 
 
 def _books(state: State) -> tuple[Ledger, Catalog]:

@@ -167,3 +167,48 @@ def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None
         }
     ]
     assert (found["releases"], found["files"], found["bookkeeping"]) == (None, None, None)
+
+
+def test_the_generators_notes_are_not_edited_by_hand(checkout: Path, check: Check) -> None:
+    """A report that stands is no fault; one that a person changes is."""
+    report = checkout / ".demandops" / "reports" / "problems.yaml"
+    report.parent.mkdir(parents=True)
+    report.write_text("problems: []\n")
+    git(checkout, "add", "--all")
+    git(checkout, "commit", "-qm", "Report what is not valid in the state repo")
+    assert check() == (0, "REPO: all files are valid and everything renders\n", "")
+    report.unlink()
+    code, _, err = check()
+    assert code == 1
+    assert err.startswith("error: .demandops/reports/problems.yaml: is the generator's own")
+
+
+def test_an_application_definition_that_is_in_use_cannot_be_deleted(
+    checkout: Path, check: Check
+) -> None:
+    goal = checkout.parent / "goal.yaml"
+    goal.write_text(
+        json.dumps(
+            {
+                "kind": "Demand",
+                "demand": "d",
+                "requesters": ["vehicle00"],
+                "applications": [
+                    {
+                        "id": "edge/fusion",
+                        "type": "object-detection-fusion",
+                        "node": "edge",
+                        "inputs": {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]},
+                    }
+                ],
+            }
+        )
+    )
+    bare = checkout.parent / "state.git"
+    subprocess.run(["git", "clone", "-q", "--bare", checkout, bare], check=True)
+    assert run(["request", str(goal), "--state-repo", str(bare)]) == 0
+    git(checkout, "pull", "-q", str(bare), "main")
+    (checkout / "appdefs" / "object-detection-fusion" / "appdef.yaml").unlink()
+    code, _, err = check()
+    assert code == 1
+    assert "'object-detection-fusion' is in use, but appdefs/object-detection-fusion is gone" in err
