@@ -10,22 +10,24 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
+from datetime import datetime
+from types import MappingProxyType
 from typing import Literal
 
 from generator.catalog.catalog import Catalog
-from generator.demand import admission, carriers, own, permission, wire
+from generator.demand import admission, approval, carriers, leaving, own, permission, wire
 from generator.demand.claim import Subject
-from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
+from generator.demand.request import DemandRequest, Operation
 from generator.errors import Fault, InvalidInput, Refused
 from generator.ledger import ledger as booking
 from generator.ledger import restore
 from generator.ledger.ledger import Changes, Ledger
 from generator.ledger.restore import Restoration
-from generator.plan import derived, quota
+from generator.plan import denial, derived, keeping, quota
 from generator.plan.clients import is_bridged
 from generator.plan.planner import affected, all_keys
-from generator.render import changeset
+from generator.plan.standing import in_force
+from generator.render import changeset, tryout
 from generator.render.changeset import Read, ReleaseChange
 from generator.render.engine import Engine
 
@@ -39,6 +41,7 @@ _OUTCOMES: dict[Operation, Outcome] = {
     Operation.RELEASE: "released",
     Operation.EXPIRE: "released",
     Operation.ROLLBACK: "restored",
+    Operation.DECOMMISSION: "released",
 }
 
 Throttle = Callable[[DemandRequest, Catalog], Iterable[Fault]]
@@ -61,7 +64,10 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What a demand does. ``files`` is empty where it changes nothing."""
+    """What a demand does. ``files`` is empty where it changes nothing.
+
+    ``approval`` names what asks for a person's approval first: access domains, rules, appdefs.
+    """
 
     request: DemandRequest
     outcome: Outcome
@@ -70,6 +76,9 @@ class Decision:
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
+    approval: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
+    """The files of the overrides that shaped what is written."""
 
     @property
     def lease_s(self) -> int | None:
@@ -109,10 +118,7 @@ def decide(
             raise Refused(impossible)
     on_stage("admitted")
     try:
-        ledger, changes = booking.apply(state.ledger, request, now)
-        over = list(quota.faults(state.ledger, ledger, changes, state.catalog))
-        if over:
-            raise Refused(over)
+        ledger, changes = _booked(state, request, now)
         keys = affected(state.ledger, ledger, state.catalog, changes.subjects())
         made = changeset.of_change(
             state.ledger, ledger, changes.claims, keys, (state.catalog, state.engine, read)
@@ -133,8 +139,29 @@ def decide(
         warnings=(
             *_uncarried(request, ledger, state.catalog),
             *_bridged(request, state.catalog),
+            *made.waiting,
+            *denial.warnings(request, ledger, state.catalog),
         ),
+        approval=approval.asked_by(
+            request, ((c.before, c.after) for c in changes.claims), state.catalog
+        ),
+        overrides=made.overrides,
     )
+
+
+def _booked(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+    """Book a request; what overrides keep gives way to it, and what it gives up they may keep.
+
+    Raises:
+        Refused: where the books, an override or a quota do not allow it.
+    """
+    asked, catalog = keeping.requested(request), state.catalog
+    ledger, changes = booking.apply(keeping.giving_way(state.ledger, asked), request, now)
+    refusals = list(denial.faults(request, ledger, changes, catalog))
+    refusals = refusals or list(quota.faults(state.ledger, ledger, changes, catalog))
+    if refusals:
+        raise Refused(refusals)
+    return keeping.settled(state.ledger, ledger, changes, asked, (catalog, now))
 
 
 def admit(
@@ -146,6 +173,8 @@ def admit(
         Refused: with every fault of form and content together.
     """
     catalog = state.catalog
+    if isinstance(goal, dict) and leaving.is_leaving(goal):
+        return leaving.parse(goal)
     if isinstance(goal, dict) and own.is_own(goal):
         request, faults = own.parse(goal)
         request = permission.with_terms(request, catalog)
@@ -187,10 +216,14 @@ def consequence(
     return changeset.of_change(before, state.ledger, (), keys, (state.catalog, state.engine, read))
 
 
-def rendered(state: State) -> dict[str, str]:
-    """Return every file below ``clusters/`` that the state asks for."""
+def rendered(state: State, standing: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+    """Return every generated file that the state asks for.
+
+    Args:
+        standing: the generated files as they are, of which overrides may hold some.
+    """
     keys = all_keys(state.ledger, state.catalog)
-    return changeset.render_all(state.ledger, state.catalog, state.engine, keys)
+    return changeset.render_all(state.ledger, state.catalog, state.engine, keys, standing)
 
 
 def _told(field: str, told: Iterable[str]) -> bool:
@@ -215,6 +248,8 @@ def _in_goals_words(
     """Return faults named by the fields of the goal that the request came as."""
 
     def field(path: str) -> str:
+        if request.operation is Operation.DECOMMISSION:
+            return path
         if request.operation.is_reference:
             return wire.wire_field(path, request, catalog.appdefs)
         return own.field(path, request)
@@ -226,6 +261,7 @@ def _uncarried(request: DemandRequest, ledger: Ledger, catalog: Catalog) -> Iter
     """Yield a warning for each input that no connection brings to the application's node."""
     if not request.operation.asks:
         return
+    ledger = in_force(ledger, catalog)
     for app in request.applications:
         for foreign in derived.foreign_inputs(app, catalog):
             topic = foreign.topic
@@ -256,39 +292,9 @@ def explain(error: InvalidInput) -> str:
 
 
 def rehearse(state: State) -> None:
-    """Render every service of every appdef once, for invented claims on a real node.
-
-    An appdef that nobody has demanded yet is checked before the first demand comes.
+    """Try every appdef and every override in force on invented demands.
 
     Raises:
-        Refused, InvalidInput: naming the template or the values that do not work.
+        Refused, InvalidInput: naming the template, the values or the override that does not work.
     """
-    place = next(iter(sorted(state.catalog.domain_of)), None)
-    if place is None:
-        return
-    faults: list[Fault] = []
-    for appdef in state.catalog.appdefs.values():
-        request = DemandRequest(
-            id="rehearsal",
-            operation=Operation.JOIN,
-            applications=(
-                ApplicationDemand(
-                    id=f"rehearsal/{appdef.name}",
-                    appdef=appdef.name,
-                    node=place,
-                    requesters=("rehearsal",),
-                    inputs={
-                        role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", place),)
-                        for role in appdef.inputs
-                    },
-                ),
-            ),
-        )
-        ledger, changes = booking.apply(Ledger(), request, datetime.fromtimestamp(0, timezone.utc))
-        for key in affected(Ledger(), ledger, state.catalog, changes.subjects()):
-            try:
-                changeset.render_all(ledger, state.catalog, state.engine, [key])
-            except InvalidInput as error:
-                faults += error.faults
-    if faults:
-        raise InvalidInput(dict.fromkeys(faults))
+    tryout.rehearse(state.catalog, state.engine)

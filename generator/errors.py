@@ -60,6 +60,10 @@ class Withdrawn(DemandOpsError):
     """A demand that its requester took back before it was committed."""
 
 
+class TurnedDown(DemandOpsError):
+    """A demand that needed approval, and that a person did not approve."""
+
+
 class NotReached(DemandOpsError):
     """A demand that is booked and published, and was not as far as asked in time.
 

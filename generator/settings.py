@@ -35,6 +35,10 @@ QUEUE_LIMIT = 10_000
 GENERATED_ROOTS = ("bootstrap", "clusters")
 """The top-level folders whose every file follows from ledger and configuration."""
 
+NOTES_ROOT = ".demandops"
+"""The top-level folder of what the generator tells people by files; nothing is read back from it
+that a decision depends on."""
+
 _PACKAGE = Path(__file__).parent
 
 
@@ -48,6 +52,12 @@ def data_folder(name: str) -> Path:
     if packaged.is_dir():
         return packaged
     return _PACKAGE.parent / {"skeleton": "state-repo-skeleton"}.get(name, name)
+
+
+def forge_token_file() -> Path | None:
+    """Return the file with the token for the forge, as ``DEMANDOPS_FORGE_TOKEN_FILE`` names it."""
+    named = os.environ.get("DEMANDOPS_FORGE_TOKEN_FILE")
+    return Path(named).expanduser() if named else None
 
 
 def data_home(state_repo: str) -> Path:

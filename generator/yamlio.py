@@ -170,6 +170,36 @@ def dump(data: Mapping[str, Any]) -> str:
     )
 
 
+def edited(text: str, key: str, value: object) -> str:
+    """Return a file with one top-level key set; all else stays, comments included.
+
+    A key that holds one plain value has it replaced where it stands; one that is missing is added
+    at the end.
+
+    Raises:
+        InvalidInput: where the file is not of a form in which that is possible.
+    """
+    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    standing = next((held for name, held in pairs if name.value == key), None)
+    if isinstance(standing, yaml.ScalarNode):
+        start, end = standing.start_mark.index, standing.end_mark.index
+        changed = text[:start] + dump({key: value}).partition(": ")[2].rstrip("\n") + text[end:]
+    else:
+        ended = "" if text.endswith("\n") else "\n"
+        added = f"{ended}\n{dump({key: value})}"
+        changed = text + (added.replace("\n", "\r\n") if "\r\n" in text else added)
+    try:
+        done = load(changed) == {**load(text), key: value}
+    except (InvalidInput, TypeError):
+        done = False
+    if not done:
+        raise InvalidInput(
+            [fault(key, f"cannot be set by the program; write {brief(value)} there")]
+        )
+    return changed
+
+
 def scalar(value: object) -> str:
     """Return ``value`` as JSON that is also YAML: what a template's ``{{ … }}`` writes.
 

@@ -19,6 +19,7 @@ from generator.errors import (
     NotReached,
     QueueFull,
     ShuttingDown,
+    TurnedDown,
     Withdrawn,
 )
 from generator.service import Receipt
@@ -127,6 +128,7 @@ def _code(outcome: Receipt | BaseException) -> str:
         return outcome.faults[0].code
     for kind, code in (
         (Withdrawn, "withdrawn"),
+        (TurnedDown, "turned-down"),
         (NotReached, f"not-{getattr(outcome, 'level', '')}"),
         (ShuttingDown, "shutting-down"),
         (QueueFull, "queue-full"),

@@ -28,6 +28,7 @@ from generator.cluster.status import Status
 from generator.errors import NotReached, QueueFull, ShuttingDown, Withdrawn
 from generator.service import Generator, Receipt
 from ros_bridge.bookkeeping import BookkeepingTopic, answer
+from ros_bridge.diagnostics import Diagnostics
 from ros_bridge.forms import DemandForm, DeploymentRequestForm, Form
 
 QUEUE_DEPTH = 2000
@@ -84,6 +85,7 @@ class DemandNode(Node):  # type: ignore[misc]
             callback_group=ReentrantCallbackGroup(),
         )
         self._topic = BookkeepingTopic(self, generator, self._from_worker)
+        self._diagnostics = Diagnostics(self, generator)
 
     def _serve(self, form: Form, name: str) -> ActionServer:
         return ActionServer(
@@ -130,6 +132,8 @@ class DemandNode(Node):  # type: ignore[misc]
         reason = "shutting down" if self._stopping else ""
         if len(self._open) >= self._generator.queue_limit:
             reason = "too many are waiting"
+            trouble = self._generator.condition.contact.trouble
+            reason += f" for the state repo: {trouble}" if trouble else ""
         if reason:
             self.get_logger().warning(f"goal '{form.name(goal)}' rejected: {reason}")
             return GoalResponse.REJECT
@@ -172,9 +176,6 @@ class DemandNode(Node):  # type: ignore[misc]
         """Return why it cannot be told what comes of a demand; empty where it can."""
         if self._answers.status is None:
             return "answered at pushed: this node has no access to the clusters"
-        gitops = self._generator.snapshot.state.catalog.repository.gitops
-        if gitops != "flux":
-            return f"answered at pushed: what {gitops} makes of it is not read yet"
         problem = self._answers.status.reaches(target.place for target in receipt.targets)
         return f"answered at pushed: {problem}" if problem else ""
 

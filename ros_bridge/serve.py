@@ -24,10 +24,13 @@ from generator.cli.output import errors, progress, signing_option
 from generator.cluster import access, wake
 from generator.cluster.status import Status
 from generator.service import Generator
+from generator.service.looking import DEFAULT_INTERVAL, interval_s
+from generator.service.webhook import Webhook, read_secret
 from generator.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from ros_bridge.forms import LEVELS
 from ros_bridge.node import Answers, DemandNode
 
+_OF_ANY_TYPE = ParameterDescriptor(dynamic_typing=True)
 _LEVELS = ("debug", "info", "warn", "error", "fatal")
 _POLL_S = 0.02
 _TASK_S = 5.0
@@ -70,17 +73,42 @@ class _ToRos(logging.Handler):
     help="How the clusters are reached, to wake them after a push and to hear what came of a "
     "demand; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
 )
+@click.option(
+    "--fetch-interval",
+    metavar="DURATION",
+    help="How often to look for what people pushed while no demand comes, 30s for one; 0 for "
+    f"never. Default: {DEFAULT_INTERVAL}; also the ROS parameter fetch_interval.",
+)
+@click.option(
+    "--webhook",
+    metavar="HOST:PORT",
+    help="Hear of pushes there, and look at once: POST /push by GitHub, GitLab, Gitea or Forgejo; "
+    "see docs/operations.md. Off by default.",
+)
+@click.option(
+    "--webhook-secret-file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="The secret that the webhook's notifications are signed with; needed unless it listens "
+    "on this machine alone.",
+)
 @signing_option
 @click.pass_context
 def serve(
-    ctx: click.Context, state_repo: str | None, access_file: Path | None, signing_key: Path | None
+    ctx: click.Context,
+    state_repo: str | None,
+    access_file: Path | None,
+    fetch_interval: str | None,
+    webhook: str | None,
+    webhook_secret_file: Path | None,
+    signing_key: Path | None,
 ) -> None:
     """Run the ROS 2 node that takes demands over the actions DeploymentRequest and Demand.
 
     Everything after --ros-args goes to ROS. Parameters: action_name (of DeploymentRequest),
     demand_action_name, answer (of DeploymentRequest: pushed, reconciled or healthy), answer_timeout
-    (seconds), state_repo, log_level (debug, info, warn, error or fatal). Stop it with Ctrl-C or
-    SIGTERM: it finishes what it has in hand.
+    (seconds), state_repo, fetch_interval, log_level (debug, info, warn, error or fatal). Stop it
+    with Ctrl-C or SIGTERM: it finishes what it has in hand.
     """
     ros_args = list(ctx.args)
     if ros_args and ros_args[0] != "--ros-args":
@@ -90,25 +118,29 @@ def serve(
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        settings = _parameters(state_repo)
+        settings = _parameters(state_repo, fetch_interval)
+        secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
-        waker = wake.Wake(clusters)
         with progress("reading the ledger") as tell:
             generator = Generator(
                 settings["state_repo"],
                 progress=tell,
-                on_published=waker,
                 with_targets=bool(clusters),
+                fetch_interval=interval_s(settings["fetch_interval"]),
                 signing_key=signing_key,
             )
-        status = Status(clusters, generator.includes) if clusters else None
-        _run(generator, settings, status)
+        waker = wake.Wake(clusters, generator.changed)
+        generator.watch(waker)
+        waker(generator.snapshot.state.catalog)  # an earlier run may have ended right after a push
+        hook = Webhook(webhook, secret, generator.look) if webhook else None
+        status = Status(clusters, generator) if clusters else None
+        _run(generator, settings, status, hook)
         waker.close()
     finally:
         rclpy.try_shutdown()
 
 
-def _parameters(state_repo: str | None) -> dict[str, Any]:
+def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
     """Read the node's parameters before it exists, for it needs the state repo to begin with."""
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
     try:
@@ -120,6 +152,11 @@ def _parameters(state_repo: str | None) -> dict[str, Any]:
             "answer": probe.declare_parameter("answer", LEVELS[0]).value,
             "answer_timeout": probe.declare_parameter("answer_timeout", 120.0).value,
             "state_repo": probe.declare_parameter("state_repo", state_repo or "").value,
+            "fetch_interval": _as_told(
+                probe.declare_parameter(
+                    "fetch_interval", fetch_interval or DEFAULT_INTERVAL, _OF_ANY_TYPE
+                ).value
+            ),
             "log_level": probe.declare_parameter("log_level", "info").value,
         }
     finally:
@@ -129,6 +166,10 @@ def _parameters(state_repo: str | None) -> dict[str, Any]:
             "which state repo? give --state-repo URL_OR_DIR, set DEMANDOPS_STATE_REPO, or the ROS "
             "parameter state_repo"
         )
+    try:
+        interval_s(values["fetch_interval"])
+    except ValueError as error:
+        raise click.UsageError(f"fetch interval: {error}") from None
     if values["answer"] not in LEVELS:
         raise click.UsageError(
             f"parameter answer is '{values['answer']}'; it takes {', '.join(LEVELS)}"
@@ -140,7 +181,14 @@ def _parameters(state_repo: str | None) -> dict[str, Any]:
     return values
 
 
-def _run(generator: Generator, settings: dict[str, Any], status: Status | None) -> None:
+def _as_told(value: object) -> str:
+    """Return a parameter as text: ROS reads 30 as a number and 30s as text."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _run(
+    generator: Generator, settings: dict[str, Any], status: Status | None, hook: Webhook | None
+) -> None:
     node = DemandNode(
         generator,
         settings["action_name"],
@@ -150,7 +198,9 @@ def _run(generator: Generator, settings: dict[str, Any], status: Status | None) 
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
         # read when the node starts; a change of them now would do nothing, so none is taken
-        node.declare_parameter(name, shown, ParameterDescriptor(read_only=True))
+        of_any_type = name == "fetch_interval"
+        descriptor = ParameterDescriptor(read_only=True, dynamic_typing=of_any_type)
+        node.declare_parameter(name, shown, descriptor)
     set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
     library_log = logging.getLogger("demandops")
     library_log.handlers, library_log.propagate = [_ToRos(node)], False
@@ -163,7 +213,11 @@ def _run(generator: Generator, settings: dict[str, Any], status: Status | None) 
     spinner.start()
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
+    if hook is not None:
+        node.get_logger().info(f"hearing of pushes at {hook.url}")
     signals.wait()
+    if hook is not None:
+        hook.close()
     _drain(executor, node, generator, status)
     executor.shutdown(timeout_sec=1)
     spinner.join(5)

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from generator.catalog.model import DnsLabel, FileModel, Frozen, Word
+from generator.catalog.model import Approval, DnsLabel, FileModel, Frozen, Word
 from generator.errors import near
 
 TopicPattern = Annotated[
@@ -105,6 +105,7 @@ class ApplicationDefinition(FileModel):
     parameters: dict[Word, Parameter] = Field(default_factory=dict)
     deployment_request: WireNames | None = Field(default=None, alias="deploymentRequest")
     services: dict[DnsLabel, Service] = Field(min_length=1)
+    approval: Approval = "none"
 
     @model_validator(mode="after")
     def _references(self) -> ApplicationDefinition:

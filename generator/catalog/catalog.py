@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 from generator.catalog.appdef import ApplicationDefinition, Service
 from generator.catalog.inventory import Broker, Cluster, Node
+from generator.catalog.override import OVERRIDES_ROOT, Override, in_order, still_in_force
 from generator.catalog.policy import AccessDomain
 from generator.catalog.registry import Chart, Image
 from generator.catalog.repository import Repository
@@ -27,7 +29,7 @@ ZENOH_BRIDGE_IMAGE = "zenoh-bridge"
 DDS_ROUTER_IMAGE = "dds-router"
 """The image of the registry that both ends of a ROS connection run."""
 
-CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs")
+CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
 """The top-level entries of a state repo that people own and the catalog is made from."""
 
 
@@ -35,7 +37,9 @@ CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs")
 class Catalog:
     """What can be run, where, from which charts and images.
 
-    ``files`` keeps the texts that templates and chart schemas are read from, by path.
+    ``files`` keeps the texts that templates and chart schemas are read from, by path. ``overrides``
+    are all that lie there; ``ended`` maps those that ended to the time that they named then, and
+    ``in_force`` are the others, in the order in which they apply.
     """
 
     repository: Repository
@@ -48,6 +52,21 @@ class Catalog:
     appdefs: Mapping[str, ApplicationDefinition]
     domain_of: Mapping[str, AccessDomain]
     files: Mapping[str, str]
+    overrides: Mapping[str, Override] = field(default_factory=dict)
+    ended: Mapping[str, str] = field(default_factory=dict)
+    in_force: tuple[Override, ...] = ()
+    judged: dict[Hashable, Override | None] = field(default_factory=dict, compare=False, repr=False)
+    """What was found denied, kept by :mod:`generator.plan.standing`: it follows from the rest."""
+
+    def with_ended(self, ended: Mapping[str, str]) -> Catalog:
+        """Return the catalog with these overrides ended (:mod:`generator.ledger.markers`)."""
+        in_force = in_order(still_in_force(self.overrides, ended))
+        ended = MappingProxyType(dict(ended))
+        return replace(self, ended=ended, in_force=in_force, judged={})
+
+    def without_overrides(self) -> Catalog:
+        """Return the catalog as it would be had nobody written an override."""
+        return replace(self, overrides={}, ended={}, in_force=(), judged={})
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
         """Return the appdef that ``DeploymentRequest`` names by ``number``."""

@@ -17,8 +17,11 @@ from generator.catalog.catalog import (
     NODES_FILE,
     Catalog,
 )
+from generator.catalog.override import Override
+from generator.catalog.policy import matches
 from generator.catalog.reading import Reading
 from generator.catalog.registry import ChartSource
+from generator.catalog.ties import check_ties
 from generator.errors import InvalidInput, near
 
 _CONNECTION_PREFIXES = ("mqtt", "zenoh", "ros")
@@ -36,6 +39,8 @@ def cross_check(catalog: Catalog, reading: Reading) -> None:
         _check_wire_types,
         _check_clients,
         _check_links,
+        _check_overrides,
+        check_ties,
     ):
         check(catalog, reading)
 
@@ -209,3 +214,47 @@ def _check_wire_types(catalog: Catalog, reading: Reading) -> None:
                 "deploymentRequest.type",
                 f"{number} already names '{other}'; choose another number",
             )
+
+
+def _check_overrides(catalog: Catalog, reading: Reading) -> None:
+    for override in catalog.overrides.values():
+        for image in override.images or ():
+            if reading.lacks(IMAGES_FILE, image):
+                known = near(image, reading.names(IMAGES_FILE))
+                message = f"'{image}' is not in {IMAGES_FILE}{known}"
+                reading.tell(override.path, f"images.{image}", message)
+        node = override.node
+        if node is not None and reading.lacks(NODES_FILE, node):
+            known = near(node, reading.names(NODES_FILE))
+            reading.tell(override.path, "node", f"'{node}' is not in nodes.yaml{known}")
+        elif node is not None and not reading.lacks(NODES_FILE, node):
+            _check_moved_to(node, override, catalog, reading)
+        versions = _versions_for(override, catalog)
+        if override.version and versions and override.version not in versions:
+            reading.tell(
+                override.path,
+                "version",
+                f"'{override.version}' is no version or channel in {CHARTS_FILE} of a chart that "
+                f"is selected{near(override.version, versions)}",
+            )
+
+
+def _check_moved_to(node: str, override: Override, catalog: Catalog, reading: Reading) -> None:
+    if node in catalog.nodes and node not in catalog.domain_of and catalog.domains:
+        message = f"'{node}' is in no access domain; add it to one in {DOMAINS_FILE}"
+        reading.tell(override.path, "node", message)
+
+
+def _versions_for(override: Override, catalog: Catalog) -> set[str]:
+    """Return the versions and channels of every chart that an override may pin."""
+    charts = {
+        service.chart
+        for appdef in catalog.appdefs.values()
+        for name, service in appdef.services.items()
+        for selector in override.select
+        if (not selector.services or matches(name, selector.services))
+        and (not selector.appdefs or matches(appdef.name, selector.appdefs))
+    }
+    return {
+        known for chart in charts & {*catalog.charts} for known in catalog.charts[chart].versions()
+    }

@@ -5,6 +5,7 @@ Pure. A file set is taken whole or refused whole, with every fault of every file
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -27,6 +28,7 @@ from generator.catalog.inventory import (
     Node,
     NodesFile,
 )
+from generator.catalog.override import OVERRIDES_ROOT, Override, OverrideFile
 from generator.catalog.policy import AccessDomain, AccessDomainsFile, matches
 from generator.catalog.reading import Reading
 from generator.catalog.registry import Chart, ChartsFile, Image, ImagesFile
@@ -34,6 +36,7 @@ from generator.catalog.repository import ROOT_FILE, Flux, Repository
 from generator.errors import InvalidInput
 from generator.settings import API_VERSION, RENDER_VERSION
 
+_NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
 _ANY = Repository(
     apiVersion=API_VERSION,
     kind="StateRepository",
@@ -81,7 +84,8 @@ def load(files: Mapping[str, str]) -> Catalog:
         appdefs=_read_appdefs(reading),
         domain_of=_domains_of_nodes(reading, nodes, domains),
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
-    )
+        overrides=_read_overrides(reading),
+    ).with_ended({})
     cross_check(catalog, reading)
     if reading.faults:
         raise InvalidInput(dict.fromkeys(reading.faults))
@@ -104,6 +108,27 @@ def _read_appdefs(reading: Reading) -> Mapping[str, ApplicationDefinition]:
             appdef = appdef.model_copy(update={"name": parts[1]})
         appdefs[appdef.name] = appdef
     return MappingProxyType(appdefs)
+
+
+def _read_overrides(reading: Reading) -> Mapping[str, Override]:
+    overrides = {}
+    for path in sorted(reading.files):
+        folder, _, name = path.partition("/")
+        if folder != OVERRIDES_ROOT or name.startswith(".") or name.endswith(".md"):
+            continue
+        stem = name.removesuffix(".yaml")
+        if stem == name or not _NAME.fullmatch(stem):
+            reading.tell(
+                path,
+                "",
+                "is no override: one is overrides/<name>.yaml, the name of small letters, digits "
+                "and '-'; rename the file, or remove it",
+            )
+            continue
+        file = reading.one(path, OverrideFile)
+        if file is not None:
+            overrides[stem] = Override.of(stem, file)
+    return MappingProxyType(overrides)
 
 
 def _domains_of_nodes(

@@ -24,6 +24,9 @@ DnsLabel = Annotated[
 Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_length=63)]
 """A name that people give to roles, services and images in definitions."""
 
+Approval = Literal["none", "required"]
+"""Whether a person has to agree before a demand is carried out."""
+
 
 class Frozen(BaseModel):
     """A value that cannot change, with no room for misspelt fields."""

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from generator.catalog.model import DnsLabel, FileModel, Frozen
+from generator.catalog.model import Approval, DnsLabel, FileModel, Frozen
 from generator.errors import shown
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
@@ -53,6 +53,7 @@ class Rule(Frozen):
     """What some requesters may demand; a demand needs one rule for each of its requesters.
 
     ``nodes`` are those where it runs or where a connection ends, ``brokers`` the nodes of brokers.
+    ``approval`` is the access domain's where it is left out.
     """
 
     name: DnsLabel
@@ -60,6 +61,7 @@ class Rule(Frozen):
     applications: Patterns = ("*",)
     nodes: Patterns = ("*",)
     brokers: Patterns = ("*",)
+    approval: Approval | None = None
 
 
 class Quotas(Frozen):
@@ -120,6 +122,7 @@ class AccessDomain(Frozen):
     quotas: Quotas = Quotas()
     leases: LeasePolicy = LeasePolicy()
     network: Literal["open", "namespace"] = "open"
+    approval: Approval = "none"
 
     @model_validator(mode="after")
     def _named_once(self) -> AccessDomain:

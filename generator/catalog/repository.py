@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from generator.catalog.model import DnsLabel, FileModel, Frozen
+from generator.errors import shown
 
 ROOT_FILE = "demandops.yaml"
 
@@ -35,6 +37,58 @@ class ArgoCd(Frozen):
     namespace: DnsLabel = "argocd"
 
 
+_WEB_URL = re.compile(
+    r"(https://[^\s:@/?#]+|http://(127\.0\.0\.1|localhost|\[::1\]))(:\d+)?(/[^\s?#]*)?"
+)
+
+
+def _web_url(text: str) -> str:
+    if not _WEB_URL.fullmatch(text):
+        raise ValueError(
+            f"{shown(text)} is no address that a token is sent to; write https://HOST/PATH, "
+            "without a user (plain http only for this machine)"
+        )
+    return text
+
+
+WebUrl = Annotated[str, AfterValidator(_web_url)]
+
+
+class Proposals(Frozen):
+    """Where demands that need approval are proposed.
+
+    ``none`` pushes the branch and asks nobody. GitLab opens a merge request by push options; GitHub
+    and Gitea (Forgejo) by their API, whose address follows from ``url`` unless ``api`` says it.
+    """
+
+    forge: Literal["none", "gitlab", "github", "gitea"] = "none"
+    url: WebUrl | None = None
+    api: WebUrl | None = None
+    labels: tuple[Annotated[str, StringConstraints(pattern=r"^[^\s,][^\n\r,]*$")], ...] = Field(
+        default=(), strict=False
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Proposals:
+        has_api = self.forge in ("github", "gitea")
+        if has_api and (self.url is None or len(self.project) != 2):
+            raise ValueError(
+                f"forge: {self.forge} needs url, the project's address in a browser, like "
+                "https://github.com/OWNER/REPOSITORY"
+            )
+        if self.api is not None and not has_api:
+            raise ValueError(f"api: is not used with forge: {self.forge}; leave it out")
+        if self.labels and self.forge != "gitlab":
+            raise ValueError("labels: only GitLab's push options set them; leave them out")
+        return self
+
+    @property
+    def project(self) -> tuple[str, ...]:
+        """Return owner and name of the project, the last two parts of its address."""
+        path = (self.url or "").partition("://")[2].partition("/")[2]
+        return tuple(path.strip("/").removesuffix(".git").split("/")[-2:]) if path else ()
+
+
 class Repository(FileModel):
     """``demandops.yaml``: what the whole state repo has in common.
 
@@ -47,3 +101,4 @@ class Repository(FileModel):
     source: DnsLabel = "demandops"
     flux: Flux | None = None
     argocd: ArgoCd | None = None
+    proposals: Proposals = Proposals()

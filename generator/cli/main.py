@@ -14,13 +14,18 @@ import click
 
 from generator import __version__
 from generator.cli import (
+    check,
+    decommission,
     diff,
     log,
+    overrides,
+    proposals,
     repo,
     request,
     rollback,
     schema,
     status,
+    upgrade,
     verify,
     views,
     why,
@@ -81,15 +86,19 @@ def cli(verbose: bool) -> None:
 
 cli.add_command(repo.init)
 cli.add_command(request.request)
+cli.add_command(decommission.decommission)
 cli.add_command(views.bookkeeping)
 cli.add_command(why.why)
 cli.add_command(log.log)
 cli.add_command(diff.diff)
+cli.add_command(overrides.overrides)
 cli.add_command(rollback.rollback)
-cli.add_command(repo.check)
+cli.add_command(check.check)
 cli.add_command(verify.verify)
+cli.add_command(upgrade.upgrade)
 cli.add_command(schema.schema)
 cli.add_command(status.status)
+cli.add_command(proposals.proposals)
 
 
 def main(args: list[str] | None = None) -> None:

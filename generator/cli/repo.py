@@ -1,4 +1,4 @@
-"""``demandops init`` and ``check``: the state repo itself."""
+"""``demandops init``: the state repo itself."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import click
 
 from generator.cli.output import (
     console,
-    errors,
     output_option,
     print_json,
     signing_option,
 )
-from generator.staterepo import checkout, layout
+from generator.staterepo import layout
 from generator.staterepo.signing import Signer
 
 
@@ -75,46 +74,3 @@ def init(
     else:
         out.print("next: edit inventory/ and policy/, commit, push it to your Git server, and run")
         out.print("      demandops serve --state-repo URL")
-
-
-@click.command()
-@click.argument(
-    "directory",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    metavar="DIR",
-    default=Path(),
-)
-@click.option(
-    "--base",
-    metavar="REV",
-    help="The commit that the edit started from; by default where it left origin/main, or HEAD.",
-)
-@output_option
-def check(directory: Path, base: str | None, output: str) -> None:
-    """Check a checked-out state repo before its edits are merged.
-
-    All files are valid, every application renders, no generated file is edited by hand, and a
-    chart that changed has a new version.
-    """
-    found = checkout.check(directory, base)
-    if output == "json":
-        print_json(
-            {
-                "faults": [
-                    {"file": one.file, "field": one.field, "message": one.message}
-                    for one in found.faults
-                ],
-                "outdated": list(found.outdated),
-            }
-        )
-    else:
-        for one in found.faults:
-            errors.print(f"error: {one}")
-        if not found.faults:
-            console().print(f"{directory}: all files are valid and everything renders")
-        if found.outdated:
-            console().print(f"the generator will write {len(found.outdated)} files anew:")
-            for path in found.outdated:
-                console().print(f"  {path}")
-    if found.faults:
-        click.get_current_context().exit(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -25,6 +26,7 @@ from generator.cli.output import (
 from generator.decision import Decision, admit, decide, form_faults
 from generator.errors import DemandOpsError, Fault, InvalidInput, fault
 from generator.service import Generator, Receipt
+from generator.service.proposal import where_told
 from generator.staterepo import reader
 
 
@@ -44,6 +46,12 @@ class _Document:
 @click.argument("files", nargs=-1, required=True, metavar="FILE…")
 @state_repo_option
 @click.option("--dry-run", is_flag=True, help="Show the consequence and book nothing.")
+@click.option(
+    "--wait",
+    is_flag=True,
+    help="Wait until demands that need approval are decided. Without it they are proposed, and the "
+    "next generator to start on this machine looks after them.",
+)
 @signing_option
 @output_option
 @click.pass_context
@@ -52,6 +60,7 @@ def request(
     files: tuple[str, ...],
     state_repo: str,
     dry_run: bool,
+    wait: bool,
     signing_key: Path | None,
     output: str,
 ) -> None:
@@ -71,7 +80,7 @@ def request(
     elif dry_run:
         rows = _rehearse(documents, state_repo, output)
     else:
-        rows = _book(documents, state_repo, signing_key)
+        rows = _book(documents, state_repo, wait, signing_key)
     if output == "json":
         print_json(rows)
     else:
@@ -140,21 +149,54 @@ def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str
 
 
 def _book(
-    documents: list[_Document], state_repo: str, signing_key: Path | None
+    documents: list[_Document], state_repo: str, wait: bool, signing_key: Path | None
 ) -> list[dict[str, Any]]:
     with progress("reading the ledger") as tell:
         generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=tell)
     try:
-        tickets = [generator.submit(document.goal) for document in documents]
+        answers = [_handed_in(generator, document, wait) for document in documents]
         rows = []
-        for index, (document, ticket) in enumerate(zip(documents, tickets, strict=True)):
+        for index, (document, answer) in enumerate(zip(documents, answers, strict=True)):
             try:
-                rows.append(_booked(index, ticket.future.result()))
+                told = answer.result()
             except DemandOpsError as error:
                 rows.append(_refused(index, document, error))
+                continue
+            if isinstance(told, Receipt):
+                rows.append(_booked(index, told))
+            else:
+                rows.append(_row(index, document.request_id, "proposed", proposal=told))
         return rows
     finally:
         generator.close(timeout=0)
+
+
+def _handed_in(
+    generator: Generator, document: _Document, wait: bool
+) -> Future[Receipt | dict[str, str]]:
+    """Hand a request in; the future gives its receipt, or where it awaits approval."""
+    answer: Future[Receipt | dict[str, str]] = Future()
+    name = document.request_id
+
+    def listen(stage: str, text: str) -> None:
+        if stage != "proposed":
+            return
+        if wait:
+            errors.print(f"{document.file}: request '{name}' {text}")
+        elif not answer.done():
+            answer.set_result(where_told(text))
+
+    def finish(future: Future[Receipt]) -> None:
+        if answer.done():
+            return
+        error = future.exception()
+        if error is not None:
+            answer.set_exception(error)
+        else:
+            answer.set_result(future.result())
+
+    generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
+    return answer
 
 
 def _booked(index: int, receipt: Receipt) -> dict[str, Any]:
@@ -172,6 +214,7 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
     """Decide every request on top of the one before, in memory only."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
+        repo.refuse_other_rendering()
         state = repo.snapshot(progress=tell).state
         standing, written = repo.file_reader(), dict[str, str | None]()
 
@@ -192,17 +235,26 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
                 _row(
                     index,
                     decision.request.id,
-                    decision.outcome,
+                    "proposed" if decision.approval else decision.outcome,
                     warnings=list(decision.warnings),
                     not_held=list(decision.changes.not_held),
+                    **({"approval": list(decision.approval)} if decision.approval else {}),
                 )
             )
     return rows
 
 
 def _show_consequence(index: int, decision: Decision) -> None:
+    outcome = "proposed" if decision.approval else decision.outcome
+    console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
+    for who in decision.approval:
+        console().print(f"  needs approval: {who} asks for it")
+    show_releases(decision)
+
+
+def show_releases(decision: Decision) -> None:
+    """Print what a decision changes: releases, and the files that are written or removed."""
     out = console()
-    out.print(f"Request {index}: '{decision.request.id}' would be {decision.outcome}")
     for release in decision.releases:
         out.print(f"  {SIGNS[release.change]} {release.name} ({release.what})")
         for detail in release.details:
@@ -221,7 +273,12 @@ def _print(rows: list[dict[str, Any]], documents: list[_Document], dry_run: bool
                 where = f"{error['field']}: " if error["field"] else ""
                 errors.print(f"  {where}{error['message']}")
         elif not dry_run:
-            out.print(f"{title} {row['outcome']} in {row['commit']}")
+            proposal = row.get("proposal")
+            out.print(
+                f"{title} {row['outcome']} in {row['commit']}"
+                if proposal is None
+                else f"{title} awaiting approval {proposal['branch']} {proposal['link']}".rstrip()
+            )
         for warning in row["warnings"]:
             errors.print(f"  warning: {warning}")
         for item in row["not_held"]:

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from generator.catalog.appdef import ApplicationDefinition
 from generator.catalog.inventory import BrokersFile, ClustersFile, NodesFile
+from generator.catalog.override import OverrideFile
 from generator.catalog.policy import AccessDomainsFile
 from generator.catalog.registry import ChartsFile, ImagesFile
 from generator.catalog.repository import Repository
@@ -30,6 +31,7 @@ _SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "deployment-request": (WireGoal, "a goal of DeploymentRequest, for `demandops request`"),
     "images": (ImagesFile, "registry/images.yaml"),
     "nodes": (NodesFile, "inventory/nodes.yaml"),
+    "override": (OverrideFile, "overrides/<name>.yaml"),
     "state-repo": (Repository, "demandops.yaml"),
 }
 

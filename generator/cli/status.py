@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,13 @@ from generator.cli.output import (
     state_repo_option,
 )
 from generator.cluster import access
-from generator.cluster.health import Health, Target, applied, of_place, of_target, since
+from generator.cluster.health import Health, Target, Watched, reading
 from generator.cluster.store import ClusterStore
-from generator.errors import StateRepoError
 from generator.plan.release import Release, ServiceRelease
 from generator.service import targets
 from generator.staterepo import reader
 from generator.staterepo.reader import Reader
+from generator.staterepo.reports import Problem
 
 _SHORT = 10
 
@@ -45,38 +46,52 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
     """Show for each release what is desired, what its cluster has seen, and how it is."""
     clusters = access.read(access_file).clusters if access_file else {}
     with reader.opened(state_repo) as repo:
+        problems = repo.problems()
         with progress("reading the ledger") as tell:
             snapshot = repo.snapshot(progress=tell)
         found = targets.of_state(snapshot.state)
-        gitops = snapshot.state.catalog.repository.gitops
-        if gitops != "flux":
-            raise StateRepoError(f"what {gitops} makes of the state repo is not read yet")
         stores = _read(clusters, [target for _, target in found])
         commit = str(snapshot.commit)
         rows = [_row(release, target, commit, stores, repo) for release, target in found]
     if output == "json":
-        print_json({"commit": commit, "releases": rows})
+        told = [asdict(problem) for problem in problems]
+        print_json({"commit": commit, "releases": rows, "problems": told})
         return
+    _print_problems(problems)
     console().print(_table(rows))
     console().print(f"desired: {commit}")
     if not clusters:
         errors.print("no access to the clusters, so nothing is known of them: give --clusters FILE")
 
 
+def _print_problems(problems: Iterable[Problem]) -> None:
+    """Print what is not valid in the state repo, as the generator reported it there."""
+    lines = [f"  {problem}" for problem in problems]
+    if lines:
+        console().print(f"{_counted(len(lines))}; of each file the last valid version is in force:")
+    for line in lines:
+        console().print(line, soft_wrap=True)
+
+
+def _counted(number: int) -> str:
+    return f"{number} problem{'s' if number > 1 else ''}"
+
+
 def _read(
     clusters: Mapping[str, access.Reached], found: Iterable[Target]
 ) -> dict[str, ClusterStore]:
     """Read all clusters at once: one that is away holds up no other."""
-    namespaces: dict[str, set[str]] = {}
+    wanted: dict[str, dict[Watched, None]] = {}
     for target in found:
-        namespaces.setdefault(target.place.cluster, set()).add(target.place.namespace)
+        watched = reading(target.place).watched(target.place)
+        wanted.setdefault(target.place.cluster, {}).update(dict.fromkeys(watched))
     stores = {
         name: ClusterStore(name, reached, lambda: None)
         for name, reached in clusters.items()
-        if reached.kubeconfig and name in namespaces
+        if reached.kubeconfig and name in wanted
     }
     with ThreadPoolExecutor(max(len(stores), 1)) as pool:
-        list(pool.map(lambda store: store.read(sorted(namespaces[store.name])), stores.values()))
+        list(pool.map(lambda store: store.read(wanted[store.name]), stores.values()))
     return stores
 
 
@@ -109,14 +124,16 @@ def _seen(
     store = stores.get(target.place.cluster)
     if store is None:
         return Health("waiting", "no access to this cluster"), "", ""
-    if store.trouble:
-        reason = f"cannot be read: {store.trouble}"
+    read = reading(target.place)
+    unread = store.unread(read.watched(target.place))
+    if unread:
+        reason = f"cannot be read: {unread}"
         return Health("waiting", reason, f"cluster {store.name}"), "", ""
     objects = store.objects()
-    health = of_place(target.place, commit, objects, repo.includes)
+    health = read.of_place(target.place, commit, objects, repo)
     if health.state != "waiting":
-        health = of_target(target, objects)
-    return health, applied(target.place, objects), since(target, objects)
+        health = read.of_target(target, commit, objects, repo)
+    return health, read.applied(target.place, objects), read.since(target, objects)
 
 
 def _what(release: Release) -> str:

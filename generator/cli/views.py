@@ -8,6 +8,7 @@ from rich.table import Table
 from generator.cli.output import (
     REV_HELP,
     console,
+    errors,
     output_option,
     print_json,
     progress,
@@ -26,8 +27,11 @@ _NONE = "(nothing)"
 @output_option
 def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     """Show who requests which service and connection."""
-    with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
-        snapshot = repo.snapshot(at, tell)
+    with reader.opened(state_repo) as repo:
+        with progress("reading the ledger") as tell:
+            snapshot = repo.snapshot(at, tell)
+        for problem in repo.problems() if at is None else ():
+            errors.print(f"warning: {problem}; its last valid version is in force")
     books, commit = derive(snapshot.state.ledger, snapshot.state.catalog), str(snapshot.commit)
     if output == "json":
         print_json(as_data(books, commit))
@@ -35,6 +39,8 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     out = console()
     out.print(services_table(books))
     out.print(connections_table(books))
+    if books.suspended:
+        out.print(suspended_table(books))
     out.print(f"at {commit}")
 
 
@@ -65,4 +71,14 @@ def connections_table(books: Bookkeeping) -> Table:
         )
     if not books.connections:
         table.add_row(_NONE, *[""] * 4)
+    return table
+
+
+def suspended_table(books: Bookkeeping) -> Table:
+    """Return the claims that overrides keep from running, as a table."""
+    table = Table("Subject", "Demand", "Requesters", "By", "Reason", title="Suspended")
+    for entry in books.suspended:
+        subject = f"{entry.kind} {entry.id}"
+        requesters = "\n".join(entry.requesters)
+        table.add_row(subject, entry.demand, requesters, entry.override, entry.reason)
     return table

@@ -18,13 +18,12 @@ from functools import partial
 from generator.cluster.access import Reached
 from generator.cluster.health import (
     Health,
-    Includes,
+    History,
     Level,
     Objects,
     Place,
     Target,
-    of_place,
-    of_target,
+    reading,
     worst,
 )
 from generator.cluster.store import ClusterStore
@@ -48,6 +47,7 @@ class _Followed:
     told: Told
     future: Future[Health] = field(default_factory=Future)
     said: set[str] = field(default_factory=set)
+    failed: Health | None = None
     confirmed: bool = False
     busy: bool = False
 
@@ -55,14 +55,14 @@ class _Followed:
 class Status:
     """Watches clusters, as many as the operator's file names."""
 
-    def __init__(self, clusters: Mapping[str, Reached], includes: Includes) -> None:
-        """Start with no watch; those of a namespace begin when something there is followed.
+    def __init__(self, clusters: Mapping[str, Reached], history: History) -> None:
+        """Start with no watch; those of a place begin when something there is followed.
 
         Args:
             clusters: how each cluster is reached; those without a kubeconfig tell nothing.
-            includes: whether one commit of the state repo is another or comes after it.
+            history: the commits of the state repo; asked from the status thread.
         """
-        self._includes = includes
+        self._history = history
         self._news = threading.Event()
         self._closed = False
         self._lock = threading.Lock()
@@ -105,7 +105,7 @@ class Status:
         places = tuple(dict.fromkeys(target.place for target in targets))
         followed = _Followed(commit, places, targets, level, time.monotonic() + timeout, told)
         for place in places:
-            self._stores[place.cluster].watch([place.namespace])
+            self._stores[place.cluster].watch(reading(place).watched(place))
         with self._lock:
             self._open.append(followed)
         self._news.set()
@@ -141,6 +141,7 @@ class Status:
                 self._beside(one, self._confirm)
                 continue
             self._tell(one, health)
+            one.failed = health if health.failing else one.failed
             if health.reaches(one.level) or last:
                 self._answer(one, health)
             elif time.monotonic() > one.deadline:
@@ -162,11 +163,17 @@ class Status:
 
     def _confirm(self, one: _Followed) -> None:
         for place in one.places:
-            self._stores[place.cluster].refresh(place.namespace)
+            self._stores[place.cluster].refresh(reading(place).confirmed_by(place))
         one.confirmed = True
 
     def _give_up(self, one: _Followed, health: Health) -> None:
-        """Answer at the end of the timeout, with what the pods say where a Deployment hangs."""
+        """Answer at the end of the timeout, with what the pods say where a Deployment hangs.
+
+        Where it is just being tried again, what failed before is the reason.
+        """
+        failed = one.failed
+        if failed and not health.failing and failed.object == health.object:
+            health = replace(health, reason=f"{health.reason}; before: {failed.reason}")
         kind, _, name = health.object.partition(" ")
         if kind == "Deployment":
             namespace, _, deployment = name.partition("/")
@@ -192,14 +199,18 @@ class Status:
         found = worst(places)
         if found.state == "waiting" or not one.places:
             return found
-        return worst([of_target(target, objects[target.place.cluster]) for target in one.targets])
+        return worst([self._of_target(target, one.commit, objects) for target in one.targets])
 
     def _of_place(self, place: Place, commit: str, objects: Mapping[str, Objects]) -> Health:
-        store = self._stores[place.cluster]
-        if store.trouble or not store.knows(place.namespace):
-            reason = store.trouble or "it was not read yet"
-            return Health("waiting", f"cannot be read: {reason}", f"cluster {place.cluster}")
-        return of_place(place, commit, objects[place.cluster], self._includes)
+        read = reading(place)
+        unread = self._stores[place.cluster].unread(read.watched(place))
+        if unread:
+            return Health("waiting", f"cannot be read: {unread}", f"cluster {place.cluster}")
+        return read.of_place(place, commit, objects[place.cluster], self._history)
+
+    def _of_target(self, target: Target, commit: str, objects: Mapping[str, Objects]) -> Health:
+        found = objects[target.place.cluster]
+        return reading(target.place).of_target(target, commit, found, self._history)
 
     @staticmethod
     def _tell(one: _Followed, health: Health) -> None:

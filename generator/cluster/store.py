@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from generator.cluster.access import Reached
-from generator.cluster.health import Key
+from generator.cluster.health import Key, Watched
 
 log = logging.getLogger("demandops")
 
@@ -16,6 +16,7 @@ _KINDS = {
     "Kustomization": ("kustomize.toolkit.fluxcd.io", "v1", "kustomizations"),
     "GitRepository": ("source.toolkit.fluxcd.io", "v1", "gitrepositories"),
     "HelmRelease": ("helm.toolkit.fluxcd.io", "v2", "helmreleases"),
+    "Application": ("argoproj.io", "v1alpha1", "applications"),
     "Deployment": ("apps", "v1", "deployments"),
 }
 _WATCH_S = 240
@@ -24,66 +25,78 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 
 class ClusterStore:
-    """The objects of some namespaces of one cluster.
+    """Objects of one cluster: those that somebody asked to know.
 
-    ``trouble`` says why the cluster cannot be read at present; empty where it can.
+    ``trouble`` says why some of them cannot be read at present; empty where all can.
     """
 
     def __init__(self, name: str, reached: Reached, on_change: Callable[[], None]) -> None:
         self.name = name
-        self.trouble = "it was not read yet"
         self._reached = reached
         self._on_change = on_change
         self._lock = threading.Lock()
         self._objects: dict[Key, dict[str, Any]] = {}
-        self._watched: set[str] = set()
-        self._read: set[tuple[str, str]] = set()
+        self._watched: set[Watched] = set()
+        self._read: set[Watched] = set()
+        self._troubles: dict[Watched, str] = {}
         self._closed = threading.Event()
         self._client: Any = None
 
-    def watch(self, namespaces: Iterable[str]) -> None:
-        """Watch further namespaces; those watched already stay so."""
-        for namespace in namespaces:
+    @property
+    def trouble(self) -> str:
+        """Why something that is watched cannot be read; empty where all can."""
+        with self._lock:
+            return next((self._troubles[one] for one in sorted(self._troubles)), "")
+
+    def watch(self, wanted: Iterable[Watched]) -> None:
+        """Watch further objects; those watched already stay so."""
+        for one in wanted:
             with self._lock:
-                if namespace in self._watched or self._closed.is_set():
+                if one in self._watched or self._closed.is_set():
                     continue
-                self._watched.add(namespace)
-            for kind in _KINDS:
-                threading.Thread(
-                    target=self._follow,
-                    args=(kind, namespace),
-                    name=f"demandops-watch-{self.name}-{kind}",
-                    daemon=True,
-                ).start()
+                self._watched.add(one)
+            threading.Thread(
+                target=self._follow,
+                args=(one,),
+                name=f"demandops-watch-{self.name}-{one.kind}",
+                daemon=True,
+            ).start()
 
     def objects(self) -> dict[Key, dict[str, Any]]:
         """Return what is there now."""
         with self._lock:
             return dict(self._objects)
 
-    def knows(self, namespace: str) -> bool:
-        """Tell whether a namespace has been read whole at least once."""
+    def unread(self, wanted: Iterable[Watched]) -> str:
+        """Return why what is wanted is not known at present; empty where it is."""
         with self._lock:
-            return all((kind, namespace) in self._read for kind in _KINDS)
+            for one in wanted:
+                if one in self._troubles:
+                    return self._troubles[one]
+                if one not in self._read:
+                    return "it was not read yet"
+        return ""
 
-    def read(self, namespaces: Iterable[str]) -> None:
-        """Read some namespaces once, without a watch; ``trouble`` says what went wrong."""
-        try:
-            for namespace in namespaces:
-                for kind in _KINDS:
-                    self._put(kind, namespace, self._list(kind, namespace)["items"])
-            self.trouble = ""
-        except Exception as error:
-            self.trouble = _told(error)
+    def read(self, wanted: Iterable[Watched]) -> None:
+        """Read some objects once, without a watch; ``trouble`` says what went wrong."""
+        everything = list(wanted)
+        for one in everything:
+            try:
+                self._put(one, self._list(one)["items"])
+            except Exception as error:
+                if not _answered(error):  # the others would be waited for in vain
+                    self._troubles |= dict.fromkeys(everything, _told(one, error))
+                    return
+                self._troubles[one] = _told(one, error)
 
-    def refresh(self, namespace: str) -> None:
-        """Read releases and then their Deployments anew: watches may lag behind each other.
+    def refresh(self, wanted: Iterable[Watched]) -> None:
+        """Read some objects anew, in this order: watches may lag behind each other.
 
         Raises:
             Exception: of the library, where the cluster does not answer.
         """
-        for kind in ("HelmRelease", "Deployment"):
-            self._put(kind, namespace, self._list(kind, namespace)["items"])
+        for one in wanted:
+            self._put(one, self._list(one)["items"])
 
     def why_not_available(self, namespace: str, deployment: str) -> str:
         """Return what keeps a Deployment's pods from running, or nothing that is known.
@@ -115,39 +128,39 @@ class ClusterStore:
         """Watch no more."""
         self._closed.set()
 
-    def _follow(self, kind: str, namespace: str) -> None:
+    def _follow(self, watched: Watched) -> None:
         pause = _FIRST_PAUSE_S
         while not self._closed.is_set():
             try:
-                self._list_and_watch(kind, namespace)
+                self._list_and_watch(watched)
                 pause = _FIRST_PAUSE_S
             except Exception as error:  # whatever the library meets on its way to the server
-                self._say(_told(error))
+                self._say(watched, _told(watched, error))
                 self._closed.wait(pause)
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
 
-    def _list_and_watch(self, kind: str, namespace: str) -> None:
+    def _list_and_watch(self, watched: Watched) -> None:
         from kubernetes import watch  # noqa: PLC0415 - half a second; only when used
 
-        listed = self._list(kind, namespace)
-        self._put(kind, namespace, listed["items"])
-        self._say("")
-        group, version, plural = _KINDS[kind]
-        revision = listed["metadata"]["resourceVersion"]
+        listed = self._list(watched)
+        self._put(watched, listed["items"])
+        self._say(watched, "")
+        group, version, plural = _KINDS[watched.kind]
         watcher = watch.Watch()
         for event in watcher.stream(
             self._api().list_namespaced_custom_object,
             group,
             version,
-            namespace,
+            watched.namespace,
             plural,
-            resource_version=revision,
+            resource_version=listed["metadata"]["resourceVersion"],
             timeout_seconds=_WATCH_S,
             _request_timeout=(_CONNECT_S, _WATCH_S + 30),
+            **_selected(watched),
         ):
             if self._closed.is_set():
                 return
-            self._take(kind, namespace, event)
+            self._take(watched, event)
 
     def _api(self) -> Any:  # noqa: ANN401 - the library has no types
         from kubernetes import client  # noqa: PLC0415 - half a second; only when used
@@ -157,26 +170,33 @@ class ClusterStore:
                 self._client = client.CustomObjectsApi(self._reached.client())
             return self._client
 
-    def _list(self, kind: str, namespace: str) -> Any:  # noqa: ANN401
-        group, version, plural = _KINDS[kind]
+    def _list(self, watched: Watched) -> Any:  # noqa: ANN401
+        group, version, plural = _KINDS[watched.kind]
         return self._api().list_namespaced_custom_object(
-            group, version, namespace, plural, _request_timeout=(_CONNECT_S, _WATCH_S)
+            group,
+            version,
+            watched.namespace,
+            plural,
+            _request_timeout=(_CONNECT_S, _WATCH_S),
+            **_selected(watched),
         )
 
-    def _put(self, kind: str, namespace: str, items: Iterable[dict[str, Any]]) -> None:
-        """Make the objects of a kind what was listed."""
+    def _put(self, watched: Watched, items: Iterable[dict[str, Any]]) -> None:
+        """Make what is watched what was listed."""
+        kind, namespace, name = watched
         with self._lock:
-            for key in [known for known in self._objects if known[:2] == (kind, namespace)]:
-                del self._objects[key]
+            for key in list(self._objects):
+                if key[:2] == (kind, namespace) and name in ("", key[2]):
+                    del self._objects[key]
             for item in items:
                 self._objects[kind, namespace, item["metadata"]["name"]] = item
-            self._read.add((kind, namespace))
+            self._read.add(watched)
 
-    def _take(self, kind: str, namespace: str, event: dict[str, Any]) -> None:
+    def _take(self, watched: Watched, event: dict[str, Any]) -> None:
         item = event["object"]
         if event["type"] not in ("ADDED", "MODIFIED", "DELETED"):
             return
-        key = (kind, namespace, item["metadata"]["name"])
+        key = (watched.kind, watched.namespace, item["metadata"]["name"])
         with self._lock:
             known = self._objects.get(key)
             if known is not None and _version(item) < _version(known):
@@ -187,14 +207,33 @@ class ClusterStore:
                 self._objects[key] = item
         self._on_change()
 
-    def _say(self, trouble: str) -> None:
-        if trouble and trouble != self.trouble:
+    def _say(self, watched: Watched, trouble: str) -> None:
+        with self._lock:
+            told = trouble and trouble not in self._troubles.values()
+            if trouble:
+                self._troubles[watched] = trouble
+            else:
+                self._troubles.pop(watched, None)
+        if told:
             log.warning("cluster '%s' cannot be read (%s); trying on", self.name, trouble)
-        self.trouble = trouble
         self._on_change()
 
 
-def _told(error: Exception) -> str:
+def _selected(watched: Watched) -> dict[str, str]:
+    """Return what narrows a request to one object, which a right to that one alone permits."""
+    return {"field_selector": f"metadata.name={watched.name}"} if watched.name else {}
+
+
+def _answered(error: Exception) -> bool:
+    """Tell whether the cluster answered, if only to refuse."""
+    return bool(getattr(error, "status", None))
+
+
+def _told(watched: Watched, error: Exception) -> str:
+    if _answered(error):  # it speaks of these objects; else it is the whole cluster that is away
+        plural = _KINDS[watched.kind][2]
+        reason = getattr(error, "reason", None) or type(error).__name__
+        return f"{plural} in {watched.namespace}: {reason}"
     reason = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
     return reason.splitlines()[0][:300]
 

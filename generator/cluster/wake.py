@@ -9,17 +9,17 @@ import logging
 import threading
 import time
 import urllib.error
-import urllib.request
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime, timezone
 from typing import Any
 
 from generator.catalog.catalog import Catalog
 from generator.catalog.policy import AccessDomain
 from generator.catalog.repository import Repository
-from generator.cluster.access import Reached
+from generator.cluster import webhook
+from generator.cluster.access import NoWay, Reached
 from generator.render.argocd import project_of
-from generator.render.paths import domains_in_use
+from generator.render.paths import domain_folder, domains_in_use
 
 log = logging.getLogger("demandops")
 
@@ -31,10 +31,16 @@ _REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
 _REFRESH = "argocd.argoproj.io/refresh"
 
 
+Changed = Callable[[str], tuple[str, list[str] | None]]
+"""Gives the newest published commit, and the paths changed since another where that is known."""
+
+
 class Wake:
     """Wakes clusters from a thread of its own; several pushes that come together wake once."""
 
-    def __init__(self, clusters: Mapping[str, Reached]) -> None:
+    def __init__(self, clusters: Mapping[str, Reached], changed: Changed) -> None:
+        self._changed = changed
+        self._told: dict[str, str] = {}
         self._clusters = {name: reached for name, reached in clusters.items() if reached.wake}
         self._catalog: Catalog | None = None
         self._apis: dict[str, Any] = {}
@@ -93,7 +99,7 @@ class Wake:
                         "cluster '%s' was not woken (%s); trying on for a minute, then it fetches "
                         "at its interval",
                         name,
-                        type(error).__name__,
+                        _reason(error),
                     )
         return missed
 
@@ -102,14 +108,36 @@ class Wake:
         return max(0.0, self._woken_at + _SPACING_S - time.monotonic())
 
     def _wake(self, name: str, reached: Reached, catalog: Catalog) -> None:
-        if reached.receiver:
-            request = urllib.request.Request(reached.receiver, data=b"{}", method="POST")  # noqa: S310
-            urllib.request.urlopen(request, timeout=_TIMEOUT_S).close()  # noqa: S310
-            return
+        argocd = catalog.repository.argocd if catalog.repository.gitops == "argocd" else None
+        if argocd and reached.webhook:
+            self._tell(name, reached.webhook, reached, catalog, argocd.url)
+        elif reached.receiver and not argocd:
+            webhook.send(reached.receiver, webhook.to_flux(), reached.secret(), _TIMEOUT_S)
+        elif reached.kubeconfig:
+            self._ask(name, reached, catalog)
+        else:
+            missing = "webhook" if argocd else "receiver"
+            raise NoWay(f"it has neither a kubeconfig nor a {missing}")
+
+    def _tell(self, name: str, url: str, reached: Reached, catalog: Catalog, repo: str) -> None:
+        """Call Argo CD's webhook.
+
+        It looks at those Applications whose folders changed. Each domain's is among them every
+        time: one that is not looked at never says that it has the commit.
+        """
+        before = self._told.get(name, "")
+        commit, paths = self._changed(before)
+        if paths is not None:
+            own = (f"{domain_folder(name, domain)}/" for domain in _domains(name, catalog))
+            paths = [path for path in paths if _concerns(path, name)]
+            paths += [f"{folder}_domain.yaml" for folder in own]
+        call = webhook.to_argocd(repo, before, commit, paths)
+        webhook.send(url, call, reached.secret(), _TIMEOUT_S)
+        self._told[name] = commit
+
+    def _ask(self, name: str, reached: Reached, catalog: Catalog) -> None:
         now = datetime.now(timezone.utc).isoformat()
-        for cluster, domain in domains_in_use(catalog):
-            if cluster != name:
-                continue
+        for domain in _domains(name, catalog):
             self._api(name, reached).patch_namespaced_custom_object(
                 *_asked(domain, catalog.repository, now), _request_timeout=_TIMEOUT_S
             )
@@ -120,6 +148,23 @@ class Wake:
 
             self._apis[name] = client.CustomObjectsApi(reached.client())
         return self._apis[name]
+
+
+def _reason(error: Exception) -> str:
+    """Return why a cluster was not woken: no URL in it, nor anything else that is secret."""
+    if isinstance(error, urllib.error.HTTPError):
+        return f"it answered {error.code}"
+    return str(error) if isinstance(error, NoWay) else type(error).__name__
+
+
+def _domains(cluster: str, catalog: Catalog) -> list[AccessDomain]:
+    return [domain for name, domain in domains_in_use(catalog) if name == cluster]
+
+
+def _concerns(path: str, cluster: str) -> bool:
+    """Tell whether a changed path may matter to a cluster: books and other clusters do not."""
+    first, _, rest = path.partition("/")
+    return rest.startswith(f"{cluster}/") if first == "clusters" else first != "ledger"
 
 
 def _asked(

@@ -11,7 +11,7 @@ from enum import Enum
 from types import MappingProxyType
 
 from generator.demand.lease import Lease
-from generator.demand.request import ConnectionType, InputTopic
+from generator.demand.request import OVERRIDE_PREFIX, ConnectionType, InputTopic
 from generator.demand.route import Route
 
 
@@ -115,6 +115,13 @@ class ConnectionClaim:
 
 
 Claim = ApplicationClaim | ConnectionClaim
+
+KEPT = OVERRIDE_PREFIX
+
+
+def is_kept(claim: Claim) -> bool:
+    """Tell whether an override holds a claim, rather than a demand."""
+    return claim.demand.startswith(KEPT)
 
 
 def demand_id(request: str, requesters: Iterable[str]) -> str:

@@ -9,20 +9,29 @@ this generator, another one or one that was restarted; it may go late by the sla
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
+from datetime import datetime, timedelta, timezone
 
 LONGEST_S = 366 * 24 * 3600
+
+UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
+"""The end of a lease that has not begun: its claim is proposed, and counts from the approval."""
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """How long a claim is to hold from when it is asked for; both in seconds."""
+    """How long a claim is to hold from when it is asked for; both in seconds.
+
+    ``on_approval``: from when it is approved.
+    """
 
     seconds: int
     slack: int = 0
+    on_approval: bool = False
 
     def starting(self, now: datetime) -> Lease:
         """Return the lease of a claim that is asked for at ``now``."""
+        if self.on_approval:
+            return Lease(self.seconds, self.slack, UNSTARTED)
         return Lease(self.seconds, self.slack, now + timedelta(seconds=self.seconds))
 
 
@@ -33,6 +42,15 @@ class Lease:
     seconds: int
     slack: int
     until: datetime
+
+    @property
+    def has_started(self) -> bool:
+        """Tell whether its time runs: what is proposed waits for the approval."""
+        return self.until < UNSTARTED
+
+    def begun(self, now: datetime) -> Lease:
+        """Return the lease with its whole term to run from ``now``."""
+        return Term(self.seconds, self.slack).starting(now)
 
     @property
     def ends(self) -> datetime:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from generator.catalog.catalog import Catalog
 from generator.catalog.policy import AccessDomain, Rule, matches, seconds_of
 from generator.demand.carriers import choose_broker
+from generator.demand.claim import ApplicationClaim
 from generator.demand.lease import Term
 from generator.demand.request import (
     ApplicationDemand,
@@ -31,7 +32,7 @@ def faults(request: DemandRequest, catalog: Catalog) -> Iterator[Fault]:
         return
     for index, app in enumerate(request.applications):
         where = f"applications[{index}]"
-        for node in _places(app, catalog):
+        for node in places(app, catalog):
             domain = catalog.domain_of.get(node)
             if domain is not None:
                 asked = (("applications", app.appdef), ("nodes", node))
@@ -46,7 +47,7 @@ def faults(request: DemandRequest, catalog: Catalog) -> Iterator[Fault]:
             yield from _too_long(request, domain)
 
 
-def _places(app: ApplicationDemand, catalog: Catalog) -> Iterable[str]:
+def places(app: ApplicationDemand | ApplicationClaim, catalog: Catalog) -> Iterable[str]:
     """Return the nodes on which services of an application run: its own, and sources."""
     appdef = catalog.appdefs.get(app.appdef)
     services = appdef.services.values() if appdef else ()
@@ -57,15 +58,23 @@ def _places(app: ApplicationDemand, catalog: Catalog) -> Iterable[str]:
 
 def _connection(where: str, asked: ConnectionDemand, catalog: Catalog) -> Iterator[Fault]:
     mqtt = asked.type == ConnectionType.MQTT.value
-    broker = choose_broker(asked.broker, asked.source, asked.target, catalog) if mqtt else None
-    for node in dict.fromkeys((asked.source, asked.target)):
+    for domain, asks in asked_at_ends(asked.source, asked.target, asked.broker, mqtt, catalog):
+        yield from _unruled(where, asked.requesters, domain, asks)
+
+
+def asked_at_ends(
+    source: str, target: str, wanted_broker: str, mqtt: bool, catalog: Catalog
+) -> Iterator[tuple[AccessDomain, list[tuple[str, str]]]]:
+    """Yield what a connection asks of the access domain of each of its ends."""
+    broker = choose_broker(wanted_broker, source, target, catalog) if mqtt else None
+    for node in dict.fromkeys((source, target)):
         domain = catalog.domain_of.get(node)
         if domain is None:
             continue
         asks = [("nodes", node)]
         if broker is not None:
             asks.append(("brokers", broker.node))
-        yield from _unruled(where, asked.requesters, domain, asks)
+        yield domain, asks
 
 
 def _unruled(
@@ -78,7 +87,7 @@ def _unruled(
     asked = list(asked)
     for index, requester in enumerate(requesters if domain.rules else ()):
         own = [rule for rule in domain.rules if matches(requester, rule.requesters)]
-        misses = [_missing(rule, asked) for rule in own]
+        misses = [missing(rule, asked) for rule in own]
         if own and None in misses:
             continue
         place = f"{where}.requesters[{index}]"
@@ -97,7 +106,7 @@ def _unruled(
         yield fault(place, message, code="not-allowed")
 
 
-def _missing(rule: Rule, asked: Iterable[tuple[str, str]]) -> tuple[str, str] | None:
+def missing(rule: Rule, asked: Iterable[tuple[str, str]]) -> tuple[str, str] | None:
     """Return the first thing asked that a rule does not cover; nothing where it covers all."""
     return next(
         ((kind, value) for kind, value in asked if not matches(value, getattr(rule, kind))), None

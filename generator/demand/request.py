@@ -17,14 +17,18 @@ from generator.demand.lease import LONGEST_S, Term
 from generator.demand.route import Route
 from generator.errors import Fault, fault
 
+OVERRIDE_PREFIX = "override:"
+"""What the demand id of an override's own claim starts with, and no other demand's."""
+
 
 class Operation(Enum):
     """What a request does to the ledger.
 
     The reference's goal joins and shuts down, adding to and taking from what its requesters hold.
     Our own names its demand and puts (replaces), releases or renews it; ``EXPIRE`` is the
-    generator's, for a demand whose lease ran out, ``ROLLBACK`` a person's, to go back to the books
-    of an earlier commit.
+    generator's, for a demand whose lease ran out, ``DECOMMISSION`` its operator's, for a node or a
+    requester that leaves for good, ``ROLLBACK`` a person's, to go back to the books of an earlier
+    commit.
     """
 
     JOIN = "join"
@@ -33,6 +37,7 @@ class Operation(Enum):
     RELEASE = "release"
     RENEW = "renew"
     EXPIRE = "expire"
+    DECOMMISSION = "decommission"
     ROLLBACK = "rollback"
 
     @property
@@ -104,6 +109,15 @@ class ConnectionDemand:
 
 
 @dataclass(frozen=True, slots=True)
+class Leaving:
+    """What is decommissioned: a name, as what (``node``, ``requester``), and who has it done."""
+
+    name: str
+    kinds: frozenset[str]
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class DemandRequest:
     """A whole request: booked as a whole or refused as a whole.
 
@@ -120,6 +134,7 @@ class DemandRequest:
     demand: str = ""
     named_by: tuple[str, ...] = ()
     lease_s: int | None = None
+    leaving: Leaving | None = None
 
     def requesters(self) -> tuple[str, ...]:
         """Return everybody in whose name something is asked, in the order listed, each once."""
@@ -160,6 +175,10 @@ def _named(request: DemandRequest) -> Iterator[Fault]:
     if request.operation.is_reference:
         return
     yield from _id("demand", request.demand)
+    if request.demand.startswith(OVERRIDE_PREFIX):
+        yield fault(
+            "demand", f"starts with '{OVERRIDE_PREFIX}', as overrides do; choose another demand id"
+        )
     if not (request.applications or request.connections):  # else told for each of these
         yield from _requesters("requesters", request.named_by)
     if request.lease_s is not None and not 0 < request.lease_s <= LONGEST_S:

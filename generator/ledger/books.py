@@ -20,6 +20,7 @@ from generator.demand.claim import (
     Subject,
     SubjectKind,
 )
+from generator.demand.lease import UNSTARTED
 from generator.demand.request import ConnectionType
 
 Claims: TypeAlias = "HashTrieMap[str, Claim]"
@@ -126,6 +127,12 @@ class Ledger:
         first = self._claims(_ENDS, min(self.minutes))
         return min(claim.lease.ends for claim in first if claim.lease)
 
+    def unstarted(self) -> tuple[Claim, ...]:
+        """Return the claims whose lease has not begun: approved, and not yet taken in."""
+        later = (minute for minute in self.minutes if minute >= _minute(UNSTARTED))
+        found = (claim for minute in sorted(later) for claim in self._claims(_ENDS, minute))
+        return tuple(claim for claim in found if claim.lease and not claim.lease.has_started)
+
     def ended(self, now: datetime) -> tuple[Claim, ...]:
         """Return the claims whose lease ended before ``now``, the first to end first."""
         over = (minute for minute in self.minutes if minute <= _minute(now))
@@ -148,6 +155,15 @@ class Ledger:
     def at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
         """Return the connections of a type that end at ``node``, sorted."""
         return self._ids("link", kind.name, node)
+
+    def connected(self, node: str) -> tuple[str, ...]:
+        """Return the connections that end at a node or go by a broker that was asked for there."""
+        found = {id for kind in ConnectionType for id in self.at(kind, node)}
+        return tuple(sorted(found | set(self._ids("broker", node))))
+
+    def names(self, entry: str) -> set[str]:
+        """Return what the index has of one kind, the requesters say; costs as much as there is."""
+        return {known[-1] for known in self.index if known[0] == entry}
 
     def get(self, key: ClaimKey) -> Claim | None:
         """Return one claim."""
@@ -209,6 +225,8 @@ def entries(claim: Claim | None) -> set[Entry]:
     else:
         for end in (claim.source, claim.target):
             found.add(("link", claim.type.name, end))
+        if claim.broker:
+            found.add(("broker", claim.broker))
         for route in claim.topics.values():
             _, taking = route.ends(claim.source, claim.target)
             found.add(("brings", taking, route.written))

@@ -25,7 +25,7 @@ from generator.demand.claim import (
     Subject,
     SubjectKind,
 )
-from generator.demand.lease import LONGEST_S, Lease
+from generator.demand.lease import LONGEST_S, UNSTARTED, Lease
 from generator.demand.request import ConnectionType, InputTopic
 from generator.demand.route import Route, RouteOptions
 from generator.errors import InvalidInput, fault
@@ -90,10 +90,11 @@ def _plain_route(value: object) -> object:
 class _Lease(Frozen):
     seconds: int = Field(ge=1, le=LONGEST_S)
     slack: int = Field(default=0, ge=0, le=LONGEST_S)
-    until: Timestamp
+    until: Timestamp | None = None  # not yet: the claim was proposed, and is not taken in
 
     def lease(self) -> Lease:
-        return Lease(self.seconds, self.slack, _time(self.until))
+        until = _time(self.until) if self.until else UNSTARTED
+        return Lease(self.seconds, self.slack, until)
 
 
 class _Claim(Frozen):
@@ -149,8 +150,10 @@ def write(claim: Claim) -> str:
             tail["broker"] = claim.broker
         tail["topics"] = {source: _route(route) for source, route in claim.topics.items()}
     if claim.lease is not None:
-        lease = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
-        tail["lease"] = lease | {"until": _written(claim.lease.until)}
+        lease: dict[str, object] = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
+        if claim.lease.has_started:
+            lease["until"] = _written(claim.lease.until)
+        tail["lease"] = lease
     return yamlio.dump(
         {
             **head,

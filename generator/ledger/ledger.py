@@ -10,6 +10,7 @@ from datetime import datetime
 from generator.demand.request import DemandRequest, Operation
 from generator.ledger import named
 from generator.ledger.books import Changes, ClaimChange, Ledger
+from generator.ledger.decommission import decommission
 from generator.ledger.join import join
 from generator.ledger.release import release
 from generator.ledger.restore import restore
@@ -45,5 +46,7 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
             return named.renew(ledger, request, now)
         case Operation.EXPIRE:
             return named.expire(ledger, request, now)
+        case Operation.DECOMMISSION:
+            return decommission(ledger, request, now)
         case Operation.ROLLBACK:
             return restore(ledger, request, now)

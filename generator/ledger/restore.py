@@ -1,7 +1,9 @@
 """Going back: the claims of an earlier commit, booked again as they stood there.
 
 What was booked since goes only where that is wanted. A claim that comes back has the lease that it
-had, for its full term from now on: with its old end it would be released at once.
+had, for its full term from now on: with its old end it would be released at once. Claims of
+overrides' own are nobody's demand: whether they come or go is settled as after every change
+(:mod:`generator.plan.keeping`).
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from datetime import datetime
 
 from generator.catalog.catalog import Catalog
 from generator.demand import admission, permission
-from generator.demand.claim import ApplicationClaim, Claim
+from generator.demand.claim import ApplicationClaim, Claim, is_kept
 from generator.demand.lease import Lease, Term
 from generator.demand.request import (
     ApplicationDemand,
@@ -53,7 +55,7 @@ def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
     assert isinstance(request, Restoration)  # noqa: S101 - the operation says so
     changes = _changes(ledger, request)
     if not request.drop_newer:
-        newer = [change for change in changes if change.before is not None]
+        newer = [c for c in changes if c.before is not None and not is_kept(c.before)]
         if newer:
             raise Refused(_newer(newer))
     start = ledger
@@ -105,7 +107,7 @@ def _newer(changes: list[ClaimChange]) -> Iterator[Fault]:
 def faults(request: Restoration, ledger: Ledger, catalog: Catalog) -> Iterator[Fault]:
     """Yield why claims that come back are not possible any more, by what is configured now."""
     for change in _changes(ledger, request):
-        if change.after is None:
+        if change.after is None or is_kept(change.after):  # overrides keep or drop their own
             continue
         asked = _asked(change.after)
         for found in (*admission.faults(asked, catalog), *permission.faults(asked, catalog)):

@@ -5,6 +5,7 @@ The view of the paper's Table III, column 4, derived from claims; nothing stores
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from generator.ledger.ledger import Ledger
 from generator.plan.clients import connection_topics
 from generator.plan.planner import all_keys, plan
 from generator.plan.release import ServiceRelease
+from generator.plan.standing import in_force, suspended
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +42,27 @@ class ConnectionEntry:
 
 
 @dataclass(frozen=True, slots=True)
+class SuspendedEntry:
+    """A claim that is booked and not planned, and the override that suspends it."""
+
+    kind: str
+    id: str
+    demand: str
+    requesters: tuple[str, ...]
+    override: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class Bookkeeping:
-    """The whole view: services by release name, connections by id, both sorted."""
+    """The whole view: services by release name, connections by id, both sorted.
+
+    ``suspended`` are the claims that an override keeps from running; they are in neither.
+    """
 
     services: dict[str, ServiceEntry]
     connections: dict[str, ConnectionEntry]
+    suspended: tuple[SuspendedEntry, ...] = ()
 
 
 def bookkeeping(ledger: Ledger, catalog: Catalog) -> Bookkeeping:
@@ -66,19 +84,42 @@ def bookkeeping(ledger: Ledger, catalog: Catalog) -> Bookkeeping:
                 requesters=release.requesters,
             )
     connections = {}
+    standing = in_force(ledger, catalog)
     for id in ledger.subjects(SubjectKind.CONNECTION):
-        claims = ledger.connection(id)
+        claims = standing.connection(id)
+        if not claims:
+            continue
         connections[id] = ConnectionEntry(
             source=claims[0].source,
             target=claims[0].target,
             topics=tuple(connection_topics(claims)),
             requesters=tuple(sorted({who for claim in claims for who in claim.requesters})),
         )
-    return Bookkeeping(services=dict(sorted(services.items())), connections=connections)
+    return Bookkeeping(
+        services=dict(sorted(services.items())),
+        connections=connections,
+        suspended=tuple(_suspended(ledger, catalog)),
+    )
+
+
+def _suspended(ledger: Ledger, catalog: Catalog) -> Iterator[SuspendedEntry]:
+    for claim, override in suspended(ledger, catalog):
+        kind = claim.subject.kind.value[:-1]
+        yield SuspendedEntry(
+            kind,
+            claim.subject.id,
+            claim.demand,
+            claim.requesters,
+            override.path,
+            override.reason,
+        )
 
 
 def as_data(books: Bookkeeping, commit: str) -> dict[str, Any]:
-    """Return the bookkeeping as plain data, the contract of ``bookkeeping --output json``."""
+    """Return the bookkeeping as plain data, the contract of ``bookkeeping --output json``.
+
+    ``suspended`` is there only where something is.
+    """
     data = asdict(books)
     for entry in data["services"].values():
         entry["applications"] = list(entry["applications"])
@@ -86,4 +127,7 @@ def as_data(books: Bookkeeping, commit: str) -> dict[str, Any]:
     for entry in data["connections"].values():
         entry["topics"] = sorted(entry["topics"])
         entry["requesters"] = list(entry["requesters"])
+    held_back = data.pop("suspended")
+    if held_back:
+        data["suspended"] = [one | {"requesters": list(one["requesters"])} for one in held_back]
     return data | {"commit": commit}

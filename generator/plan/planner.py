@@ -11,28 +11,44 @@ from types import MappingProxyType
 
 from generator.catalog.appdef import ApplicationDefinition, Parameter, Service
 from generator.catalog.catalog import Catalog
+from generator.catalog.override import Override
 from generator.catalog.registry import ChartSource
 from generator.demand.claim import ApplicationClaim, Subject, SubjectKind
 from generator.demand.request import InputTopic
 from generator.errors import Refused, fault
 from generator.ledger.ledger import Ledger
-from generator.plan import clients, naming, parameters, scaling
+from generator.plan import clients, naming, overrides, parameters, scaling
 from generator.plan.clients import BridgeKey, EndKey
 from generator.plan.place import place
 from generator.plan.release import Release, ServiceKey, ServiceRelease
+from generator.plan.standing import in_force
 
 ReleaseKey = ServiceKey | EndKey | BridgeKey
 
 
-def keys_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[ReleaseKey]:
-    """Yield what must run because ``subject`` is held."""
+def keys_of(
+    ledger: Ledger, catalog: Catalog, subject: Subject, *, strict: bool = False
+) -> Iterator[ReleaseKey]:
+    """Yield what must run because ``subject`` is held and no override denies it.
+
+    Of an application whose definition is gone nobody can say: nothing, or where ``strict`` it is
+    refused, for what runs must not stop because somebody deleted a file that it still needs.
+    """
+    yield from keys_booked(in_force(ledger, catalog), catalog, subject, strict=strict)
+
+
+def keys_booked(
+    ledger: Ledger, catalog: Catalog, subject: Subject, *, strict: bool = False
+) -> Iterator[ReleaseKey]:
+    """Yield what ``subject`` needs by the claims of ``ledger``, suspended or not."""
     if subject.kind is SubjectKind.CONNECTION:
         yield from clients.keys_of(ledger, subject.id)
         return
     claims = ledger.application(subject.id)
     if not claims:
         return
-    appdef = catalog.appdefs.get(claims[0].appdef)
+    known = strict or claims[0].appdef in catalog.appdefs
+    appdef = _appdef(catalog, claims[0].appdef) if known else None
     for name, service in (appdef.services if appdef else {}).items():
         if service.each is None:
             yield ServiceKey(name, claims[0].node, application=subject.id)
@@ -50,29 +66,52 @@ def keys_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> Iterator[Rele
 def affected(
     before: Ledger, after: Ledger, catalog: Catalog, subjects: Iterable[Subject]
 ) -> tuple[ReleaseKey, ...]:
-    """Return every release that a change of ``subjects`` may have added, altered or removed."""
+    """Return every release that a change of ``subjects`` may have added, altered or removed.
+
+    Raises:
+        Refused: where the definition of what is to run from now on is gone.
+    """
     keys = (
         key
         for subject in subjects
         for ledger in (before, after)
-        for key in keys_of(ledger, catalog, subject)
+        for key in keys_of(ledger, catalog, subject, strict=ledger is after)
     )
     return tuple(dict.fromkeys(keys))
 
 
 def all_keys(ledger: Ledger, catalog: Catalog) -> tuple[ReleaseKey, ...]:
-    """Return every release that the ledger asks for."""
+    """Return every release that the ledger asks for.
+
+    Raises:
+        Refused: where the definition of an application that is held is gone.
+    """
     subjects = [Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)]
-    return tuple(dict.fromkeys(key for s in subjects for key in keys_of(ledger, catalog, s)))
+    keys = (key for s in subjects for key in keys_of(ledger, catalog, s, strict=True))
+    return tuple(dict.fromkeys(keys))
 
 
 def plan(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
-    """Return the release at ``key``, or nothing where no claim needs it.
+    """Return the release at ``key`` as overrides shape it, or nothing where no claim needs it.
 
     Raises:
         Refused: where claims contradict each other in a parameter, or what a claim names is no
             longer in the catalog.
     """
+    ledger = in_force(ledger, catalog)
+    release = _unshaped(ledger, catalog, key)
+    return overrides.shaped(release, ledger, catalog) if release else None
+
+
+def denied(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> tuple[Release, Override] | None:
+    """Return the release that is needed at ``key`` and the override that denies it, or nothing."""
+    ledger = in_force(ledger, catalog)
+    release = _unshaped(ledger, catalog, key)
+    by = overrides.denying(release, ledger, catalog) if release else None
+    return (release, by) if release and by else None
+
+
+def _unshaped(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
     if isinstance(key, EndKey):
         return clients.end(ledger, catalog, key)
     if isinstance(key, BridgeKey):
@@ -237,7 +276,7 @@ def _appdef(catalog: Catalog, name: str) -> ApplicationDefinition:
                     "appdef",
                     f"'{name}' is in use, but appdefs/{name} is gone; restore it",
                     code="unknown-application",
-                )
+                ).within(f"appdefs/{name}/appdef.yaml")
             ]
         )
     return appdef

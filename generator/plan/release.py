@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
 
 from generator.catalog.appdef import Service
+from generator.catalog.catalog import Catalog
 from generator.catalog.inventory import Broker, Node
+from generator.catalog.override import Override
 from generator.catalog.policy import AccessDomain
-from generator.catalog.registry import ChartSource
+from generator.catalog.registry import ChartSource, Image
 from generator.demand.request import ConnectionType, InputTopic
 from generator.demand.route import Route
 
@@ -30,6 +32,41 @@ class ServiceKey:
 
 
 @dataclass(frozen=True, slots=True)
+class Shaping:
+    """The overrides that shape a release with the effects of each, who comes last wins."""
+
+    by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
+
+    def image(self, image: str, catalog: Catalog) -> Image:
+        """Return an image of the registry as the overrides pin it."""
+        found = catalog.images[image]
+        for override, effects in self.by:
+            if "images" in effects and override.images and image in override.images:
+                found = override.images[image].over(found)
+        return found
+
+    @property
+    def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+        """The files that patch values, and their patches."""
+        return tuple(
+            (override.path, override.values or {})
+            for override, effects in self.by
+            if "values" in effects
+        )
+
+    @property
+    def held(self) -> bool:
+        """Whether the release stays as it is rendered: nothing higher than a hold changes it."""
+        held = False
+        for _, effects in self.by:
+            held = "hold" in effects or (held and set(effects) <= {"keep"})
+        return held
+
+
+UNSHAPED = Shaping()
+
+
+@dataclass(frozen=True, slots=True)
 class ServiceRelease:
     """The desired state of one service: one Helm release."""
 
@@ -46,6 +83,7 @@ class ServiceRelease:
     replicas: int
     applications: tuple[str, ...]
     requesters: tuple[str, ...]
+    shaping: Shaping = UNSHAPED
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +99,7 @@ class ConnectionEnd:
     peer: str
     domain: AccessDomain
     topics: Mapping[str, Route]
+    shaping: Shaping = field(default=UNSHAPED, kw_only=True)
 
     def reads(self, route: Route) -> bool:
         """Tell whether this end takes the topic in from ROS, and the other gives it out."""
@@ -115,6 +154,7 @@ class Bridge:
     rates: Mapping[str, float]
     connect: tuple[str, ...]
     listen: tuple[str, ...]
+    shaping: Shaping = UNSHAPED
 
 
 Release = ServiceRelease | MqttEnd | RosEnd | Bridge

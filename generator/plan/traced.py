@@ -55,7 +55,7 @@ class TracedPlan:
                 self._keys[subject] = self._traced(
                     ledger,
                     subject,
-                    lambda seen, of=subject: tuple(keys_of(seen, self._catalog, of)),  # type: ignore[misc]
+                    lambda seen, of=subject: tuple(keys_of(seen, self._catalog, of, strict=True)),  # type: ignore[misc]
                 )
         for subject in [one for one in stale if one in self._keys]:
             if subject not in ledger.claims:

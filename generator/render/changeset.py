@@ -6,7 +6,7 @@ bytes it has already does not appear, so an unchanged release costs no commit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +17,7 @@ from generator.ledger import format as ledger_format
 from generator.ledger.ledger import ClaimChange, Ledger
 from generator.plan.planner import ReleaseKey, plan
 from generator.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
-from generator.render import gitops
+from generator.render import gitops, marking
 from generator.render.check import check_files
 from generator.render.engine import Engine
 from generator.render.paths import path_of
@@ -44,6 +44,10 @@ class Changeset:
 
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
+    overrides: tuple[str, ...] = ()
+    """The files of the overrides that shaped what is written."""
+    waiting: tuple[str, ...] = ()
+    """What does not reach a release, for an override holds it."""
 
 
 def of_change(
@@ -72,34 +76,48 @@ def of_change(
         for change in claims
     }
     releases = []
+    shaped: set[str] = set()
+    waiting: list[str] = []
     for key in keys:
         old, new = _plan_leniently(before, catalog, key), plan(after, catalog, key)
         old_path = path_of(old) if old else None
         new_path = path_of(new) if new else None
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
-        text = gitops.render(new, catalog, engine) if new else None
         standing = read(new_path) if new_path else None
+        waiting += _waiting(old, new) if standing is not None else ()
+        text = marking.text_of(new, catalog, engine, standing) if new else None
         if new_path and text != standing:
             files[new_path] = text
+            shaped |= {override.path for override, _ in new.shaping.by} if new else set()
         if text is not None and text == standing:
             continue
         if old or new:
             releases.append(described(old, new, standing is not None))
     check_files(files)
-    return Changeset(files=files, releases=tuple(sorted(releases, key=_order)))
+    told = tuple(sorted(releases, key=_order))
+    return Changeset(files, told, tuple(sorted(shaped)), tuple(waiting))
 
 
 def render_all(
-    ledger: Ledger, catalog: Catalog, engine: Engine, keys: Iterable[ReleaseKey]
+    ledger: Ledger,
+    catalog: Catalog,
+    engine: Engine,
+    keys: Iterable[ReleaseKey],
+    standing: Mapping[str, str],
 ) -> dict[str, str]:
-    """Return every generated file below ``clusters/`` that ledger and catalog ask for."""
+    """Return every generated file that ledger and catalog ask for.
+
+    Args:
+        standing: the generated files as they are, of which overrides may hold some.
+    """
     files = gitops.standing_files(catalog, engine)
     for key in keys:
         release = plan(ledger, catalog, key)
         if release is not None:
-            files[path_of(release)] = gitops.render(release, catalog, engine)
-    return files
+            path = path_of(release)
+            files[path] = marking.text_of(release, catalog, engine, standing.get(path))
+    return files | marking.charts_kept(files, standing, catalog)
 
 
 def _plan_leniently(ledger: Ledger, catalog: Catalog, key: ReleaseKey) -> Release | None:
@@ -115,7 +133,7 @@ def _order(change: ReleaseChange) -> tuple[int, str]:
 
 
 def described(old: Release | None, new: Release | None, stood: bool) -> ReleaseChange:
-    """Return how a release differs; ``stood`` tells whether its file was there before."""
+    """Return in words what becomes of a release; ``stood``: there is a file of it."""
     release = new or old
     assert release is not None  # noqa: S101 - the caller has one of them
     if isinstance(release, ServiceRelease):
@@ -134,11 +152,26 @@ def described(old: Release | None, new: Release | None, stood: bool) -> ReleaseC
 
 
 def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
-    before, after = _facts(old), _facts(new)
+    held = new is not None and new.shaping.held  # nothing else reaches its file
+    before, after = _overrides(old), _overrides(new)
+    before, after = (before, after) if held else (_facts(old) + before, _facts(new) + after)
     known, wanted = frozenset(before), frozenset(after)
     gone = [f"- {fact}" for fact in before if fact not in wanted]
     come = [f"+ {fact}" for fact in after if fact not in known]
     return (*gone, *come)
+
+
+def _waiting(old: Release | None, new: Release | None) -> Iterator[str]:
+    """Yield a warning where a release that is held would otherwise change."""
+    if new is None or not new.shaping.held or _facts(old) == _facts(new):
+        return
+    by = " and ".join(one.path for one, effects in new.shaping.by if "hold" in effects)
+    yield f"{new.name} is held by {by}, so what is asked of it waits until it is let go"
+
+
+def _overrides(release: Release | None) -> list[str]:
+    by = release.shaping.by if release is not None else ()
+    return [f"{override.path}: {', '.join(effects)}" for override, effects in by]
 
 
 def _facts(release: Release | None) -> list[str]:

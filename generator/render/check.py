@@ -19,6 +19,7 @@ import kubernetes_validate
 from generator import yamlio
 from generator.catalog.catalog import Catalog
 from generator.catalog.model import field_path
+from generator.catalog.override import OVERRIDES_ROOT
 from generator.catalog.registry import ChartSource
 from generator.errors import Fault, InvalidInput, fault
 
@@ -38,7 +39,8 @@ def check_values(
     As Helm does it: laid over the chart's defaults, for a schema may require what has one.
 
     Raises:
-        InvalidInput: naming the values template and each value that does not fit.
+        InvalidInput: naming the values template, or the override that patches them, and each value
+            that does not fit.
     """
     schema = catalog.files.get(f"{chart.folder}/values.schema.json") if chart.folder else None
     if schema is None:
@@ -56,10 +58,11 @@ def check_values(
     except InvalidInput as error:
         raise InvalidInput(yamlio.faults_in(error, file)) from None
     whole = _laid_over(defaults, values)
+    origin = "the override" if template.startswith(f"{OVERRIDES_ROOT}/") else "the template"
     faults = [
         fault(
             f"values.{path}" if path else "values",
-            f"{message}; mend the template or {chart.folder}",
+            f"{message}; mend {origin} or {chart.folder}",
         ).within(template)
         for path, message in _problems(validator, whole)
     ]

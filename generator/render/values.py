@@ -6,25 +6,45 @@ Requesters are no part of it.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 from generator.catalog.catalog import Catalog
 from generator.catalog.inventory import Node
+from generator.catalog.override import merged
+from generator.errors import Fault, InvalidInput
 from generator.plan.release import ServiceRelease
 from generator.render.check import check_values
 from generator.render.engine import Engine
 
 
 def values_of(release: ServiceRelease, catalog: Catalog, engine: Engine) -> dict[str, Any]:
-    """Return what the chart of a service is installed with.
+    """Return what the chart of a service is installed with, overrides' patches laid over.
 
     Raises:
-        InvalidInput: where the template fails or the values break the chart's schema.
+        InvalidInput: where the template fails, or the values break the chart's schema; it names
+            the template or the override.
     """
     template = catalog.values_template(release.appdef, release.service)
-    values = engine.data(template, **_context(release, catalog))
-    check_values(values, release.chart, catalog, template)
+    try:
+        values = engine.data(template, **_context(release, catalog))
+        check_values(values, release.chart, catalog, template)
+    except InvalidInput as error:
+        raise InvalidInput(_told_of_overrides(error, release)) from None
+    for file, patch in release.shaping.patches:
+        values = merged(values, patch)
+        check_values(values, release.chart, catalog, file)
     return values
+
+
+def _told_of_overrides(error: InvalidInput, release: ServiceRelease) -> Iterable[Fault]:
+    """Yield faults of a template, which may be an override's that gives it other things."""
+    giving = {"version", "images", "replicas", "node"}
+    files = [one.path for one, effects in release.shaping.by if giving & {*effects}]
+    note = f" (it is given what {' and '.join(files)} say; it may be for those to mend)"
+    for found in error.faults:
+        yield replace(found, message=found.message + note) if files else found
 
 
 def _context(release: ServiceRelease, catalog: Catalog) -> dict[str, object]:
@@ -41,7 +61,9 @@ def _context(release: ServiceRelease, catalog: Catalog) -> dict[str, object]:
         },
         "outputs": dict(release.outputs),
         "parameters": dict(release.parameters),
-        "images": {name: catalog.images[name].parts() for name in release.service.images},
+        "images": {
+            name: release.shaping.image(name, catalog).parts() for name in release.service.images
+        },
         "replicas": release.replicas,
     }
     if release.key.application is not None:

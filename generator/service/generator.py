@@ -11,6 +11,8 @@ from pathlib import Path
 from generator import settings
 from generator.catalog.catalog import Catalog
 from generator.errors import DemandOpsError, ShuttingDown, StateRepoError
+from generator.service import following
+from generator.service.approval import Approvals
 from generator.service.settling import Settler
 from generator.service.ticket import Listener, Ticket, handed_in
 from generator.service.waiting import Waiting
@@ -35,9 +37,9 @@ class Generator:
         queue_limit: int = settings.QUEUE_LIMIT,
         patient: bool = True,
         with_targets: bool = False,
+        fetch_interval: float = 0.0,
         signing_key: Path | None = None,
         progress: Progress = lambda done, total: None,
-        on_published: Callable[[Catalog], None] = lambda catalog: None,
     ) -> None:
         """Open the state repo and start the worker; what an earlier run left over comes first.
 
@@ -47,10 +49,10 @@ class Generator:
             queue_limit: how many demands may wait.
             patient: whether to start while the remote is away, from what was fetched last.
             with_targets: whether receipts say which releases a demand needs.
+            fetch_interval: seconds between two looks at what others published, while no demand
+                comes; 0: a repository on this disk only, and seldom.
             signing_key: an SSH key that signs the commits (:mod:`generator.staterepo.signing`).
             progress: told (files read, files in all) while the ledger is loaded.
-            on_published: called in the worker thread after every push, with the catalog in force;
-                must return at once.
 
         Raises:
             StateRepoError, InvalidInput: where the state repo or the key cannot be used.
@@ -69,9 +71,18 @@ class Generator:
         self.address = repository.address
         self.queue_limit = queue_limit
         self._waiting = Waiting(self._slot.outbox, queue_limit)
-        self._watchers = [on_published]
+        self._watchers: list[Callable[[Catalog], None]] = []
+        self._approvals = Approvals(
+            repository, self._waiting, with_targets, settings.forge_token_file()
+        )
         self._settler = Settler(
-            repository, snapshot, self._waiting, self._tell_watchers, with_targets
+            repository,
+            snapshot,
+            self._waiting,
+            self._tell_watchers,
+            with_targets,
+            self._approvals,
+            fetch_interval,
         )
         self._finished: Future[bool] | None = None
         self._stop_lock = threading.Lock()
@@ -84,6 +95,15 @@ class Generator:
     def snapshot(self) -> Snapshot:
         """The newest published state; safe to read from any thread."""
         return self._settler.snapshot
+
+    @property
+    def condition(self) -> following.Condition:
+        """How it is with the state repo; safe to read from any thread."""
+        return following.condition(self._settler.follower.link, self.snapshot, self._waiting)
+
+    def look(self) -> None:
+        """Have the state repo looked at now, for somebody pushed to it; from any thread."""
+        self._settler.follower.nudge()
 
     def submit(
         self,
@@ -115,12 +135,27 @@ class Generator:
         """Tell whether ``commit`` is ``other`` or comes after it; from any thread."""
         return self._repository.includes(commit, other)
 
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Tell whether two commits hold the same under ``path``; from any thread."""
+        return self._repository.unchanged(commit, other, path)
+
+    def changed(self, since: str) -> tuple[str, list[str] | None]:
+        """Return the newest published commit and which paths changed since another.
+
+        The paths are None where that other is not known. From any thread.
+        """
+        commit = str(self.snapshot.commit)
+        return commit, self._repository.changed(since, commit)
+
     def withdraw(self, operation: str) -> bool:
         """Take a demand back. False once it is committed, or was never known."""
         return self._waiting.withdraw(operation)
 
     def watch(self, on_published: Callable[[Catalog], None]) -> None:
-        """Have ``on_published`` called as well after every push, in the worker thread."""
+        """Have ``on_published`` called after every push, in the worker thread.
+
+        It is given the catalog in force and must return at once.
+        """
         self._watchers.append(on_published)
 
     def _tell_watchers(self, catalog: Catalog) -> None:
@@ -168,10 +203,11 @@ class Generator:
                 self._settler.take_up(batch)
                 if not batch:
                     self._settler.notice()
-                    continue
-                self._settler.settle(batch)
-                self._settler.catch_up()
-                self._settler.tidy()
+                else:
+                    self._settler.settle(batch)
+                    self._settler.catch_up()
+                    self._settler.tidy()
+                self._settler.attend()
             except ShuttingDown as error:
                 self._waiting.fail(batch, error, keep=True)
             except DemandOpsError as error:
@@ -180,3 +216,4 @@ class Generator:
                 log.exception("a fault of the generator")
                 told = StateRepoError(f"a fault of the generator: {error!r}; its log says more")
                 self._waiting.fail(batch, told)
+        self._approvals.suspend()

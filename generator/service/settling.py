@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 from generator.catalog.catalog import Catalog
 from generator.decision import Decision, Outcome, decide
+from generator.demand import leaving
 from generator.demand.request import DemandRequest, Operation
 from generator.errors import (
     DemandOpsError,
@@ -28,7 +29,10 @@ from generator.errors import (
     fault,
 )
 from generator.service import rollback
+from generator.service.approval import GIVEN_UP, Approvals, Deferred
 from generator.service.expiry import LeaseClock
+from generator.service.following import Follower
+from generator.service.overriding import OverrideClock
 from generator.service.targets import of_decision as targets_of
 from generator.service.throttle import Throttle
 from generator.service.ticket import Receipt, Ticket
@@ -53,7 +57,7 @@ _TIDY_EVERY = 300
 _LONGEST_WAIT_S = 60.0
 """Between two looks at the leases: a clock may be set meanwhile."""
 
-_Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError]
+_Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Deferred]
 
 
 class Settler:
@@ -69,8 +73,11 @@ class Settler:
         waiting: Waiting,
         on_published: Callable[[Catalog], None],
         with_targets: bool,
+        approvals: Approvals,
+        fetch_interval: float = 0.0,
     ) -> None:
         self.snapshot = snapshot
+        self._approvals = approvals
         self._repository = repository
         self._waiting = waiting
         self._on_published = on_published
@@ -78,25 +85,33 @@ class Settler:
         self._since_tidy = 0
         self._throttle = Throttle()
         self._clock = LeaseClock()
+        self._overrides = OverrideClock()
         self._tried: dict[str, datetime] = {}
         self._ahead = Ahead()
         self._giving_up = threading.Event()
         embedded = repository.always_current
+        self.follower = Follower(repository, waiting, fetch_interval, self._line, self._taken)
         self._batch_limit = _BATCH_LIMIT_EMBEDDED if embedded else _BATCH_LIMIT_REMOTE
 
     def give_up(self) -> None:
         """Stop waiting for a remote that is away; from any thread."""
         self._giving_up.set()
+        self.follower.give_up()
         self._repository.give_up()
+        self._waiting.wake()
 
     def take_up(self, batch: list[Ticket]) -> None:
         """Move what waits into ``batch``, and behind it the demands whose lease ran out.
 
         A renewal that waits was received before: it is judged first, or nothing expires yet.
         """
-        self._waiting.take_up(batch, self._batch_limit)
+        self._take_up(batch)
         if not self._waiting.anything:
             batch += self.expired()
+
+    def _take_up(self, batch: list[Ticket]) -> None:
+        self._waiting.take_up(batch, self._batch_limit)
+        self._approvals.resume(batch, self.snapshot.state)
 
     def settle(self, batch: list[Ticket]) -> None:
         """Bring a batch to an end, with what comes in while the remote moves, and empty it.
@@ -111,15 +126,19 @@ class Settler:
         stale = False
         while batch:
             try:
-                if stale:
+                # of a remote that is away nothing is judged: what is committed stays in
+                if stale or self.follower.link.is_away:
                     self._repository.refresh()
                     stale, verdict_is_current = False, True
                 self._waiting.dismiss_withdrawn(batch)
                 part = batch[:share]
+                self._approvals.give_up(part, self.snapshot.state)
                 line = self._line()
                 arrived = self._arrived(line.start, part)
                 began = time.monotonic()
-                results = [(ticket, self._judge(line, ticket, arrived)) for ticket in part]
+                results: list[_Result] = []
+                for ticket in part:
+                    results.append((ticket, self._judge(line, ticket, arrived, results)))
                 judged = time.monotonic()
                 nothing_to_push = line.head.commit == line.start.commit
                 if nothing_to_push and not verdict_is_current:
@@ -129,7 +148,7 @@ class Settler:
                     if tip != line.start.commit:
                         continue
                 if self._publish(line, results):
-                    self._waiting.answer(results)
+                    self._answer(results)
                     del batch[: len(part)]
                     pause, away, share = _FIRST_PAUSE_S, _FIRST_PAUSE_S, self._batch_limit
                     continue
@@ -142,19 +161,61 @@ class Settler:
                 stale, away = True, _FIRST_PAUSE_S
             except RemoteAway as error:
                 _doubt(batch, self.snapshot)
+                self.follower.out_of_touch(error)
                 verdict_is_current = self._repository.always_current
                 wait, away = away, min(away * 2, _LONGEST_PAUSE_S)
-                log.warning("%s; trying again in %.1f s", error, wait)
             # waited before the fetch: what is judged then is pushed while it is fresh
-            if self._giving_up.wait(wait * random.uniform(0.5, 1.0)):  # noqa: S311 - no secret
+            self._linger(batch, wait * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
+            if self._giving_up.is_set():
                 raise ShuttingDown(
                     "the remote is away; the demand stays in the outbox for the next start"
                 )
-            self._waiting.take_up(batch, self._batch_limit)
+            self._take_up(batch)
+
+    def _answer(self, results: list[_Result]) -> None:
+        """Answer what is settled; what needs approval waits on."""
+        told = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
+        self._waiting.answer(told)
+        for ticket, result in results:
+            if isinstance(result, Deferred):
+                self._approvals.take(ticket, result.decision)
+
+    def attend(self) -> None:
+        """Look after the demands that await approval, with main as it is now."""
+        if not self._approvals.is_due(str(self.snapshot.commit)):
+            return
+        try:
+            heads = self._approvals.heads()
+            if heads.main != str(self.snapshot.commit):
+                self._repository.refresh()
+                self.follower.catch_up()
+            # a branch that is gone may have been merged: only a newer main tells
+            if self._repository.includes(str(self.snapshot.commit), heads.main):
+                self._approvals.look(self.snapshot, heads)
+        except (RemoteAway, PushDenied) as error:
+            log.warning("%s; the demands that await approval wait on", error)
+
+    def _linger(self, batch: list[Ticket], seconds: float) -> None:
+        """Let a while pass; demands that come in meanwhile are kept, and told why they wait."""
+        end = time.monotonic() + seconds
+        told = list(batch)
+        while not self._giving_up.is_set():
+            if self.follower.link.is_away:
+                for ticket in told:
+                    ticket.tell("away", f"waiting: {self.follower.link.contact.trouble}")
+            self._waiting.dismiss_withdrawn(batch)
+            left = end - time.monotonic()
+            if left <= 0:
+                return
+            told = self._waiting.keep(left)
 
     def pause(self) -> float:
-        """Return the seconds after which to look at the leases again."""
-        return self._clock.pause(self.snapshot.state.ledger, _LONGEST_WAIT_S)
+        """Return the seconds until leases, overrides, proposals or the state repo are due."""
+        state = self.snapshot.state
+        ends = self._clock.pause(state.ledger, self._approvals.pause(_LONGEST_WAIT_S))
+        ends = self._overrides.pause(state.catalog, _now(), ends)
+        look = self.follower.pause()
+        return ends if look is None else min(ends, look)
 
     def expired(self) -> list[Ticket]:
         """Return a ticket for each demand whose lease ran out; nobody waits for its receipt.
@@ -180,18 +241,13 @@ class Settler:
     def catch_up(self) -> None:
         """Try again what people changed and could not be carried out: a release may allow it."""
         if self.snapshot.problems:
-            self._take_in()
+            self.follower.catch_up()
 
     def notice(self) -> None:
-        """Take in what others published in a repository on this disk: its leases end here too."""
-        if self._repository.always_current and self._repository.tip() != self.snapshot.commit:
-            self._take_in()
-
-    def _take_in(self) -> None:
-        """Bring the snapshot to the newest tip, and publish what follows from people's changes."""
-        line = self._line()
-        if line.publish():
-            self._taken(line)
+        """Take in what others published, while no demand comes, and end overrides."""
+        due = self._overrides.anything(self.snapshot.state.catalog, _now())
+        if not self.follower.notice(self.snapshot, due):
+            self._overrides.put_off(_now())
 
     def tidy(self) -> None:
         """Every few hundred commits: a demand leaves some twenty loose objects behind."""
@@ -205,16 +261,18 @@ class Settler:
             published = line.publish()
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
+            self.follower.link.denied(str(error))
             return True
         if not published:
             return False
+        self.follower.in_touch(pushed=line.head.commit != line.start.commit)
         self._taken(line)
         self._since_tidy += len(results)
         return True
 
     def _taken(self, line: writer.Line) -> None:
-        self.snapshot = line.head
-        if line.head.commit != line.start.commit:
+        before, self.snapshot = self.snapshot, line.head
+        if line.head.commit != before.commit:  # a merge may ask for no commit of our own
             self._on_published(line.head.state.catalog)
 
     def _line(self) -> writer.Line:
@@ -222,22 +280,32 @@ class Settler:
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems:
-            return writer.Line(self._repository, before)
+            line = writer.Line(self._repository, before)
+            self._overrides.end(line, _now())
+            return line
         advance = self._ahead.advance(self._repository.objects, before, tip)
         line = writer.Line(self._repository, advance.snapshot)
         line.follow(advance, before, _now())
-        for found in line.head.problems:
-            log.error("%s (its last valid version stays in force)", found)
+        self.follower.tell(line.head.problems)
+        self._overrides.end(line, _now())
         return line
 
     def _judge(
-        self, line: writer.Line, ticket: Ticket, arrived: dict[str, history.Arrival]
-    ) -> Receipt | DemandOpsError:
+        self,
+        line: writer.Line,
+        ticket: Ticket,
+        arrived: dict[str, history.Arrival],
+        earlier: list[_Result],
+    ) -> Receipt | DemandOpsError | Deferred:
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
         if ticket.operation in arrived:
             return _published_before(ticket, arrived[ticket.operation])
         try:
+            gone = self._approvals.gave_up(ticket, line.head.state, earlier)
+            earlier[:] = [
+                (t, Withdrawn(GIVEN_UP) if t.operation in gone else r) for t, r in earlier
+            ]
             goal = ticket.goal
             if rollback.is_rollback(goal):
                 goal = rollback.understood(goal, self._repository, line.start)
@@ -251,12 +319,18 @@ class Settler:
                     request, catalog, ticket.operation, ticket.received
                 ),
             )
+            if decision.approval:
+                return Deferred(decision)
             if not self._waiting.hold(ticket):
                 return Withdrawn(TAKEN_BACK)
+            self._approvals.replaced_by(decision.request)
             before = line.head.state.ledger
             targets = targets_of(before, decision) if self._with_targets else ()
             return replace(_commit(line, ticket, decision), targets=targets)
         except InvalidInput as error:
+            if self._approvals.released(ticket):  # what was proposed, and nothing else
+                line.note(ticket.operation, "Unchanged")
+                return _released(ticket, str(line.head.commit))
             line.note(ticket.operation, "Refused")
             return error
         except SigningFailed as error:
@@ -292,6 +366,7 @@ def _commit(line: writer.Line, ticket: Ticket, decision: Decision) -> Receipt:
         warnings=decision.warnings,
         not_held=decision.changes.not_held,
         lease_s=decision.lease_s,
+        changes=decision.changes.claims,
     )
 
 
@@ -301,13 +376,20 @@ def _published_before(ticket: Ticket, arrival: history.Arrival) -> Receipt | Dem
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal if isinstance(ticket.goal, dict) else {}
     gives_up = goal.get("shutdown") or goal.get("operation") == Operation.RELEASE.value
+    gives_up = gives_up or leaving.is_leaving(goal)
     outcome: Outcome = "released" if gives_up else "booked"
     if rollback.is_rollback(goal):
         outcome = "restored"
     if arrival.outcome == "unchanged":
         outcome = "unchanged"
-    name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
+    name = goal.get("id") or goal.get("request") or goal.get("demand") or goal.get("name") or ""
     return Receipt(ticket.operation, str(name), outcome, arrival.commit)
+
+
+def _released(ticket: Ticket, commit: str) -> Receipt:
+    goal = ticket.goal
+    name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
+    return Receipt(ticket.operation, str(name), "released", commit)
 
 
 def _doubt(batch: list[Ticket], start: Snapshot) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from generator.cluster.health import Place, Target
+from generator.catalog.repository import Repository
+from generator.cluster.health import Named, Place, Target
 from generator.decision import Decision, State
 from generator.demand.claim import Subject, SubjectKind
 from generator.demand.request import DemandRequest
@@ -10,6 +11,7 @@ from generator.errors import Refused
 from generator.ledger.ledger import Ledger
 from generator.plan.planner import ReleaseKey, affected, all_keys, keys_of, plan
 from generator.plan.release import Release, ServiceRelease
+from generator.render.argocd import project_of
 
 
 def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
@@ -31,7 +33,7 @@ def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
                 continue
         release = new or old
         if release is not None:
-            found.append(_target(release, wanted=new is not None))
+            found.append(_target(release, catalog.repository, wanted=new is not None))
     return tuple(dict.fromkeys(found))
 
 
@@ -41,7 +43,8 @@ def of_state(state: State) -> list[tuple[Release, Target]]:
     for key in all_keys(state.ledger, state.catalog):
         release = plan(state.ledger, state.catalog, key)
         if release is not None:
-            found.append((release, _target(release, wanted=True)))
+            target = _target(release, state.catalog.repository, wanted=True)
+            found.append((release, target))
     return sorted(found, key=lambda pair: (pair[1].place.cluster, pair[1].name))
 
 
@@ -53,6 +56,9 @@ def _asked(request: DemandRequest, ledger: Ledger) -> list[Subject]:
     return subjects
 
 
-def _target(release: Release, *, wanted: bool) -> Target:
-    place = Place(release.node.cluster, release.domain.name, release.domain.namespace)
+def _target(release: Release, repository: Repository, *, wanted: bool) -> Target:
+    domain, over = release.domain, None
+    if repository.gitops == "argocd" and repository.argocd:
+        over = Named(repository.argocd.namespace, project_of(domain, repository))
+    place = Place(release.node.cluster, domain.name, domain.namespace, over)
     return Target(place, release.name, isinstance(release, ServiceRelease), wanted)

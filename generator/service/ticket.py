@@ -8,18 +8,20 @@ import re
 import uuid
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from typing import Any, Literal
 
 from generator.cluster.health import Target
 from generator.decision import Outcome
 from generator.errors import Refused, fault
+from generator.ledger.ledger import ClaimChange
 from generator.staterepo.outbox import Entry
 
 log = logging.getLogger("demandops")
 
-Stage = Literal["admitted", "booked", "committed", "pushed"]
+Stage = Literal["away", "admitted", "booked", "committed", "proposed", "pushed"]
+"""``away``: the state repo cannot be reached or takes nothing for now; the text says why."""
 Listener = Callable[[Stage, str], None]
 
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
@@ -31,7 +33,8 @@ class Receipt:
 
     ``commit`` is the tip where the demand changed nothing. ``lease_s`` is for how many seconds
     it holds unless it is renewed, nothing where it has no end. ``targets`` are the releases that
-    it needs or gave up, where the generator was asked to say so.
+    it needs or gave up, where the generator was asked to say so. ``changes`` are the claims that it
+    changed; none where that was published before and nobody could be told.
     """
 
     operation: str
@@ -42,6 +45,24 @@ class Receipt:
     not_held: tuple[str, ...] = ()
     lease_s: int | None = None
     targets: tuple[Target, ...] = ()
+    changes: tuple[ClaimChange, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What the journal keeps of a proposal: enough to take it up again.
+
+    ``commits`` are those that the branch was put to or is about to be, the newest last, and
+    ``base`` the main below the newest. ``pushed`` tells that the branch was there once, ``link``
+    where the server says that a person finds it, ``withdrawn`` why it is to go, where it is.
+    """
+
+    branch: str
+    commits: tuple[str, ...] = ()
+    base: str = ""
+    pushed: bool = False
+    link: str = ""
+    withdrawn: str = ""
 
 
 @dataclass(eq=False)
@@ -61,15 +82,17 @@ class Ticket:
     maybe_published: bool = False
     state: Literal["waiting", "committed", "withdrawn", "done"] = "waiting"
     told: set[str] = field(default_factory=set)
+    proposal: Record | None = None
 
     def __post_init__(self) -> None:
         self.future.set_running_or_notify_cancel()  # `withdraw` takes a demand back, not cancel
 
     def tell(self, stage: Stage, text: str) -> None:
-        """Tell a stage once, also where the demand is judged again."""
-        if stage in self.told:
+        """Tell a stage once, also where the demand is judged again; of a proposal each news."""
+        news = text if stage == "proposed" else stage
+        if news in self.told:
             return
-        self.told.add(stage)
+        self.told.add(news)
         try:
             self.listener(stage, text)
         except Exception:
@@ -82,7 +105,8 @@ class Ticket:
 
     def entry(self) -> Entry:
         """Return what the outbox keeps of it."""
-        return Entry(self.operation, self.goal, self.received.isoformat(), self.base)
+        kept = asdict(self.proposal) if self.proposal else None
+        return Entry(self.operation, self.goal, self.received.isoformat(), self.base, kept)
 
 
 def handed_in(goal: object, operation: str | None, listener: Listener) -> Ticket:
@@ -107,4 +131,7 @@ def left_over(entry: Entry) -> Ticket:
     received = datetime.fromisoformat(entry.received)
     ticket = Ticket(entry.operation, entry.goal, received, lambda stage, text: None)
     ticket.doubt(entry.base)
+    if entry.proposal is not None:
+        kept = entry.proposal
+        ticket.proposal = Record(**{**kept, "commits": tuple(kept["commits"])})
     return ticket

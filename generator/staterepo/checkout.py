@@ -1,73 +1,120 @@
 """A checked-out state repo, as a person edits it: is what they are about to merge sound?
 
-Compared with the commit that it started from: generated files are not edited by hand, and a chart
-that changed has a new version, for Flux and Argo CD go by the version alone.
+Compared with the commit that the edit started from: all is valid and renders, generated files are
+not edited by hand, and a chart that changed has a new version, for Flux and Argo CD go by the
+version alone. Beside the faults stands what merging would do, to the desired state and to the
+bookkeeping.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from pathlib import Path
-
-import pygit2
-from pygit2 import Commit, Repository
 
 from generator import yamlio
 from generator.catalog.catalog import CONFIG_ROOTS, Catalog
 from generator.catalog.loading import load
+from generator.catalog.override import written
+from generator.catalog.repository import ROOT_FILE
 from generator.decision import State, rehearse, rendered
-from generator.errors import Fault, InvalidInput, StateRepoError, fault
+from generator.errors import Fault, InvalidInput, fault
 from generator.ledger import format as ledger_format
+from generator.ledger import markers
 from generator.ledger.ledger import Ledger
-from generator.settings import GENERATED_ROOTS, MAIN_BRANCH
-from generator.staterepo import snapshot as snapshots
+from generator.plan.bookkeeping import bookkeeping
+from generator.plan.difference import EntryChange, difference
+from generator.plan.following import due, taken_in
+from generator.plan.planner import ReleaseKey
+from generator.plan.release import Release
+from generator.plan.survey import survey, warnings
+from generator.render import consequence as consequences
+from generator.render.consequence import Consequence
+from generator.render.handedit import Suggestion
+from generator.settings import GENERATED_ROOTS, RENDER_VERSION
+from generator.staterepo import handedits
 from generator.staterepo import tree as trees
-
-_UPSTREAM = f"refs/remotes/origin/{MAIN_BRANCH}"
+from generator.staterepo.worktree import Base, author_of, base_of, files_of
 
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What a check found: faults to mend, and generated files that the generator will rewrite."""
+    """What a check found.
+
+    ``consequence`` is missing where the files are not valid; ``books`` is missing there too, and
+    where there is nothing valid to compare with. ``base`` is what was compared with, if anything;
+    where its own files are not valid (``base_in_force``), the last valid ones stand in. What is in
+    ``warnings`` is no fault and may still not be meant.
+    """
 
     faults: tuple[Fault, ...]
-    outdated: tuple[str, ...]
+    suggestions: tuple[Suggestion, ...] = ()
+    consequence: Consequence | None = None
+    books: tuple[EntryChange, ...] | None = None
+    base: str | None = None
+    base_in_force: bool = True
+    warnings: tuple[Fault, ...] = ()
 
 
-def check(folder: Path, base: str | None = None) -> Checked:
-    """Check the files of a folder, and that everything renders.
+def check(folder: Path, base: str | None = None, now: datetime | None = None) -> Checked:
+    """Check the files of a folder, that everything renders, and what follows from the edit.
 
     Args:
         folder: a checked-out state repo, or an unpacked one without Git.
-        base: the commit that the edit started from; where left out, where it left origin/main,
-            or else HEAD.
+        base: what the edit is to be merged into; by default ``origin/main``, or ``main``. It is
+            compared with where the work tree left that.
+        now: overrides that ended by then are not tried; the time of the day where left out.
 
     Raises:
-        StateRepoError: where it is no state repo, or ``base`` is no commit.
+        StateRepoError: where it is no state repo, or ``base`` is no commit, or the clone is too
+            shallow to tell.
     """
-    if not (folder / "demandops.yaml").is_file():
-        raise StateRepoError(
-            f"{folder} is no state repo, for it has no demandops.yaml; `demandops init` makes one"
-        )
-    files = dict(_texts(folder))
-    before = _base_files(folder, base)
-    faults = [] if before is None else list(_hand_edits(files, before))
+    files, faults = files_of(folder)
+    start = base_of(folder, base)
+    before = start.files if start else files
+    ledger = _ledger(files, faults)
+    found = Checked((), base=start.commit if start else None)
+    found = replace(found, base_in_force=start is None or start.in_force)
+    edited = handedits.edited(files, before)
     try:
-        catalog = load({p: t for p, t in files.items() if p.split("/")[0] in CONFIG_ROOTS})
-        if before is not None:
-            faults += _unversioned_charts(catalog, files, before)
-        state = State.of(catalog, _ledger(files, faults))
-        rehearse(state)
-        wanted = rendered(state)
+        moment = now or datetime.now(timezone.utc)
+        state = _state(files, before, ledger, faults, moment)
+        claims = [path for path in {*files, *before} if files.get(path) != before.get(path)]
+        state = _taken_in(state, start, claims, files, moment)
+        standing = {
+            path: text
+            for path, text in before.items()
+            if _generated(path) and not trees.is_note(path)
+        }
+        wanted = _wanted(state, standing, claims)
     except InvalidInput as error:
-        return Checked((*faults, *error.faults), ())
-    outdated = tuple(
-        path
-        for path in sorted({*wanted, *(p for p in files if p.split("/")[0] in GENERATED_ROOTS)})
-        if wanted.get(path) != files.get(path) and not trees.is_note(path)
+        refused, suggested = _hand_edits(folder, files, start, edited)
+        faults += error.faults
+        return replace(found, faults=_ordered([*faults, *refused]), suggestions=suggested)
+    # what the generator would write all the same is no edit: a proposal of its own, an upgrade
+    edited = [
+        path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
+    ]
+    refused, suggested = _hand_edits(folder, files, start, edited)
+    new = consequences.releases_of(state.ledger, state.catalog)
+    old = new if start is None else _releases(start)
+    return replace(
+        found,
+        faults=_ordered([*faults, *refused]),
+        suggestions=suggested,
+        consequence=consequences.consequence(old, new, standing, wanted),
+        books=_books(start, state),
+        warnings=_warnings(state, moment),
     )
-    return Checked(tuple(faults), outdated)
+
+
+def _ordered(faults: list[Fault]) -> tuple[Fault, ...]:
+    return tuple(sorted(dict.fromkeys(faults), key=lambda found: found.file))
+
+
+def _generated(path: str) -> bool:
+    return path.split("/", maxsplit=1)[0] in GENERATED_ROOTS
 
 
 def _ledger(files: Mapping[str, str], faults: list[Fault]) -> Ledger:
@@ -84,49 +131,100 @@ def _ledger(files: Mapping[str, str], faults: list[Fault]) -> Ledger:
     return ledger
 
 
-def _texts(folder: Path) -> Iterator[tuple[str, str]]:
-    for root in (*CONFIG_ROOTS, "ledger", *GENERATED_ROOTS):
-        top = folder / root
-        paths = [top] if top.is_file() else sorted(top.rglob("*"))
-        for path in paths:
-            if path.is_file():
-                yield path.relative_to(folder).as_posix(), path.read_text(errors="replace")
+def _state(
+    files: Mapping[str, str],
+    before: Mapping[str, str],
+    ledger: Ledger,
+    faults: list[Fault],
+    now: datetime,
+) -> State:
+    """Return what the files say; faults that do not keep it from being rendered are put down."""
+    catalog = load({p: t for p, t in files.items() if p.split("/")[0] in CONFIG_ROOTS})
+    version = catalog.repository.render_version
+    if version < RENDER_VERSION:
+        message = (
+            f"is {version}, but this program renders version {RENDER_VERSION}; check with the "
+            "program that the generator runs, or have all rendered anew by `demandops upgrade`"
+        )
+        raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
+    faults += _unversioned_charts(catalog, files, before)
+    catalog = _with_ended(catalog, files, now)
+    state = State.of(catalog, ledger)
+    rehearse(state)
+    return state
 
 
-def _base_files(folder: Path, base: str | None) -> dict[str, str] | None:
-    """Return the files of the commit that an edit started from; nothing where Git knows none."""
+def _taken_in(
+    state: State,
+    start: Base | None,
+    changed: Collection[str],
+    files: Mapping[str, str],
+    now: datetime,
+) -> State:
+    """Return the books as the generator would have them once it took the change in."""
+    if start is None or start.state is None:
+        return state
+    old, new = start.state.ledger, state.ledger
+    subjects = [
+        claim.subject
+        for books in (old, new)
+        for claim in books
+        if ledger_format.path_of(claim.key) in changed
+    ]
+    before, after = (old, start.state.catalog), (new, state.catalog)
+    taken = taken_in(before, after, dict.fromkeys(subjects), _marked(files), now)
+    return replace(state, ledger=taken.ledger, catalog=taken.catalog)
+
+
+def _marked(files: Mapping[str, str]) -> dict[str, str]:
+    return {p: text for p, text in files.items() if p.startswith(f"{markers.MARKERS_ROOT}/")}
+
+
+def _with_ended(catalog: Catalog, files: Mapping[str, str], now: datetime) -> Catalog:
+    """Return the catalog without the overrides that a generator ended, or would at once."""
+    catalog = catalog.with_ended(markers.read(_marked(files)))
+    over = {one.name: written(one.end) for one in due(catalog, now) if one.end}
+    return catalog.with_ended({**catalog.ended, **over})
+
+
+def _warnings(state: State, now: datetime) -> tuple[Fault, ...]:
+    idle = warnings(survey(state.ledger, state.catalog, now))
+    return tuple(fault("", text).within(path) for path, text in idle)
+
+
+def _wanted(state: State, standing: Mapping[str, str], edited: Collection[str]) -> dict[str, str]:
+    """Return every generated file; of what cannot be rendered, the faults of every release."""
     try:
-        repo = Repository(str(folder))
-    except pygit2.GitError:
-        if base is not None:
-            raise StateRepoError(f"{folder} is no Git checkout; leave out --base") from None
+        return rendered(state, standing)
+    except InvalidInput as error:
+        found = consequences.faults(state.ledger, state.catalog, state.engine, edited)
+        raise InvalidInput(found or error.faults) from None
+
+
+def _releases(start: Base) -> dict[ReleaseKey, Release]:
+    if start.state is None:
+        return {}
+    return consequences.releases_of(start.state.ledger, start.state.catalog)
+
+
+def _books(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
+    if start is None:
+        return ()
+    if start.state is None:
         return None
-    if repo.is_empty:
+    try:
+        old = bookkeeping(start.state.ledger, start.state.catalog)
+    except InvalidInput:
         return None
-    commit = snapshots.commit_of(repo, base) if base else _started_from(repo)
-    return trees.texts(commit.tree, (*CONFIG_ROOTS, *GENERATED_ROOTS))
+    return difference(old, bookkeeping(state.ledger, state.catalog))
 
 
-def _started_from(repo: Repository) -> Commit:
-    head = repo.head.peel(Commit)
-    if _UPSTREAM in repo.references:
-        upstream = repo.references[_UPSTREAM].peel(Commit)
-        common = repo.merge_base(head.id, upstream.id)
-        if common is not None:
-            return snapshots.commit_of(repo, common)
-    return head
-
-
-def _hand_edits(files: Mapping[str, str], before: Mapping[str, str]) -> Iterator[Fault]:
-    for path in sorted({*files, *before}):
-        if path.split("/")[0] not in GENERATED_ROOTS or trees.is_note(path):
-            continue
-        if files.get(path) != before.get(path):
-            yield fault(
-                "",
-                "is generated, and an edit by hand is lost; take it back, and change the "
-                "configuration that it follows from",
-            ).within(path)
+def _hand_edits(
+    folder: Path, files: Mapping[str, str], start: Base | None, edited: list[str]
+) -> tuple[list[Fault], tuple[Suggestion, ...]]:
+    if start is None or not edited:
+        return [], ()
+    return handedits.refused(files, start, edited, author_of(folder))
 
 
 def _unversioned_charts(

@@ -8,7 +8,8 @@ import re
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from generator.staterepo.repository import (
     ENVIRONMENT,
     MAIN,
     TIMEOUT_S,
+    CutShort,
     PushDenied,
     RemoteAway,
     StateRepository,
@@ -33,6 +35,7 @@ _BEHIND = re.compile(r"\[rejected\]")
 _REMOTE_SAYS = re.compile(r"remote: ?(.*)")
 _REFUSED = re.compile(r"\[remote rejected\] \((.*)\)")
 _PASSING = re.compile(r"lock|failed to update ref|incorrect old value")
+_POLL_S = 0.02
 _NO_RIGHT = re.compile(r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE)
 
 Say = Callable[[str], None]
@@ -85,11 +88,11 @@ class ClonedRepository(StateRepository):
             self._fetch(repo)
         partial.rename(self._folder)
 
-    def _fetch(self, repo: git.Repo) -> None:
+    def _fetch(self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False) -> None:
         try:
             # told here, not configured: a push that outlives a killed generator moves nothing here
             spec = f"+{MAIN}:{_REMOTE_MAIN}"
-            self._talk(repo, "fetch", "--no-tags", "--quiet", "origin", spec)
+            self._talk(repo, "fetch", "--no-tags", "--quiet", "origin", spec, urgent=urgent)
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
             if "couldn't find remote ref" in text:
@@ -108,6 +111,11 @@ class ClonedRepository(StateRepository):
     def refresh(self) -> Oid:
         """Fetch and return the remote's commit."""
         self._fetch(self._git)
+        return self.tip()
+
+    def look(self, urgent: Callable[[], bool]) -> Oid:
+        """Fetch, but give way to what is urgent: a demand is not to wait for a slow remote."""
+        self._fetch(self._git, urgent)
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
@@ -129,7 +137,56 @@ class ClonedRepository(StateRepository):
         self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         return True
 
-    def _talk(self, repo: git.Repo, *command: str) -> None:
+    def listed(self, *patterns: str) -> dict[str, str]:
+        """Ask the remote for its references that match, and return name → commit.
+
+        Raises:
+            RemoteAway: where it cannot be reached.
+        """
+        try:
+            out, _ = self._talk(self._git, "ls-remote", "--quiet", "origin", *patterns)
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+            raise RemoteAway(f"{self.address} cannot be asked: {_last_line(text)}") from None
+        pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
+        return {name: commit for commit, name in pairs}
+
+    def fetch_branches(self, prefix: str) -> None:
+        """Fetch the branches whose names begin so, and forget those that are gone.
+
+        Raises:
+            RemoteAway: where the remote cannot be reached.
+        """
+        spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
+        try:
+            self._talk(self._git, "fetch", "--no-tags", "--quiet", "--prune", "origin", spec)
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+            raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
+
+    def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
+        """Push one reference and return what the remote had to say.
+
+        Args:
+            spec: what goes where.
+            lease: ``<reference>:<commit>``, what the remote must have, or nothing there.
+            options: what the server is told (``git push --push-option``).
+
+        Raises:
+            git.GitCommandError: where the remote did not take it.
+        """
+        told = [f"--push-option={option}" for option in options]
+        expects = f"--force-with-lease={lease}"
+        out, err = self._talk(self._git, "push", "--porcelain", *told, expects, "origin", spec)
+        return f"{out}\n{err}"
+
+    def why_not(self, error: git.GitCommandError) -> StateRepoError:
+        """Return why a push was not taken: to be tried again, or denied."""
+        return self._why_not(without_secrets(f"{error.stdout}\n{error.stderr}"))
+
+    def _talk(
+        self, repo: git.Repo, *command: str, urgent: Callable[[], bool] = lambda: False
+    ) -> tuple[str, str]:
         if self._given_up:
             raise RemoteAway(f"{self.address} was given up")
         with repo.git.custom_environment(**ENVIRONMENT):
@@ -144,14 +201,12 @@ class ClonedRepository(StateRepository):
         if self._given_up:  # between the first look and now
             self.give_up()
         try:
-            out, err = process.communicate(timeout=TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            out, err = process.communicate()
+            out, err = _heard(process, urgent)
         finally:
             self._talking = None
         if process.returncode:
             raise git.GitCommandError(list(command), process.returncode, err, out)
+        return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
 
     def give_up(self) -> None:
         """End what git is waiting for, and start nothing more."""
@@ -177,6 +232,32 @@ class ClonedRepository(StateRepository):
     def always_current(self) -> bool:
         """Say no: the remote may have moved since the last fetch."""
         return False
+
+
+def _heard(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:
+    """Return what git says; end it where it takes too long, or something urgent comes."""
+    end = time.monotonic() + TIMEOUT_S
+    while True:
+        try:
+            return process.communicate(timeout=_POLL_S)
+        except subprocess.TimeoutExpired:
+            hurry = urgent()
+            if not hurry and time.monotonic() < end:
+                continue
+            heard = _ended(process)
+            if hurry:
+                raise CutShort("a look at the remote was ended for a demand") from None
+            return heard
+
+
+def _ended(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
+    """End git and all that it started; kindly first, so that it takes its locks with it."""
+    for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
+        with suppress(subprocess.TimeoutExpired):
+            return process.communicate(timeout=patience)
+    raise AssertionError("a killed process has ended")  # pragma: no cover
 
 
 def _last_line(text: str) -> str:

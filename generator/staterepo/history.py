@@ -14,6 +14,7 @@ import pygit2
 from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
+from generator.staterepo.message import PROPOSAL
 from generator.staterepo.snapshot import commit_of
 
 _WHY = "Why: "
@@ -37,7 +38,7 @@ class LogEntry:
     @property
     def by_generator(self) -> bool:
         """Tell whether the generator made the commit, so that its files fit its books."""
-        return "Render-Version" in self.trailers
+        return "Render-Version" in self.trailers and PROPOSAL not in self.trailers
 
 
 def trailers_of(message: str) -> dict[str, list[str]]:

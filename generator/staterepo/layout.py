@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pygit2
 
-from generator import yamlio
+from generator import __version__, yamlio
 from generator.catalog.catalog import CONFIG_ROOTS
 from generator.catalog.loading import load
 from generator.catalog.repository import ROOT_FILE
@@ -22,6 +22,9 @@ from generator.staterepo import message, signing
 from generator.staterepo import tree as trees
 from generator.staterepo.signing import Signer
 
+PIPELINES = (".github/workflows/demandops.yml", ".gitlab-ci.yml")
+"""What checks pull requests on GitHub and GitLab, by the version that laid the repo down."""
+
 
 def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
     """Return every file of a new state repo by path: skeleton, appdefs and what they render to.
@@ -32,10 +35,12 @@ def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
     found = _read(data_folder("skeleton"), "")
     found |= _read(data_folder("appdefs"), "appdefs/")
     roots = {"flux": found.pop(ROOT_FILE), "argocd": found.pop("demandops.argocd.yaml")}
-    root = roots[gitops]
+    root = yamlio.edited(roots[gitops], "renderVersion", RENDER_VERSION)
     if url:
         root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {yamlio.scalar(url)}", root)
     found[ROOT_FILE] = root
+    for path in PIPELINES:
+        found[path] = re.sub(r"demandops==\S+", f"demandops=={__version__}", found[path])
     catalog = load({p: text for p, text in found.items() if p.split("/")[0] in CONFIG_ROOTS})
     return found | rendered(State.of(catalog, Ledger()))
 

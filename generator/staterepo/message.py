@@ -12,17 +12,22 @@ from datetime import datetime, timezone
 
 import pygit2
 
+from generator.catalog.override import OVERRIDES_ROOT, Override, written
 from generator.decision import Decision
-from generator.demand.claim import SubjectKind
+from generator.demand.claim import KEPT, ClaimKey, SubjectKind
 from generator.demand.request import DemandRequest, Operation
 from generator.errors import Fault
 from generator.ledger import format as ledger_format
+from generator.ledger.decommission import needs
 from generator.ledger.restore import Restoration
 from generator.render.changeset import ReleaseChange
 from generator.settings import RENDER_VERSION
 
 GENERATOR_NAME = "DemandOps generator"
 GENERATOR_EMAIL = "generator@demandops.invalid"
+
+PROPOSAL = "Proposal"
+"""The trailer of a commit that awaits approval, or did: the branch that it was proposed on."""
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
@@ -31,8 +36,11 @@ _MAX_SUBJECT = 90
 
 
 def is_generators(message: str) -> bool:
-    """Tell whether a commit is the generator's, so that its files fit its books."""
-    return "\nRender-Version: " in message
+    """Tell whether a commit is the generator's, so that its files fit its books.
+
+    A proposal is merged by a person, perhaps onto others' changes: its files are looked at anew.
+    """
+    return "\nRender-Version: " in message and f"\n{PROPOSAL}: " not in message
 
 
 def generator_signature(moment: datetime) -> pygit2.Signature:
@@ -43,12 +51,14 @@ def generator_signature(moment: datetime) -> pygit2.Signature:
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
     """Return the requesters as the author, at the time when the demand was received.
 
-    Of a rollback it is the person who asked for it.
+    Of a rollback and where something leaves it is the person who asked for it.
     """
-    request = decision.request
+    request, leaving = decision.request, decision.request.leaving
     if isinstance(request, Restoration):
         email = re.sub(r"[<>\s]", "", request.email) or GENERATOR_EMAIL
         return pygit2.Signature(_name(request.by), email, int(received.timestamp()), 0)
+    if leaving is not None:
+        return _operator(leaving.by, received)
     names = ", ".join(_requesters(decision))
     demand = decision.changes.claims[0].key.demand
     local = demand if _LOCAL_PART.fullmatch(demand) else ledger_format.segment(demand)
@@ -60,6 +70,15 @@ def _name(names: str) -> str:
     """Return a name as git takes it: without angle brackets, or these characters at its ends."""
     plain = _clipped(names.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
     return plain.strip(" .,:;\"'\\") or "unnamed"
+
+
+def _operator(by: str, received: datetime) -> pygit2.Signature:
+    """Return who had the generator do something, the generator itself where nobody is known."""
+    name, _, email = by.removesuffix(">").rpartition(" <")
+    try:
+        return pygit2.Signature(name, email, int(received.timestamp()), 0)
+    except (ValueError, pygit2.GitError):
+        return generator_signature(received)
 
 
 def of_decision(
@@ -80,11 +99,13 @@ def of_decision(
         ("Operation-Id", operation),
         *settled,
         *_of_rollback(request),
+        *_leaving(decision),
         *(("Demand-Id", demand) for demand in dict.fromkeys(c.key.demand for c in claims)),
         *(("Requester", requester) for requester in _requesters(decision)),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
         *(("Connection", s.id) for s in subjects if s.kind is SubjectKind.CONNECTION),
         ("Request-Id", request.id),
+        *_overrides(decision),
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
@@ -101,14 +122,28 @@ _VERBS = {
 
 def _requesters(decision: Decision) -> tuple[str, ...]:
     """Return in whose name a demand changed something; of one that ended, in whose it stood."""
-    claims = [change.after or change.before for change in decision.changes.claims]
+    changes = decision.changes.claims
+    claims = [change.after or change.before for change in changes]
+    if decision.request.leaving is not None:  # whose name goes is concerned as well
+        claims = [change.before for change in changes]
     stood = sorted({who for claim in claims if claim for who in claim.requesters})
     return decision.request.requesters() or tuple(stood)
 
 
+def _leaving(decision: Decision) -> list[tuple[str, str]]:
+    """Return the trailer of a node that is decommissioned; a requester's stands there already."""
+    leaving, befores = decision.request.leaving, [c.before for c in decision.changes.claims]
+    if leaving is None or "node" not in leaving.kinds:
+        return []
+    held = any(needs(before, leaving.name) for before in befores if before)
+    return [("Node", leaving.name)] if held else []
+
+
 def _title(decision: Decision) -> str:
     subjects = ", ".join(subject.id for subject in decision.changes.subjects())
-    operation = decision.request.operation
+    operation, leaving = decision.request.operation, decision.request.leaving
+    if leaving is not None:
+        return f"Decommission {leaving.name}"
     if operation is Operation.EXPIRE:
         return f"Expire {subjects}"
     if isinstance(decision.request, Restoration):
@@ -133,6 +168,12 @@ def _why(decision: Decision, received: datetime) -> str:
         return (
             f"Why: the lease of demand '{request.demand}' on {what} in the name of {who} ended "
             f"at {last} and was not renewed."
+        )
+    if request.leaving is not None:
+        by = f" by {request.leaving.by}" if request.leaving.by else ""
+        return (
+            f"Why: '{request.leaving.name}' leaves for good, told{by} on {moment}; it held a part "
+            f"of {what} in the name of {who}."
         )
     verb = _VERBS[request.operation][1]
     if request.operation.asks and _only_leases(decision):
@@ -167,14 +208,14 @@ def of_follow(
     more: Iterable[tuple[str, str]] = (),
 ) -> str:
     """Return the message of a commit that carries out what people changed in the state repo."""
-    problems = list(problems)
-    body = [
-        "Carry out changes made in the state repo",
-        "",
-        f"Why: commits up to {cause[:12]} changed what is configured or booked.",
-        "",
-        *_desired_state(tuple(releases)),
-    ]
+    problems, releases = list(problems), tuple(releases)
+    why = f"Why: commits up to {cause[:12]} changed what is configured or booked."
+    title = "Carry out changes made in the state repo"
+    if not releases:
+        title = "Report what is not valid in the state repo"
+        title = title if problems else "Report that all of the state repo is valid again"
+    body = [title, "", why]
+    body += ["", *_desired_state(releases)] if releases else []
     if problems:
         body += ["", "Not taken in, for it is not valid:", *(f"  {found}" for found in problems)]
     trailers = [
@@ -185,6 +226,46 @@ def of_follow(
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
+
+
+def of_ended(
+    override: Override,
+    releases: tuple[ReleaseChange, ...],
+    more: Iterable[tuple[str, str]] = (),
+) -> str:
+    """Return the message of the commit that ends an override at the time that it names."""
+    body = [
+        f"End override {override.name}",
+        "",
+        f"Why: {override.path} of {override.owner} ({override.reason}) expired at "
+        f"{written(override.end) if override.end else ''}.",
+        "",
+        *(_desired_state(releases) if releases else ["Desired state: unchanged."]),
+    ]
+    trailers = [
+        ("Operation", "expire-override"),
+        *of_overrides([override.path]),
+        *more,
+        ("Render-Version", str(RENDER_VERSION)),
+    ]
+    return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
+
+
+def of_overrides(paths: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the trailers that name overrides."""
+    return [("Override", path) for path in sorted(set(paths))]
+
+
+def _overrides(decision: Decision) -> list[tuple[str, str]]:
+    """Return the trailers that name the overrides that shaped a demand's commit."""
+    keys = (change.key for change in decision.changes.claims)
+    return of_overrides([*decision.overrides, *keeping(keys)])
+
+
+def keeping(keys: Iterable[ClaimKey]) -> list[str]:
+    """Return the files of the overrides whose own claims these are."""
+    demands = (key.demand for key in keys if key.demand.startswith(KEPT))
+    return [f"{OVERRIDES_ROOT}/{demand.removeprefix(KEPT)}.yaml" for demand in demands]
 
 
 def _trailers(pairs: Iterable[tuple[str, str]]) -> list[str]:

@@ -24,16 +24,22 @@ _MAX_SLOTS = 256
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A demand as it came: its operation id, the goal, when, and the tip known then."""
+    """A demand as it came: its operation id, the goal, when, and the tip known then.
+
+    ``proposal``: what it awaits approval on, where it does.
+    """
 
     operation: str
     goal: Any
     received: str
     base: str
+    proposal: dict[str, Any] | None = None
 
     def line(self) -> str:
         """Return its line of the journal; the goal is not copied, for it may be deep."""
         record = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.proposal is None:
+            del record["proposal"]
         return json.dumps(record, ensure_ascii=True) + "\n"
 
 

@@ -8,15 +8,20 @@ from datetime import datetime, timezone
 from itertools import islice
 from pathlib import Path
 
+from pygit2 import Commit
+
 from generator import settings
-from generator.errors import StateRepoError
+from generator.catalog.catalog import Catalog
+from generator.errors import InvalidInput, StateRepoError
 from generator.ledger.restore import Restoration
 from generator.render.changeset import Read
 from generator.staterepo import (
     history,
+    holding,
     moments,
     paths,
     remote,
+    reports,
     restoring,
     signatures,
     verification,
@@ -27,6 +32,8 @@ from generator.staterepo.address import is_url
 from generator.staterepo.history import LogEntry
 from generator.staterepo.outbox import Slot
 from generator.staterepo.paths import PathHistory
+from generator.staterepo.proposals import Waiting, waiting
+from generator.staterepo.repository import StateRepository
 from generator.staterepo.snapshot import Progress, Snapshot
 from generator.staterepo.verification import Verdict
 
@@ -57,6 +64,20 @@ class Reader:
         if self._slot is not None:
             self._slot.close()
 
+    @property
+    def repository(self) -> StateRepository:
+        """The state repo itself, for a command that writes to it."""
+        return self._repository
+
+    def refuse_other_rendering(self) -> None:
+        """Raise where a generator of another version writes this repo, as a generator does.
+
+        Raises:
+            StateRepoError: saying which version it is and what to do.
+        """
+        tip = snapshots.commit_of(self._repository.objects, self._tip)
+        snapshots.refuse_other_rendering(tip.tree)
+
     def commit(self, revision: str | None = None) -> str:
         """Return the id of a commit, by a revision or a time; the newest where none is given.
 
@@ -72,28 +93,71 @@ class Reader:
         """Tell whether ``commit`` is ``other`` or comes after it."""
         return self._repository.includes(commit, other)
 
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Tell whether two commits hold the same under ``path``."""
+        return self._repository.unchanged(commit, other, path)
+
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Load the books and the configuration at a commit.
+        """Load the books and the configuration that are in force at a commit.
+
+        Where the generator reported that people broke a file, these are its last valid versions.
 
         Raises:
             InvalidInput, StateRepoError: where it holds no valid state repo.
         """
-        return snapshots.load(self._repository.objects, self.commit(revision), progress)
+        commit = snapshots.commit_of(self._repository.objects, self.commit(revision))
+        told = self._told_at(commit)
+        if told:
+            return holding.in_force_at(self._repository.objects, commit, told)
+        return snapshots.load(self._repository.objects, commit.id, progress)
+
+    def _told_at(self, commit: Commit) -> str:
+        """Return the commit whose configuration the generator told to be in force, if another."""
+        base = history.last_generated(self._repository.objects, commit.id)
+        if base is None:
+            return ""
+        made = snapshots.commit_of(self._repository.objects, base)
+        return history.entry_of(made).one("In-Force")
+
+    def problems(self) -> tuple[reports.Problem, ...]:
+        """Return what the generator reports not to be valid at the newest commit."""
+        return reports.read(self.file_reader()(reports.PATH))
 
     def last_valid(self, revision: str, progress: Progress = lambda done, total: None) -> Snapshot:
-        """Load a commit; of what is not valid there, the last version that was (and its problems).
+        """Load what is in force at a commit, whether or not the generator has been there since.
+
+        Of what is not valid there it is the last version that was; the problems are told.
 
         Raises:
             InvalidInput, StateRepoError: where there never was a valid configuration.
         """
-        return snapshots.load_last_valid(self._repository.objects, revision, progress)
+        try:
+            return self.snapshot(revision, progress)
+        except InvalidInput:
+            return snapshots.load_last_valid(self._repository.objects, revision, progress)
 
     def file_reader(self, revision: str | None = None) -> Read:
         """Return a function that gives the text of a file at a commit."""
         tree = snapshots.commit_of(self._repository.objects, self.commit(revision)).tree
         return lambda path: trees.read_text(tree, path)
+
+    def catalog(self) -> Catalog:
+        """Return the configuration at the newest commit.
+
+        Raises:
+            InvalidInput, StateRepoError: where it holds no valid one.
+        """
+        return snapshots.catalog_at(snapshots.commit_of(self._repository.objects, self._tip).tree)
+
+    def proposals(self) -> list[Waiting]:
+        """Return the demands that await approval, by branch.
+
+        Raises:
+            RemoteAway: where the remote does not answer.
+        """
+        return list(waiting(self._repository))
 
     def log(self, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""

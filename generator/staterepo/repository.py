@@ -7,6 +7,7 @@ chooses.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 
 import git
@@ -24,6 +25,10 @@ ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
 
 class RemoteAway(StateRepoError):
     """The remote did not answer; what is kept in the outbox goes there when it is back."""
+
+
+class CutShort(StateRepoError):
+    """A look at the remote was ended because something more urgent came."""
 
 
 class PushDenied(StateRepoError):
@@ -50,6 +55,15 @@ class StateRepository(ABC):
             RemoteAway: where it cannot be reached.
         """
 
+    def look(self, urgent: Callable[[], bool]) -> Oid:
+        """As :meth:`refresh`, but ended as soon as ``urgent`` says that something else is to do.
+
+        Raises:
+            RemoteAway: where it cannot be reached.
+            CutShort: where it was ended.
+        """
+        return self.refresh()
+
     @abstractmethod
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Make ``commit`` the tip if the tip is ``expected``, durably; else return false.
@@ -70,6 +84,28 @@ class StateRepository(ABC):
         except (pygit2.GitError, KeyError, ValueError):
             return False
 
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Tell whether two commits hold the same under ``path``; false for one not known here.
+
+        May be called from any thread.
+        """
+        objects = Repository(self.objects.path)
+        one, two = (_under(objects, name, path) for name in (commit, other))
+        return one is not None and one == two
+
+    def changed(self, since: str, commit: str) -> list[str] | None:
+        """Return the paths in which two commits differ; None where one is not known here.
+
+        May be called from any thread.
+        """
+        objects = Repository(self.objects.path)
+        try:
+            found = objects.diff(objects[since].id, objects[commit].id)
+        except (pygit2.GitError, KeyError, ValueError):
+            return None
+        ends = (end for delta in found.deltas for end in (delta.old_file, delta.new_file))
+        return sorted({end.path for end in ends})
+
     def give_up(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End what is under way with a remote; nothing where there is none."""
 
@@ -82,6 +118,15 @@ class StateRepository(ABC):
     @abstractmethod
     def always_current(self) -> bool:
         """Tell whether :meth:`tip` can never be behind (a repository on this disk)."""
+
+
+def _under(objects: Repository, commit: str, path: str) -> Oid | None:
+    """Return the id of what a commit holds under a path, or None."""
+    try:
+        tree = objects[commit].peel(pygit2.Tree)
+        return tree.id if path in ("", ".") else tree[path].id
+    except (pygit2.GitError, KeyError, ValueError):
+        return None
 
 
 def _git(repo: git.Repo, *command: str) -> None:

@@ -16,8 +16,6 @@ from generator.ledger.restore import Restoration
 from generator.staterepo import tree as trees
 from generator.staterepo.snapshot import commit_of
 
-_PEOPLES = (*CONFIG_ROOTS, "overrides")
-
 
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     """Return the request to go back to a commit.
@@ -56,7 +54,7 @@ def configured_since(repo: Repository, commit: str | Oid, tip: str | Oid) -> lis
     """Return the files of people that are not what they were at ``commit``."""
     before, after = commit_of(repo, commit).tree, commit_of(repo, tip).tree
     changed = trees.differences(repo, before, after, "")
-    return sorted(path for path, _ in changed if path.split("/")[0] in _PEOPLES)
+    return sorted(path for path, _ in changed if path.split("/")[0] in CONFIG_ROOTS)
 
 
 def person(repo: Repository) -> tuple[str, str]:

@@ -22,6 +22,7 @@ from generator.decision import State, rehearse
 from generator.demand.claim import Claim, ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.ledger import format as ledger_format
+from generator.ledger import markers
 from generator.ledger.ledger import Ledger
 from generator.settings import GENERATED_ROOTS, RENDER_VERSION
 from generator.staterepo import message
@@ -36,7 +37,7 @@ class Snapshot:
 
     ``keys`` finds the claim behind a ledger file, so that a removed file is understood.
     ``problems`` are files that are not valid and whose last valid version is in force; ``sound`` is
-    the newest commit without any.
+    the newest commit without any; ``held`` are ledger files that are not in force as they stand.
     """
 
     commit: Oid
@@ -44,6 +45,7 @@ class Snapshot:
     keys: HashTrieMap[str, ClaimKey]
     problems: tuple[Fault, ...] = ()
     sound: Oid | None = None
+    held: tuple[str, ...] = ()
 
     def after(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
         """Return the snapshot of a commit of our own, whose state is known already."""
@@ -125,6 +127,7 @@ def load_last_valid(
     except InvalidInput as error:
         problems += error.faults
         catalog = _last_valid_catalog(repo, commit, error)
+        catalog = catalog.with_ended(markers.read(markers_at(commit.tree)))
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
     for path in dict.fromkeys(found.file for found in faults):
         claim = _last_valid_claim(commit, path)
@@ -132,25 +135,30 @@ def load_last_valid(
             ledger, keys = ledger.replace(claim.key, claim), keys.insert(path, claim.key)
     problems += faults
     sound = None if problems else commit.id
-    return Snapshot(commit.id, State.of(catalog, ledger), keys, tuple(problems), sound)
+    held = tuple(dict.fromkeys(found.file for found in faults))
+    return Snapshot(commit.id, State.of(catalog, ledger), keys, tuple(problems), sound, held)
 
 
-def refuse_newer(tree: Tree) -> None:
-    """Raise where a newer generator writes the repo: two versions would undo each other's files.
+def refuse_other_rendering(tree: Tree) -> None:
+    """Raise where a generator of another version writes the repo: two would undo each other's work.
 
     Raises:
-        StateRepoError: saying which version it is.
+        StateRepoError: saying which version it is and what to do.
     """
     try:
         data = yamlio.load(trees.read_text(tree, ROOT_FILE) or "")
     except InvalidInput:
         return
     version = data.get("renderVersion") if isinstance(data, dict) else None
-    if isinstance(version, int) and version > RENDER_VERSION:
-        raise StateRepoError(
-            f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
-            f"{RENDER_VERSION}; update the generator"
-        )
+    if not isinstance(version, int) or version == RENDER_VERSION:
+        return
+    remedy = "update the generator"
+    if version < RENDER_VERSION:
+        remedy = "stop older generators, then have all rendered anew by `demandops upgrade`"
+    raise StateRepoError(
+        f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
+        f"{RENDER_VERSION}; {remedy}"
+    )
 
 
 def _last_valid_catalog(repo: Repository, commit: Commit, fault: InvalidInput) -> Catalog:
@@ -209,7 +217,12 @@ def catalog_at(tree: Tree) -> Catalog:
         raise StateRepoError(
             "this is no state repo, for it has no demandops.yaml; `demandops init DIR` makes one"
         )
-    return load_catalog(files)
+    return load_catalog(files).with_ended(markers.read(markers_at(tree)))
+
+
+def markers_at(tree: Tree) -> dict[str, str]:
+    """Return path → text of the files that say which overrides ended."""
+    return trees.texts(tree, (markers.MARKERS_ROOT,))
 
 
 def _ledger_at(
@@ -248,7 +261,7 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     What is not valid there is left as it was before, and told in the new snapshot's problems.
     """
     before, after = commit_of(repo, snapshot.commit).tree, commit_of(repo, to).tree
-    refuse_newer(after)
+    refuse_other_rendering(after)
     state, problems = snapshot.state, list[Fault]()
     catalog_changed = _edited_by_hand(repo, snapshot.commit, to)
     if any(_id(before, root) != _id(after, root) for root in CONFIG_ROOTS) or snapshot.problems:
@@ -260,14 +273,18 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             state = State(catalog, State.of(catalog, state.ledger).engine, state.ledger)
         except (InvalidInput, StateRepoError) as error:
             problems += _as_faults(error)
-    ledger, keys, subjects = state.ledger, snapshot.keys, list[Subject]()
-    seen = set()
-    for path, blob in trees.differences(
-        repo, _subtree(before, "ledger"), _subtree(after, "ledger"), "ledger/"
-    ):
+    ended = markers.read(markers_at(after))
+    if ended != state.catalog.ended:
+        state = replace(state, catalog=state.catalog.with_ended(ended))
+        catalog_changed = True
+    ledger, keys, subjects, held = state.ledger, snapshot.keys, list[Subject](), list[str]()
+    changed = dict(
+        trees.differences(repo, _subtree(before, "ledger"), _subtree(after, "ledger"), "ledger/")
+    )
+    changed |= {path: trees.blob(after, path) for path in snapshot.held}
+    for path, blob in sorted(changed.items()):
         if ledger_format.kind_of(path) is None:
             continue
-        seen.add(path)
         known = keys.get(path)
         if blob is None:
             if known is not None:
@@ -279,17 +296,15 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             claim = ledger_format.read(_text(repo, blob), path)
         except InvalidInput as error:
             problems += error.faults
+            held.append(path)
             continue
         if ledger.get(claim.key) != claim:
             ledger = ledger.replace(claim.key, claim)
             subjects.append(claim.subject)
         keys = keys.insert(path, claim.key)
-    problems += [
-        p for p in snapshot.problems if p.file.startswith("ledger/") and p.file not in seen
-    ]
-    state = replace(state, ledger=ledger)
+    state, sound = replace(state, ledger=ledger), snapshot.sound if problems else to
     return Advance(
-        Snapshot(to, state, keys, tuple(problems), snapshot.sound if problems else to),
+        Snapshot(to, state, keys, tuple(problems), sound, tuple(held)),
         tuple(dict.fromkeys(subjects)),
         catalog_changed,
     )

@@ -22,6 +22,12 @@ def read_text(tree: Tree, path: str) -> str | None:
     return entry.data.decode("utf-8", "replace") if isinstance(entry, pygit2.Blob) else None
 
 
+def blob(tree: Tree, path: str) -> Oid | None:
+    """Return the id of a file, or nothing where there is none."""
+    entry = child(tree, path)
+    return entry.id if isinstance(entry, pygit2.Blob) else None
+
+
 def child(tree: Tree, name: str) -> pygit2.Object | None:
     """Return the entry ``name`` of a tree, or nothing."""
     try:

@@ -15,25 +15,26 @@ from dataclasses import dataclass, replace
 import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 
-from generator.catalog.catalog import CONFIG_ROOTS
+from generator.catalog.catalog import CONFIG_ROOTS, Catalog
 from generator.decision import State, rendered
 from generator.demand.claim import Claim
 from generator.errors import InvalidInput
 from generator.ledger import format as ledger_format
+from generator.ledger import markers
 from generator.ledger.ledger import ClaimChange
 from generator.plan.planner import ReleaseKey
+from generator.plan.release import Release
 from generator.plan.traced import TracedPlan
-from generator.render import gitops
+from generator.render import gitops, marking
 from generator.render.paths import path_of
-from generator.settings import GENERATED_ROOTS, RENDER_VERSION
+from generator.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
+from generator.staterepo import accounting, holding
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.history import LogEntry, entry_of
-from generator.staterepo.snapshot import Snapshot
+from generator.staterepo.message import PROPOSAL
 
-_PEOPLES = (*CONFIG_ROOTS, "overrides")
-_FREE = ("init", "upgrade")
-"""Operations that may write what people own: they lay it down, or bring it to a new form."""
+_CHARTS = "/_charts/"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,23 +66,50 @@ class _Proof:
     claims: dict[str, Claim]
     plan: TracedPlan
     planned: dict[ReleaseKey, tuple[str, Oid]]
+    held: dict[ReleaseKey, Release]
+    """Releases whose files an override holds: they follow from the commit before."""
     steady: dict[str, Oid]
     """What stays when nothing is demanded."""
     standing: dict[str, Oid]
     """What the commit holds below the generated folders."""
 
-    def take_in(self, state: State, changes: Sequence[ClaimChange]) -> None:
-        """Plan and render what the changes may have changed."""
+    def take_in(self, state: State, changes: Sequence[ClaimChange], before: Tree | None) -> None:
+        """Plan and render what the changes may have changed.
+
+        Args:
+            state: books and configuration after the changes.
+            changes: every claim that is not what it was.
+            before: the commit's parent, whose files overrides may hold.
+        """
         self.state = state
         for key, release in self.plan.advance(state.ledger, changes).items():
             self.planned.pop(key, None)
-            if release is not None:
-                text = gitops.render(release, state.catalog, state.engine)
-                self.planned[key] = (path_of(release), _blob(text))
+            self.held.pop(key, None)
+            if release is not None and release.shaping.held:
+                self.held[key] = release
+            elif release is not None:
+                self.planned[key] = _rendered(release, state, None)
+        for key, release in self.held.items():
+            self.planned[key] = _rendered(release, state, before)
 
-    def differing(self) -> tuple[str, ...]:
+    def differing(self, before: Tree | None) -> tuple[str, ...]:
         """Return the files that are not what they should be."""
-        return _differing(self.steady | dict(self.planned.values()), self.standing)
+        wanted = self.steady | dict(self.planned.values())
+        if before is not None and any(one.hold for one in self.state.catalog.in_force):
+            charts = {
+                path: trees.read_text(before, path) or ""
+                for path, _ in _standing(before)
+                if _CHARTS in path and path not in wanted
+            }
+            kept = marking.charts_kept({}, charts, self.state.catalog)
+            wanted |= {path: _blob(text) for path, text in kept.items()}
+        return _differing(wanted, self.standing)
+
+
+def _rendered(release: Release, state: State, before: Tree | None) -> tuple[str, Oid]:
+    path = path_of(release)
+    standing = trees.read_text(before, path) if before is not None else None
+    return path, _blob(marking.text_of(release, state.catalog, state.engine, standing))
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
@@ -98,7 +126,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         if verdict.skipped:
             yield verdict
             continue
-        touched = _not_its_own(repo, commit, entry)
+        touched = accounting.not_its_own(repo, commit, entry)
         alone = whole or place == len(commits) or bool(entry.one("In-Force"))
         try:
             differing = row.differing(commit, entry, alone=alone)
@@ -135,7 +163,8 @@ class _Row:
         proof, self._proof = self._proof, None
         if alone:
             state = self._loaded(commit, entry)
-            wanted = {path: _blob(text) for path, text in rendered(state).items()}
+            files = rendered(state, _held_from(commit, state.catalog))
+            wanted = {path: _blob(text) for path, text in files.items()}
             return _differing(wanted, dict(_standing(commit.tree)))
         if proof is None or _reconfigured(proof, commit):
             proof = _from_nothing(self._loaded(commit, entry), commit)
@@ -146,11 +175,11 @@ class _Row:
                 raise _Unreadable(error.faults[0]) from None
             _bring_forward(self._repo, proof, commit, changes)
         self._proof = proof  # of one that could not be judged nothing serves the next
-        return proof.differing()
+        return proof.differing(_parent(commit))
 
     def _loaded(self, commit: Commit, entry: LogEntry) -> State:
         try:
-            return _in_force_at(self._repo, commit, entry.one("In-Force")).state
+            return holding.in_force_at(self._repo, commit, entry.one("In-Force")).state
         except InvalidInput as error:
             raise _Unreadable(error.faults[0]) from None
 
@@ -165,28 +194,33 @@ def _differing(wanted: Mapping[str, Oid], standing: Mapping[str, Oid]) -> tuple[
 
 def _why_not(entry: LogEntry) -> str:
     if not entry.by_generator:
-        return "made by a person"
+        return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
     version = entry.one("Render-Version")
     if version != str(RENDER_VERSION):
         return f"rendered by version {version}, this is version {RENDER_VERSION}"
     return ""
 
 
-def _in_force_at(repo: Repository, commit: Commit, sound: str) -> Snapshot:
-    """Return what the generator went by at one of its commits.
+def _parent(commit: Commit) -> Tree | None:
+    return commit.parents[0].tree if commit.parents else None
 
-    ``sound`` is the commit whose configuration was in force, where people had broken theirs.
-    """
-    if not sound:
-        return snapshots.load(repo, commit.id)
-    snapshot = snapshots.load(repo, sound)
-    later = snapshots.advance(repo, snapshot, commit.id).snapshot
-    return replace(later, state=replace(snapshot.state, ledger=later.state.ledger))
+
+def _held_from(commit: Commit, catalog: Catalog) -> dict[str, str]:
+    """Return the files as they were before a commit, where overrides hold some of them."""
+    before = _parent(commit)
+    if before is None or not any(override.hold for override in catalog.in_force):
+        return {}
+    return trees.texts(before, GENERATED_ROOTS)
 
 
 def _reconfigured(proof: _Proof, commit: Commit) -> bool:
+    """Tell whether people's files, which overrides ended, or what is held back is another."""
+
     def ids(tree: Tree) -> list[Oid | None]:
-        found = (trees.child(tree, root) for root in _PEOPLES)
+        found = [trees.child(tree, root) for root in (*CONFIG_ROOTS, NOTES_ROOT)]
+        ledger = trees.child(tree, ledger_format.LEDGER_ROOT)
+        if isinstance(ledger, Tree):
+            found.append(trees.child(ledger, markers.MARKERS_ROOT.rsplit("/", 1)[-1]))
         return [entry.id if entry else None for entry in found]
 
     return ids(proof.tree) != ids(commit.tree)
@@ -218,10 +252,11 @@ def _from_nothing(state: State, commit: Commit) -> _Proof:
         claims={ledger_format.path_of(claim.key): claim for claim in state.ledger},
         plan=TracedPlan(state.catalog),
         planned={},
+        held={},
         steady={path: _blob(text) for path, text in steady.items()},
         standing=dict(_standing(commit.tree)),
     )
-    proof.take_in(state, ())
+    proof.take_in(state, (), _parent(commit))
     return proof
 
 
@@ -242,7 +277,7 @@ def _bring_forward(
             if blob is not None:
                 proof.standing[path] = blob
     proof.tree = commit.tree
-    proof.take_in(replace(proof.state, ledger=ledger), changes)
+    proof.take_in(replace(proof.state, ledger=ledger), changes, _parent(commit))
 
 
 def _standing(tree: Tree) -> Iterator[tuple[str, Oid]]:
@@ -252,32 +287,6 @@ def _standing(tree: Tree) -> Iterator[tuple[str, Oid]]:
             yield from trees.entries(entry, f"{root}/")
         elif entry is not None:
             yield root, entry.id
-
-
-def _not_its_own(repo: Repository, commit: Commit, entry: LogEntry) -> tuple[str, ...]:
-    """Return what a commit of the generator changed although its message does not account for it.
-
-    People's files, and claims of demands that it does not name or that are not written as the
-    generator writes them.
-    """
-    if not commit.parents or entry.one("Operation") in _FREE:
-        return ()
-    before, found = commit.parents[0].tree, []
-    for root in _PEOPLES:
-        found += [path for path, _ in trees.below_root(repo, before, commit.tree, root)]
-    named = {f"{ledger_format.segment(id)}.yaml" for id in entry.trailers.get("Demand-Id", ())}
-    for path, blob in trees.below_root(repo, before, commit.tree, ledger_format.LEDGER_ROOT):
-        if path.rsplit("/", 1)[-1] not in named or (blob and not _is_canonical(commit, path)):
-            found.append(path)
-    return tuple(found)
-
-
-def _is_canonical(commit: Commit, path: str) -> bool:
-    text = _text(commit, path)
-    try:
-        return ledger_format.write(ledger_format.read(text, path)) == text
-    except InvalidInput:
-        return False
 
 
 def _text(commit: Commit, path: str) -> str:

@@ -11,17 +11,24 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
+from types import MappingProxyType
 from typing import Literal
 
 import pygit2
 from pygit2 import Oid, Signature
 
+from generator.catalog.catalog import Catalog
+from generator.catalog.override import Override
 from generator.decision import Decision, State, consequence, rendered
-from generator.demand.claim import Subject
+from generator.demand.claim import ClaimKey, Subject
 from generator.errors import Fault, InvalidInput, StateRepoError
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger
+from generator.plan import keeping
+from generator.plan.following import TakenIn, differing, ended, files_of, taken_in
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
-from generator.staterepo import history, message, signing
+from generator.staterepo import history, holding, message, people, reports, signing
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
@@ -46,15 +53,44 @@ class Line:
         """Return a file as it is at the head of the line."""
         return trees.read_text(self._tree, path)
 
-    def commit(self, decision: Decision, operation: str, received: datetime, now: datetime) -> str:
-        """Commit one demand on top of the line and return the commit's id."""
-        text = message.of_decision(
-            decision, operation, received, [*self._settled, *_in_force(self.head)]
-        )
+    def commit(
+        self,
+        decision: Decision,
+        operation: str,
+        received: datetime,
+        now: datetime,
+        proposal: str = "",
+    ) -> str:
+        """Commit one demand on top of the line and return the commit's id.
+
+        Args:
+            proposal: the branch that it awaits approval on; nothing where it needs none.
+        """
+        more = [*self._settled, *_in_force(self.head)]
+        if proposal:
+            more.append((message.PROPOSAL, proposal))
+        text = message.of_decision(decision, operation, received, more)
         self._settled = []
         made = self._write(decision.files, text, message.author(decision, received), now)
         keys = [change.key for change in decision.changes.claims]
         self.head = self.head.after(made, decision.state, keys)
+        return str(made)
+
+    def record(
+        self,
+        files: Mapping[str, str | None],
+        state: State,
+        text: str,
+        author: Signature,
+        now: datetime,
+        keys: Iterable[ClaimKey] = (),
+    ) -> str:
+        """Commit what a person had done by a command.
+
+        ``state`` is what the files give then, ``keys`` the claims that changed with them.
+        """
+        made = self._write(files, text, author, now)
+        self.head = self.head.after(made, state, keys)
         return str(made)
 
     def note(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
@@ -71,51 +107,123 @@ class Line:
         What cannot be planned or rendered (a node that is in use is gone from the inventory) is
         left as it was before, and told in the head's problems.
         """
-        snapshot = advance.snapshot
-        state, problems = snapshot.state, list(snapshot.problems)
+        snapshot, good, found = self._held_back(advance.snapshot, before, advance.subjects)
+        state, problems = snapshot.state, [*snapshot.problems, *found]
         change = Changeset({}, ())
-        if advance.catalog_changed:
+        keys: tuple[ClaimKey, ...] = ()
+        whole = advance.catalog_changed
+        if whole:
             try:
-                change = self._everything(state)
+                state, change, keys = self._taken_in(state, before, good, now)
             except InvalidInput as error:
                 problems += error.faults
-                state = replace(before.state, ledger=state.ledger)
-                advance = replace(advance, catalog_changed=False)
-        if not advance.catalog_changed:
-            state, change = self._carried_out(state, before, advance.subjects, problems)
+                catalog = before.state.catalog.with_ended(state.catalog.ended)
+                state = replace(before.state, ledger=state.ledger, catalog=catalog)
+                snapshot, good, found = self._held_back(
+                    replace(snapshot, state=state), before, good
+                )
+                state, whole = snapshot.state, False
+                problems += found
+        if not whole:
+            state, change, keys = self._carried_out(state, before, good, (problems, now))
+        state, begun = _with_leases_begun(state, now)
+        change = replace(change, files={**change.files, **begun})
         sound = before.sound if problems else snapshot.commit
         self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
-        if change.files:
+        files = {**change.files, **self._report(problems, before)}
+        if files:
+            overrides = [*differing(before.state.catalog, state.catalog), *change.overrides]
+            overrides += message.keeping(keys)
+            causes = people.since(self._objects, before.sound or before.commit, snapshot.commit)
             text = message.of_follow(
                 change.releases,
                 str(snapshot.commit),
                 str(before.commit),
                 problems,
-                _in_force(self.head),
+                [
+                    *message.of_overrides(overrides),
+                    *people.trailers(causes),
+                    *_in_force(self.head),
+                ],
             )
-            made = self._write(change.files, text, message.generator_signature(now), now)
-            self.head = self.head.after(made, state, ())
+            made = self._write(files, text, people.author(causes, now), now)
+            self.head = self.head.after(made, state, keys)
+
+    def _held_back(
+        self, snapshot: Snapshot, before: Snapshot, subjects: Iterable[Subject]
+    ) -> tuple[Snapshot, list[Subject], list[Fault]]:
+        return holding.held_back(self._objects, snapshot, before, subjects, self.read)
+
+    def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
+        """Return the report on what is not valid, where it is not what stands there already."""
+        standing = self.read(reports.PATH)
+        origin = people.Origins(self._objects, before.sound or before.commit, self.start.commit)
+        wanted = reports.write(reports.reported(problems, reports.read(standing), origin))
+        return {} if wanted == standing else {reports.PATH: wanted}
+
+    def _taken_in(
+        self, state: State, before: Snapshot, subjects: Iterable[Subject], now: datetime
+    ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
+        """Render everything for a configuration that changed."""
+        marked = snapshots.markers_at(self._tree)
+        taken = taken_in(_books(before.state), _books(state), subjects, marked, now)
+        state = _with(state, taken)
+        return state, self.everything(state, taken.files), taken.keys
+
+    def end(self, override: Override, now: datetime) -> None:
+        """Commit that an override's time is over, and what follows.
+
+        Raises:
+            Refused, InvalidInput: where what is left cannot be planned or rendered.
+        """
+        state = self.head.state
+        taken = ended(_books(state), override, now)
+        state = _with(state, taken)
+        change = self.everything(state, taken.files)
+        text = message.of_ended(override, change.releases, _in_force(self.head))
+        made = self._write(change.files, text, message.generator_signature(now), now)
+        self.head = self.head.after(made, state, taken.keys)
 
     def _carried_out(
-        self, state: State, before: Snapshot, subjects: Iterable[Subject], problems: list[Fault]
-    ) -> tuple[State, Changeset]:
+        self,
+        state: State,
+        before: Snapshot,
+        subjects: Iterable[Subject],
+        noted: tuple[list[Fault], datetime],
+    ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
         """Plan and render the subjects that people changed; one that fails stays as it was."""
-        good = []
+        problems, now = noted
+        good, keys = list[Subject](), list[ClaimKey]()
+        books = before.state.ledger
+        files: dict[str, str | None] = {}
         for subject in subjects:
+            ledger, own = keeping.kept(books, state.ledger, [subject], (state.catalog, now))
+            tried = replace(state, ledger=ledger)
             try:
-                consequence(state, before.state.ledger, [subject], self.read)
-                good.append(subject)
+                consequence(tried, books, [subject], self.read)
             except InvalidInput as error:
                 problems += error.faults
-                state = replace(state, ledger=state.ledger.restored(subject, before.state.ledger))
-        return state, consequence(state, before.state.ledger, good, self.read)
+                state = replace(state, ledger=state.ledger.restored(subject, books))
+                continue
+            files |= files_of(state.ledger, ledger, own)
+            state = tried
+            good.append(subject)
+            keys += own
+        change = consequence(state, books, good, self.read)
+        return state, replace(change, files={**files, **change.files}), tuple(keys)
 
-    def _everything(self, state: State) -> Changeset:
-        files: dict[str, str | None] = dict(rendered(state))
+    def everything(
+        self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
+    ) -> Changeset:
+        """Return all generated files that differ from what stands, with ``more`` of the ledger.
+
+        Raises:
+            Refused, InvalidInput: where a release cannot be planned or rendered.
+        """
+        generated = trees.texts(self._tree, GENERATED_ROOTS)
+        files: dict[str, str | None] = dict(rendered(state, generated))
         changes = []
-        standing = {
-            path for path in trees.texts(self._tree, GENERATED_ROOTS) if path.endswith(".yaml")
-        }
+        standing = {path for path in generated if path.endswith(".yaml")}
         for path in standing - set(files):
             files[path] = None
         for path in sorted(files):
@@ -126,7 +234,7 @@ class Line:
             kind: Change = "stop" if files[path] is None else "start" if old is None else "change"
             name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
             changes.append(ReleaseChange(name, kind, path, ()))
-        return Changeset(files, tuple(changes))
+        return Changeset({**more, **files}, tuple(changes))
 
     def _write(
         self, files: Mapping[str, str | None], text: str, author: Signature, now: datetime
@@ -166,6 +274,28 @@ class Line:
         return self._repository.publish(self.start.commit, self.head.commit)
 
 
+def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, str]]:
+    """Start the leases of claims that a person approved; return their files as well.
+
+    A lease that counted from the demand could be over before anybody has approved it.
+    """
+    ledger, files = state.ledger, {}
+    for claim in ledger.unstarted():
+        assert claim.lease is not None  # noqa: S101 - that is what was looked for
+        begun = replace(claim, lease=claim.lease.begun(now))
+        ledger = ledger.replace(claim.key, begun)
+        files[ledger_format.path_of(claim.key)] = ledger_format.write(begun)
+    return replace(state, ledger=ledger), files
+
+
+def _books(state: State) -> tuple[Ledger, Catalog]:
+    return state.ledger, state.catalog
+
+
+def _with(state: State, taken: TakenIn) -> State:
+    return replace(state, ledger=taken.ledger, catalog=taken.catalog)
+
+
 def _in_force(snapshot: Snapshot) -> list[tuple[str, str]]:
     """Return the trailer that names whose configuration is in force, where it is another's."""
     return [("In-Force", str(snapshot.sound))] if snapshot.problems and snapshot.sound else []
@@ -182,7 +312,7 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
         StateRepoError: where this is no state repo.
     """
     tip = repository.tip()
-    snapshots.refuse_newer(snapshots.commit_of(repository.objects, tip).tree)
+    snapshots.refuse_other_rendering(snapshots.commit_of(repository.objects, tip).tree)
     base = history.last_generated(repository.objects, tip)
     base = base or tip
     told = history.entry_of(snapshots.commit_of(repository.objects, base)).one("In-Force")

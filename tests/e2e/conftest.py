@@ -12,6 +12,8 @@ from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 from tests.ros_domain import reserved
 
+pytest.register_assert_rewrite("tests.e2e.common.answers")
+
 
 @pytest.fixture(scope="session")
 def say(request: pytest.FixtureRequest) -> Report:

@@ -31,6 +31,7 @@ CASES = (
     "ros",
     "argocd-experiment",
     "argocd-charts-from-registries",
+    "overrides",
 )
 
 

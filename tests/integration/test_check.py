@@ -29,6 +29,21 @@ def checkout(laid_down: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     return tmp_path / "state-repo"
 
 
+NEW_CHART = """\
+# ChartVersion, not Revision: a commit that leaves the chart alone must not touch its releases.
+apiVersion: source.toolkit.fluxcd.io/v1
+kind: HelmChart
+metadata:
+  name: "object-fusion-0.2.0"
+  namespace: "perception"
+spec:
+  interval: 10m
+  chart: "./appdefs/object-detection-fusion/charts/object-fusion"
+  reconcileStrategy: ChartVersion
+  sourceRef:
+    kind: GitRepository
+    name: "demandops"
+"""
 Check = Callable[..., tuple[int, str, str]]
 
 
@@ -38,14 +53,20 @@ def check(checkout: Path, capsys: pytest.CaptureFixture[str]) -> Check:
         capsys.readouterr()
         code = run(["check", str(checkout), *args])
         printed = capsys.readouterr()
-        return code, printed.out.replace(f"{checkout}", "REPO"), printed.err
+        out = printed.out.replace(f"{checkout}", "REPO").replace(head(checkout)[:10], "BASE")
+        return code, out, printed.err
 
     return checked
 
 
-def git(folder: Path, *args: str) -> None:
+def git(folder: Path, *args: str) -> str:
     who = ["-c", "user.name=someone", "-c", "user.email=someone@example.invalid"]
-    subprocess.run(["git", "-C", str(folder), *who, *args], check=True, capture_output=True)
+    command = ["git", "-C", str(folder), *who, *args]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def head(folder: Path) -> str:
+    return git(folder, "rev-parse", "HEAD") if (folder / ".git").exists() else "0" * 40
 
 
 def edit(file: Path, old: str, new: str) -> None:
@@ -79,9 +100,16 @@ def test_a_chart_that_changed_with_a_new_version_is_fine_and_shows_what_follows(
     assert (code, errors) == (0, "")
     assert out == (
         "REPO: all files are valid and everything renders\n"
-        "the generator will write 2 files anew:\n"
-        "  clusters/c-its/perception/_charts/object-fusion-0.1.0.yaml\n"
-        "  clusters/c-its/perception/_charts/object-fusion-0.2.0.yaml\n"
+        "\n"
+        "what merging would do since BASE:\n"
+        "\n"
+        "the generator will write or remove 2 files:\n"
+        "  remove clusters/c-its/perception/_charts/object-fusion-0.1.0.yaml\n"
+        "  write  clusters/c-its/perception/_charts/object-fusion-0.2.0.yaml\n"
+        "\n"
+        "--- /dev/null\n"
+        "+++ clusters/c-its/perception/_charts/object-fusion-0.2.0.yaml\n"
+        "@@ -0,0 +1,13 @@\n" + "".join(f"+{line}\n" for line in NEW_CHART.splitlines())
     )
 
 
@@ -101,7 +129,7 @@ def test_a_generated_file_edited_by_hand_is_told(checkout: Path, check: Check) -
     assert code == 1
     assert errors == (
         "error: bootstrap/c-its.yaml: is generated, and an edit by hand is lost; take it back, and "
-        "change the configuration that it follows from\n"
+        "change demandops.yaml, inventory/ or policy/access-domains.yaml that it follows from\n"
     )
 
 
@@ -130,13 +158,57 @@ def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None
     edit(checkout / "inventory" / "brokers.yaml", "node: edge", "node: egde")
     code, out, _ = check("--output", "json")
     assert code == 1
-    assert json.loads(out) == {
-        "faults": [
+    found = json.loads(out)
+    assert found["faults"] == [
+        {
+            "file": "inventory/brokers.yaml",
+            "field": "brokers[1].node",
+            "message": "'egde' is not in nodes.yaml; did you mean 'edge'?",
+        }
+    ]
+    assert (found["releases"], found["files"], found["bookkeeping"]) == (None, None, None)
+
+
+def test_the_generators_notes_are_not_edited_by_hand(checkout: Path, check: Check) -> None:
+    """A report that stands is no fault; one that a person changes is."""
+    report = checkout / ".demandops" / "reports" / "problems.yaml"
+    report.parent.mkdir(parents=True)
+    report.write_text("problems: []\n")
+    git(checkout, "add", "--all")
+    git(checkout, "commit", "-qm", "Report what is not valid in the state repo")
+    assert check() == (0, "REPO: all files are valid and everything renders\n", "")
+    report.unlink()
+    code, _, err = check()
+    assert code == 1
+    assert err.startswith("error: .demandops/reports/problems.yaml: is the generator's own")
+
+
+def test_an_application_definition_that_is_in_use_cannot_be_deleted(
+    checkout: Path, check: Check
+) -> None:
+    goal = checkout.parent / "goal.yaml"
+    goal.write_text(
+        json.dumps(
             {
-                "file": "inventory/brokers.yaml",
-                "field": "brokers[1].node",
-                "message": "'egde' is not in nodes.yaml; did you mean 'edge'?",
+                "kind": "Demand",
+                "demand": "d",
+                "requesters": ["vehicle00"],
+                "applications": [
+                    {
+                        "id": "edge/fusion",
+                        "type": "object-detection-fusion",
+                        "node": "edge",
+                        "inputs": {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]},
+                    }
+                ],
             }
-        ],
-        "outdated": [],
-    }
+        )
+    )
+    bare = checkout.parent / "state.git"
+    subprocess.run(["git", "clone", "-q", "--bare", checkout, bare], check=True)
+    assert run(["request", str(goal), "--state-repo", str(bare)]) == 0
+    git(checkout, "pull", "-q", str(bare), "main")
+    (checkout / "appdefs" / "object-detection-fusion" / "appdef.yaml").unlink()
+    code, _, err = check()
+    assert code == 1
+    assert "'object-detection-fusion' is in use, but appdefs/object-detection-fusion is gone" in err

@@ -18,6 +18,11 @@ from tests.golden.cases import start
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 
 
+def unknown(since: str) -> tuple[str, None]:
+    """A state repo whose last commit is not known here."""
+    return "a" * 40, None
+
+
 def write(folder: Path, text: str) -> Path:
     file = folder / "clusters.yaml"
     file.write_text(HEAD + text)
@@ -35,7 +40,7 @@ def test_a_file_names_each_cluster_and_how_it_is_reached(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("clusters: {a: {}}\n", "clusters.a: needs a kubeconfig or a receiver"),
+        ("clusters: {a: {}}\n", "clusters.a: needs a kubeconfig, a receiver or a webhook"),
         ("", "clusters: is missing; add it"),
     ],
 )
@@ -79,7 +84,7 @@ def receiver() -> Iterator[tuple[str, list[str]]]:
 def test_a_receiver_is_called_after_a_push(receiver: tuple[str, list[str]]) -> None:
     url, heard = receiver
     state, _ = start("experiment")
-    waker = wake.Wake({"c-its": access.Reached(receiver=url)})
+    waker = wake.Wake(changed=unknown, clusters={"c-its": access.Reached(receiver=url)})
     waker(state.catalog)
     waker.close()
     assert set(heard) == {"/hook/abc"}
@@ -141,7 +146,7 @@ def test_the_object_that_fetches_is_annotated(
 ) -> None:
     kubeconfig, heard = api
     state, _ = start(case)
-    waker = wake.Wake({"c-its": access.Reached(kubeconfig=kubeconfig)})
+    waker = wake.Wake(changed=unknown, clusters={"c-its": access.Reached(kubeconfig=kubeconfig)})
     waker(state.catalog)
     waker.close()
     assert {asked for asked, _ in heard} == {path}
@@ -150,7 +155,7 @@ def test_the_object_that_fetches_is_annotated(
 
 def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:
     url, heard = receiver
-    wake.Wake({"c-its": access.Reached(receiver=url)}).close()
+    wake.Wake(changed=unknown, clusters={"c-its": access.Reached(receiver=url)}).close()
     assert heard == []
 
 
@@ -160,7 +165,9 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
     url, heard = receiver
     state, _ = start("experiment")
     away = access.Reached(receiver="http://127.0.0.1:1/hook/secret")
-    waker = wake.Wake({"away": away, "here": access.Reached(receiver=url)})
+    waker = wake.Wake(
+        changed=unknown, clusters={"away": away, "here": access.Reached(receiver=url)}
+    )
     waker(state.catalog)
     waker.close()
     assert heard
@@ -172,7 +179,7 @@ def test_a_cluster_that_did_not_answer_is_tried_again(receiver: tuple[str, list[
     """The receiver answers with a failure at first."""
     url, heard = receiver
     state, _ = start("experiment")
-    waker = wake.Wake({"c-its": access.Reached(receiver=f"{url}?fail=1")})
+    waker = wake.Wake(changed=unknown, clusters={"c-its": access.Reached(receiver=f"{url}?fail=1")})
     try:
         waker(state.catalog)
         end = time.monotonic() + 30

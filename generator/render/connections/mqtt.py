@@ -107,5 +107,5 @@ def render(end: MqttEnd, catalog: Catalog, engine: Engine) -> str:
         tls=end.broker.tls,
         credentials=end.broker.credentials,
         compose=COMPOSE,
-        **pod.context(end.node, MQTT_CLIENT_IMAGE, catalog),
+        **pod.context(end, MQTT_CLIENT_IMAGE, catalog),
     )

@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 
 from generator.catalog.catalog import IMAGES_FILE, Catalog
-from generator.catalog.inventory import Node
 from generator.errors import Refused, fault
+from generator.plan.release import Bridge, MqttEnd, RosEnd
 
 
-def context(node: Node, image: str, catalog: Catalog) -> dict[str, object]:
+def context(release: MqttEnd | RosEnd | Bridge, image: str, catalog: Catalog) -> dict[str, object]:
     """Return what every client's template needs.
 
     Raises:
@@ -18,11 +18,12 @@ def context(node: Node, image: str, catalog: Catalog) -> dict[str, object]:
     if image not in catalog.images:
         message = f"'{image}' is in use, but not in {IMAGES_FILE}; add it there"
         raise Refused([fault("images", message, code="unsupported-connection-type")])
+    node = release.node
     return {
         "node": node,
         "selector": node.labels(),
         "tolerations": [item.model_dump(exclude_defaults=True) for item in node.tolerations],
-        "image": catalog.images[image].reference(),
+        "image": release.shaping.image(image, catalog).reference(),
     }
 
 

@@ -115,5 +115,5 @@ def render(end: RosEnd, catalog: Catalog, engine: Engine) -> str:
         configuration=yamlio.dump(data),
         checksum=pod.checksum(yamlio.dump(needs_restart)),
         reload_seconds=RELOAD_SECONDS,
-        **pod.context(end.node, DDS_ROUTER_IMAGE, catalog),
+        **pod.context(end, DDS_ROUTER_IMAGE, catalog),
     )

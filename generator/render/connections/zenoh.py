@@ -59,5 +59,5 @@ def render(bridge: Bridge, catalog: Catalog, engine: Engine) -> str:
         bridge=bridge,
         configuration=text,
         checksum=pod.checksum(text),
-        **pod.context(bridge.node, ZENOH_BRIDGE_IMAGE, catalog),
+        **pod.context(bridge, ZENOH_BRIDGE_IMAGE, catalog),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 
 import pytest
@@ -10,6 +11,7 @@ import yaml
 from tests.e2e.common import expected
 from tests.e2e.common.expected import NODES, STANDING
 from tests.e2e.common.ros import Client
+from tests.e2e.common.staterepo import demandops
 from tests.e2e.flux import view as flux_view
 from tests.e2e.flux.world import World as FluxWorld
 from tests.e2e.rig.argocd import NAMESPACE as CONTROL
@@ -89,17 +91,29 @@ def from_flux(domain: flux_view.Domain) -> None:
             domain.kube.patch(kind, item["metadata"]["name"], SUSPENDED, domain.namespace)
 
 
+def upgrade(world: FluxWorld, gitops: str) -> str:
+    """Go over to a controller in one commit, while the generator runs; return the commit."""
+    before = world.tip()
+    options = ("--gitops", gitops, "--output", "json")
+    said = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)
+    assert world.commits_since(before) == 1
+    commit = json.loads(said)["commit"]
+    assert commit == world.tip()
+    return str(commit)
+
+
 def to_argocd(world: FluxWorld) -> Domain:
-    """Choose Argo CD, have the next demand render everything anew, and let Argo CD follow."""
-    root = world.file("demandops.yaml").replace("gitops: flux\n", "gitops: argocd\n")
-    url = world.rig.git_url(world.name)
-    world.push({"demandops.yaml": f"{root}argocd:\n  url: {url}\n"})
-    sent = world.demand(expected.demand(2))
+    """Have everything rendered for Argo CD, let it follow, and demand the next step."""
+    upgraded = upgrade(world, "argocd")
     manifests = list(yaml.safe_load_all(world.file(f"bootstrap/{CLUSTER}.yaml")))
     world.rig.kube.apply(*manifests)
     folder = manifests[-1]
     destination = folder["spec"]["destination"]["namespace"]
     domain = Domain(world.rig.kube, destination, folder["metadata"]["name"])
+    domain.wait_applied(upgraded)
+    domain.wait_releases_synced()
+    sent = world.demand(expected.demand(2))
+    domain.wake()
     domain.wait_applied(sent.commit)
     domain.wait_releases_synced()
     return domain
@@ -128,8 +142,7 @@ def forget_argocd(domain: Domain) -> None:
 
 
 def to_flux(world: FluxWorld) -> None:
-    """Choose Flux, have the next demand render everything anew, and let Flux follow."""
-    root = world.file("demandops.yaml").replace("gitops: argocd\n", "gitops: flux\n")
-    world.push({"demandops.yaml": root})
+    """Have everything rendered for Flux, and let it follow while demands go on."""
+    upgrade(world, "flux")
     world.demand(expected.demand(4))
     world.bootstrap(CLUSTER, world.rig)

@@ -1,19 +1,22 @@
-"""Argo CD's application-controller and repo-server, and their Redis, as plain processes.
+"""Argo CD's application-controller, repo-server and server, and their Redis, as plain processes.
 
-One program takes both parts, by `ARGOCD_BINARY_NAME`. The controller runs as the cluster's
+One program takes all parts, by `ARGOCD_BINARY_NAME`. The server is there for its webhook. The
+controller runs as the cluster's
 administrator; what a release may do is limited by its AppProject and by the service account that
 is impersonated for it, as docs/argocd.md asks for. Redis is the machine's own `redis-server`.
 """
 
 from __future__ import annotations
 
+import base64
 import os
+import secrets
 import shutil
 from pathlib import Path
 
 from .errors import RigError
 from .kube import Manifest
-from .net import LOOPBACK, accepts, answers, free_port
+from .net import LOOPBACK, accepts, answers, free_port, url
 from .processes import Component
 
 NAMESPACE = "argocd"
@@ -22,6 +25,9 @@ REMEDY = "install Argo CD there first, set up as docs/argocd.md says"
 REDIS = "redis-server"
 CONTROLLER = "argocd-application-controller"
 REPO_SERVER = "argocd-repo-server"
+SERVER = "argocd-server"
+WEBHOOK_SECRET = secrets.token_hex(16)
+"""What calls of the server's webhook are signed with."""
 
 
 def settings() -> list[Manifest]:
@@ -39,6 +45,9 @@ def settings() -> list[Manifest]:
             "apiVersion": "v1",
             "kind": "Secret",
             "metadata": {"name": "argocd-secret", "namespace": NAMESPACE, "labels": labels},
+            "data": {
+                "webhook.github.secret": base64.b64encode(WEBHOOK_SECRET.encode()).decode(),
+            },
         },
     ]
 
@@ -46,8 +55,8 @@ def settings() -> list[Manifest]:
 def components(
     binaries: dict[str, Path], folder: Path, kubeconfig: Path, own: dict[str, list[str]]
 ) -> list[Component]:
-    """Redis and the two parts; `own` holds further arguments by component name."""
-    redis, repo_server, data = free_port(), free_port(), folder / "argocd"
+    """Redis and the three parts; `own` holds further arguments by component name."""
+    redis, repo_server, server_port, data = free_port(), free_port(), free_port(), folder / "argocd"
     data.mkdir(parents=True, exist_ok=True)
     cache = f"--redis={LOOPBACK}:{redis}"
     controller = [
@@ -60,12 +69,24 @@ def components(
         # Tests wait for what this shortens: up to five minutes after repeated edits by hand.
         "--self-heal-backoff-cap-seconds=3",
     ]
-    server = [
+    manifests = [
         cache,
         f"--address={LOOPBACK}",
         f"--port={repo_server}",
         f"--metrics-address={LOOPBACK}",
         "--disable-tls",
+    ]
+    server = [
+        f"--kubeconfig={kubeconfig}",
+        f"--namespace={NAMESPACE}",
+        cache,
+        f"--address={LOOPBACK}",
+        f"--port={server_port}",
+        f"--metrics-address={LOOPBACK}",
+        f"--repo-server={LOOPBACK}:{repo_server}",
+        "--repo-server-plaintext",
+        "--application-namespaces=*",
+        "--insecure",
     ]
     environment = {
         "ARGOCD_FAKE_IN_CLUSTER": "true",  # "in the cluster" is what the kubeconfig names
@@ -76,11 +97,13 @@ def components(
         "KUBECONFIG": str(kubeconfig),
         "PATH": f"{binaries['helm'].parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}",
     }
-    return [
-        _redis(redis, data),
-        _part(REPO_SERVER, binaries["argocd"], [*server, *own.get(REPO_SERVER, [])], environment),
-        _part(CONTROLLER, binaries["argocd"], [*controller, *own.get(CONTROLLER, [])], environment),
+    program = binaries["argocd"]
+    parts = [
+        _part(REPO_SERVER, program, [*manifests, *own.get(REPO_SERVER, [])], environment),
+        _part(CONTROLLER, program, [*controller, *own.get(CONTROLLER, [])], environment),
+        _part(SERVER, program, [*server, *own.get(SERVER, [])], environment, server_port),
     ]
+    return [_redis(redis, data), *parts]
 
 
 def _redis(port: int, folder: Path) -> Component:
@@ -93,11 +116,18 @@ def _redis(port: int, folder: Path) -> Component:
     return Component(REDIS, (*argv, "--save", "", "--appendonly", "no"), accepts(port))
 
 
-def _part(name: str, binary: Path, arguments: list[str], environment: dict[str, str]) -> Component:
+def _part(
+    name: str,
+    binary: Path,
+    arguments: list[str],
+    environment: dict[str, str],
+    serves: int | None = None,
+) -> Component:
     port = free_port()  # of its health; the controller's is on all addresses, it has no flag
     return Component(
         name,
         (str(binary), f"--metrics-port={port}", "--loglevel=info", *arguments),
-        answers(port, "/healthz"),
+        answers(serves or port, "/healthz"),
         {**environment, "ARGOCD_BINARY_NAME": name},
+        url=url(serves) if serves else "",
     )

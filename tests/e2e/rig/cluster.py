@@ -183,6 +183,10 @@ class Rig:
         """A part's log file."""
         return self._own().log(component)
 
+    def url(self, component: str) -> str:
+        """Where a part serves, for those that tests call."""
+        return self._own().url(component)
+
     def kill(self, component: str) -> None:
         """End a part as a crash would; `start_component` brings it back."""
         self._own().kill(component)

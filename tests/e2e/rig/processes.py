@@ -31,7 +31,7 @@ _GROUP_SECONDS = 3.0  # an init that does not reap its orphans must not hold a s
 
 @dataclass(frozen=True)
 class Component:
-    """How one process is started and when it counts as ready."""
+    """How one process is started, when it counts as ready, and where it serves (`url`)."""
 
     name: str
     argv: tuple[str, ...]
@@ -39,6 +39,7 @@ class Component:
     environment: Mapping[str, str] = field(default_factory=dict)
     ready_seconds: float = 90.0
     stop_seconds: float = 10.0
+    url: str = ""
 
 
 class Processes:
@@ -131,6 +132,10 @@ class Processes:
     def names(self) -> list[str]:
         """All components, in the order of their start."""
         return list(self._components)
+
+    def url(self, name: str) -> str:
+        """Where a component serves what tests ask of it."""
+        return self._known(name).url
 
     def log(self, name: str) -> Path:
         """The log file of a component; it goes on through restarts."""

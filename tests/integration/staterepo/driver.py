@@ -23,6 +23,7 @@ from generator.service import Generator, Receipt
 from generator.staterepo.cloned import ClonedRepository
 from generator.staterepo.embedded import EmbeddedRepository
 from generator.staterepo.outbox import Outbox
+from generator.staterepo.proposals import Branches
 from generator.staterepo.writer import Line
 
 Demand = dict[str, Any]
@@ -86,6 +87,12 @@ def arm(where: str) -> None:
         _after(EmbeddedRepository, "publish", at)
     elif point == "unanswered":
         _after(Outbox, "done", at)
+    elif point == "proposing":
+        _before(Branches, "put", at)
+    elif point == "proposed":
+        _after(Branches, "put", at)
+    elif point == "retracting":
+        _before(Branches, "remove", at)
     elif point == "withdrawn":
         Lanes.withdrawn = staticmethod(at)  # type: ignore[method-assign]
     elif point:

@@ -119,6 +119,7 @@ def test_an_edited_inventory_is_carried_out_before_the_next_demand(
         "Operation": "follow",
         "Follows": made,
         "Since": first.id,
+        "Caused-By": f"{made} Petra Platform <petra@example.org>",
         "Render-Version": "1",
     }
     changed = rig.git(bare, "diff-tree", "-r", "--name-only", "--no-commit-id", follow.id)
@@ -175,7 +176,7 @@ def test_an_invalid_inventory_leaves_its_last_valid_version_in_force_and_is_logg
     if not running:
         with rig.running(address) as generator:
             broken_and_mended(generator)
-    assert _kinds(bare) == ["join", "person", "join", "person", "join"]
+    assert _kinds(bare) == ["join", "person", "follow", "join", "person", "follow", "join"]
     errors = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
     assert any(
         text.startswith(f"{NODES}: ") and text.endswith("(its last valid version stays in force)")
@@ -192,7 +193,7 @@ def test_an_inventory_still_invalid_at_a_restart_leaves_its_last_valid_version_i
     _around(address, True, [goal(1)], lambda: _break_nodes(person), [goal(2)])
     with rig.running(address) as generator:
         rig.book(generator, goal(3))
-    assert _kinds(bare) == ["join", "person", "join", "join"]
+    assert _kinds(bare) == ["join", "person", "follow", "join", "join"]
 
 
 def test_a_claim_still_broken_at_a_restart_leaves_its_last_valid_version_in_force(
@@ -201,7 +202,7 @@ def test_a_claim_still_broken_at_a_restart_leaves_its_last_valid_version_in_forc
     _around(address, True, [goal(1)], lambda: _break_claim(bare)(person), [goal(2)])
     with rig.running(address) as generator:
         rig.book(generator, goal(3), leave(1))
-    assert _kinds(bare) == ["join", "person", "join", "join", "shutdown"]
+    assert _kinds(bare) == ["join", "person", "follow", "join", "join", "shutdown", "follow"]
     assert rig.books(bare) == rig.books_after([goal(2), goal(3)])
 
 
@@ -210,7 +211,7 @@ def test_a_broken_claim_file_leaves_the_claim_as_it_was_and_is_logged(
     address: str, bare: Path, person: Person, running: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     _around(address, running, [goal(1)], lambda: _break_claim(bare)(person), [goal(2)])
-    assert _kinds(bare) == ["join", "person", "join"]
+    assert _kinds(bare) == ["join", "person", "follow", "join"]
     fusions = rig.git(bare, "ls-tree", "-r", "--name-only", "main", "clusters/")
     assert "of-edge-fusion-1" in fusions, "the claim stands, so its fusion runs"
     assert any(

@@ -51,7 +51,7 @@ def test_goals_stay_open_while_the_remote_is_away_and_are_published_once_it_is_b
     assert [receipt.commit for receipt in receipts] == [commit.id for commit in rig.commits(bare)][
         1:
     ]
-    assert stages.names == ["admitted", "booked", "committed", "pushed"], "each told once"
+    assert stages.names == ["admitted", "booked", "committed", "away", "pushed"], "each told once"
     assert rig.books(bare) == rig.books_after(map(goal, range(4)))
     rig.assert_sound(bare)
 

@@ -1,4 +1,4 @@
-"""What objects say about releases, told from objects as the API gives them."""
+"""What Flux's objects say about releases, told from objects as the API gives them."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from typing import Any
 
 import pytest
 
-from generator.cluster.health import Health, Place, Target, of_place, of_target, since, worst
+from generator.cluster.health import Health, Place, Target, reading, worst
+from tests.unit.cluster.commits import Letters
 
+COMMITS = Letters()
 PLACE = Place("c-its", "perception", "ns")
 SERVICE = Target(PLACE, "od-edge", by_helm=True)
 CLIENT = Target(PLACE, "mqtt-a", by_helm=False)
 GONE = Target(PLACE, "od-edge", by_helm=True, wanted=False)
+FLUX = reading(PLACE)
 
 
 def condition(kind: str, status: str, message: str = "") -> dict[str, str]:
@@ -39,11 +42,6 @@ def deployment(name: str, *conditions: Any, of: str = "", **status: Any) -> dict
     return {"metadata": metadata, "spec": {"replicas": 2}, "status": found}
 
 
-def after(commit: str, other: str) -> bool:
-    """Commits are named by letters, in order."""
-    return commit >= other
-
-
 @pytest.mark.parametrize(
     ("found", "state", "reason", "failing"),
     [
@@ -61,7 +59,7 @@ def test_an_access_domain_is_as_far_as_its_kustomization(
     found: dict[str, Any] | None, state: str, reason: str, failing: bool
 ) -> None:
     objects = {("Kustomization", "ns", "perception"): found} if found else {}
-    health = of_place(PLACE, "b", objects, after)
+    health = FLUX.of_place(PLACE, "b", objects, COMMITS)
     assert (health.state, health.failing) == (state, failing)
     assert reason in health.reason
 
@@ -72,7 +70,7 @@ def test_a_source_that_cannot_be_fetched_is_the_reason() -> None:
         ("Kustomization", "ns", "perception"): kustomization("a", "a"),
         ("GitRepository", "ns", "demandops"): source,
     }
-    health = of_place(PLACE, "b", objects, after)
+    health = FLUX.of_place(PLACE, "b", objects, COMMITS)
     assert health == Health("waiting", "no route", "GitRepository ns/demandops", failing=True)
 
 
@@ -106,24 +104,27 @@ def test_a_service_is_healthy_when_helm_and_all_its_deployments_are(
 ) -> None:
     keys = {"r": ("HelmRelease", "ns", "od-edge"), "d": ("Deployment", "ns", "x")}
     found = {keys[short]: item for short, item in objects.items()}
-    health = of_target(SERVICE, found)
+    health = FLUX.of_target(SERVICE, "b", found, COMMITS)
     assert (health.state, health.failing) == (state, failing)
     assert reason in health.reason
 
 
 def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
     key = ("Deployment", "ns", "mqtt-a")
-    assert of_target(CLIENT, {}).state == "reconciled"
-    assert of_target(CLIENT, {key: deployment("mqtt-a")}).state == "healthy"
-    assert of_target(CLIENT, {key: deployment("mqtt-a", availableReplicas=0)}).state == "reconciled"
+    assert FLUX.of_target(CLIENT, "b", {}, COMMITS).state == "reconciled"
+    assert FLUX.of_target(CLIENT, "b", {key: deployment("mqtt-a")}, COMMITS).state == "healthy"
+    assert (
+        FLUX.of_target(CLIENT, "b", {key: deployment("mqtt-a", availableReplicas=0)}, COMMITS).state
+        == "reconciled"
+    )
 
 
 def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
     helm = {("HelmRelease", "ns", "od-edge"): release(READY)}
     left = {("Deployment", "ns", "x"): deployment("x", of="od-edge")}
-    assert of_target(GONE, helm).state == "reconciled"
-    assert of_target(GONE, left).state == "reconciled"
-    assert of_target(GONE, {}).state == "healthy"
+    assert FLUX.of_target(GONE, "b", helm, COMMITS).state == "reconciled"
+    assert FLUX.of_target(GONE, "b", left, COMMITS).state == "reconciled"
+    assert FLUX.of_target(GONE, "b", {}, COMMITS).state == "healthy"
 
 
 def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
@@ -135,8 +136,8 @@ def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
 
 def test_since_when_is_the_cluster_s_to_say() -> None:
     found = {("HelmRelease", "ns", "od-edge"): release(READY)}
-    assert since(SERVICE, found) == "2026-05-04T12:00:00Z"
-    assert since(CLIENT, found) == ""
+    assert FLUX.since(SERVICE, found) == "2026-05-04T12:00:00Z"
+    assert FLUX.since(CLIENT, found) == ""
 
 
 @pytest.mark.parametrize(

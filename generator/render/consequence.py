@@ -1,0 +1,155 @@
+"""What a change of configuration or books would do to everything that is rendered. Pure.
+
+Unlike a demand's changeset, which looks at what it touches, this looks at everything, for
+configuration may change anything.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+from generator import yamlio
+from generator.catalog.catalog import Catalog
+from generator.demand.claim import Subject, SubjectKind
+from generator.errors import Fault, InvalidInput
+from generator.ledger import format as ledger_format
+from generator.ledger.ledger import Ledger
+from generator.plan.planner import ReleaseKey, all_keys, keys_of, plan
+from generator.plan.release import Release
+from generator.render import gitops
+from generator.render.changeset import ReleaseChange, described
+from generator.render.edits import leaves
+from generator.render.engine import Engine
+from generator.render.handedit import value_of
+from generator.render.paths import path_of
+
+_MOST_FACTS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class FileChange:
+    """A generated file as it is and as it would be; nothing: it is not there."""
+
+    path: str
+    before: str | None
+    after: str | None
+
+    def diff(self) -> Iterator[str]:
+        """Yield the lines of a unified diff."""
+        return difflib.unified_diff(
+            (self.before or "").splitlines(),
+            (self.after or "").splitlines(),
+            self.path if self.before is not None else "/dev/null",
+            self.path if self.after is not None else "/dev/null",
+            lineterm="",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Consequence:
+    """The releases that would start, change or stop, and every file that would be written."""
+
+    releases: tuple[ReleaseChange, ...]
+    files: tuple[FileChange, ...]
+
+
+def releases_of(ledger: Ledger, catalog: Catalog) -> dict[ReleaseKey, Release]:
+    """Return what runs; what cannot be planned any more is passed over."""
+    found: dict[ReleaseKey, Release] = {}
+    for key in all_keys(ledger, catalog):
+        try:
+            release = plan(ledger, catalog, key)
+        except InvalidInput:
+            continue
+        if release is not None:
+            found[key] = release
+    return found
+
+
+def faults(
+    ledger: Ledger, catalog: Catalog, engine: Engine, edited: Collection[str] = ()
+) -> list[Fault]:
+    """Return what keeps releases from being planned or rendered, of all of them.
+
+    Each is told to be in a claim's file where it is in no other: in one of ``edited`` if there is
+    one among those that ask for the release.
+    """
+    found: list[Fault] = []
+    asking: dict[ReleaseKey, list[str]] = {}
+    for key in all_keys(ledger, catalog):
+        try:
+            release = plan(ledger, catalog, key)
+            if release is not None:
+                gitops.render(release, catalog, engine)
+        except InvalidInput as error:
+            asking = asking or _claim_files(ledger, catalog)
+            found += _located(error.faults, asking.get(key, []), edited)
+    return list(dict.fromkeys(found))
+
+
+def _claim_files(ledger: Ledger, catalog: Catalog) -> dict[ReleaseKey, list[str]]:
+    """Return by release the files of the claims that ask for it."""
+    found: dict[ReleaseKey, list[str]] = {}
+    for subject in (Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)):
+        files = [ledger_format.path_of(claim.key) for claim in ledger.of(subject)]
+        for key in keys_of(ledger, catalog, subject):
+            found.setdefault(key, []).extend(files)
+    return found
+
+
+def _located(
+    faults: Iterable[Fault], claims: list[str], edited: Collection[str]
+) -> Iterator[Fault]:
+    place = next((path for path in claims if path in edited), (claims or [""])[0])
+    for found in faults:
+        yield found if found.file else found.within(place)
+
+
+def consequence(
+    old: Mapping[ReleaseKey, Release],
+    new: Mapping[ReleaseKey, Release],
+    standing: Mapping[str, str],
+    files: Mapping[str, str],
+) -> Consequence:
+    """Return what it takes to get from what stands to what is wanted.
+
+    Args:
+        old, new: the releases before and after.
+        standing, files: the generated files before and after.
+    """
+    changes = tuple(
+        FileChange(path, standing.get(path), files.get(path))
+        for path in sorted({*standing, *files})
+        if standing.get(path) != files.get(path)
+    )
+    touched = {change.path for change in changes}
+    told = []
+    for key in dict.fromkeys([*old, *new]):
+        was, will = old.get(key), new.get(key)
+        before = path_of(was) if was else None
+        after = path_of(will) if will else None
+        if before not in touched and after not in touched:
+            continue
+        stands = standing.get(before or after or "")
+        change = described(was, will, stands is not None)
+        if change.change == "change" and not change.details:
+            facts = _facts(stands or "", files.get(after or "", ""))
+            change = replace(change, details=tuple(facts))
+        told.append(change)
+    order = ["start", "change", "stop"]
+    told.sort(key=lambda change: (order.index(change.change), change.name))
+    return Consequence(tuple(told), changes)
+
+
+def _facts(before: str, after: str) -> Iterator[str]:
+    """Yield what differs in a manifest, for a change that the plan has no words for."""
+    try:
+        differing = list(leaves(list(yamlio.load_all(before)), list(yamlio.load_all(after))))
+    except InvalidInput:
+        return
+    for path, old, new in differing[:_MOST_FACTS]:
+        yield f"{path.removeprefix('[0].')}: {value_of(old)} → {value_of(new)}"
+    if len(differing) > _MOST_FACTS:
+        yield f"and {len(differing) - _MOST_FACTS} more"

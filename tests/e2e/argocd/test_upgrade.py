@@ -1,0 +1,48 @@
+"""The state repo goes over to Flux while this cluster's Argo CD was not taken off: all runs on.
+
+`demandops upgrade` prints what to do before; a cluster that was out of reach could not be told.
+"""
+
+from __future__ import annotations
+
+from tests.e2e.common import expected
+from tests.e2e.common.staterepo import demandops
+from tests.e2e.rig.argocd import NAMESPACE
+
+from .world import World
+
+
+def test_an_argo_cd_that_was_not_taken_off_fails_and_leaves_alone_what_runs(world: World) -> None:
+    domain = world.domain
+    world.step(1, expected.after(1))
+    domain.wait_releases_synced()
+    before, releases = identities(world), domain.releases()
+    assert before
+    assert len(releases) == 3
+
+    demandops(world.folder, "upgrade", "--state-repo", world.push_url, "--gitops", "flux")
+    domain.wake()
+    domain.wait_fetched(world.tip())
+    domain.kube.wait(  # a trouble that is tried again is none for a moment
+        "Argo CD to fail at the HelmReleases",
+        lambda: "HelmRelease" in domain.trouble(domain.name, NAMESPACE),
+    )
+    assert identities(world) == before
+    assert domain.releases() == releases
+
+    demandops(world.folder, "upgrade", "--state-repo", world.push_url, "--gitops", "argocd")
+    domain.wake()
+    domain.wait_applied(world.tip())
+    assert identities(world) == before
+    for step in (2, 3):
+        world.step(step, expected.after(step))
+
+
+def identities(world: World) -> dict[str, object]:
+    """Deployments and their pods by name."""
+    found = {}
+    for item in world.domain.find("Deployment"):
+        name = item["metadata"]["name"]
+        uid, _, *below = world.domain.identity(name)
+        found[name] = (uid, *below)
+    return found

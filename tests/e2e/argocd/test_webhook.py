@@ -1,0 +1,114 @@
+"""Argo CD's own server takes the generator's signed calls, and no others."""
+
+from __future__ import annotations
+
+import urllib.error
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from generator.cluster import webhook
+from ros_bridge.client import DemandClient
+from tests.e2e.common.access import access_file, documented_roles, limited
+from tests.e2e.common.answers import TIMEOUT_S, fusion, restarted, with_chart
+from tests.e2e.common.namespace import name_of
+from tests.e2e.common.ros import Client
+from tests.e2e.rig.argocd import SERVER, WEBHOOK_SECRET
+from tests.e2e.rig.cluster import Rig
+
+from .conftest import CLUSTER
+from .world import World
+
+OF_CHART = "\n---\napiVersion: v1\nkind: ConfigMap\nmetadata: {name: {{ .Release.Name }}-new}\n"
+
+
+@pytest.fixture(scope="module")
+def world(
+    rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[World]:
+    """Its generator calls the webhook, and may read the cluster and change nothing there."""
+    if rig.existing:
+        pytest.skip("the secret of this Argo CD's webhook is not known here")
+    made = World(rig, tmp_path_factory.mktemp("world"), ros_domain, client)
+    try:
+        made.bootstrap(CLUSTER)
+        secret = made.folder / "secret"
+        secret.touch(mode=0o600)
+        secret.write_text(f"{WEBHOOK_SECRET}\n")
+        rights = {
+            namespace: [
+                {**rule, "verbs": [verb for verb in rule["verbs"] if verb != "patch"]}
+                for rule in rules
+            ]
+            for namespace, rules in documented_roles("argo cd").items()
+        }
+        access_file(
+            made.folder,
+            CLUSTER,
+            kubeconfig=limited(rig.kube, rig.kubeconfig, made.folder, rights),
+            webhook=f"{rig.url(SERVER)}/api/webhook",
+            secret_file=secret,
+        )
+        restarted(made, TIMEOUT_S)
+        yield made
+    finally:
+        made.remove()
+
+
+@pytest.fixture
+def asker(ros_domain: int) -> Iterator[DemandClient]:
+    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=2 * TIMEOUT_S) as made:
+        yield made
+
+
+@pytest.fixture
+def refreshed(rig: Rig) -> Callable[[], set[str]]:
+    """The Applications that the server had looked at since the test began or it was asked last."""
+    log, seen = rig.log(SERVER), rig.log(SERVER).stat().st_size
+
+    def names() -> set[str]:
+        nonlocal seen
+        with log.open("rb") as file:
+            file.seek(seen)
+            text = file.read().decode()
+        seen += len(text.encode())
+        said = (line for line in text.splitlines() if "from webhook" in line)
+        return {line.split("refreshing app '")[1].split("'")[0] for line in said}
+
+    return names
+
+
+def test_a_push_is_heard_of_and_only_what_changed_is_looked_at(
+    world: World, asker: DemandClient, refreshed: Callable[[], set[str]]
+) -> None:
+    asker.put("d", [fusion("vehicle00")], answer="healthy")
+    refreshed()  # with the first call everything may be
+    answer = asker.put("e", [fusion("vehicle00")], answer="healthy")
+    assert all(path.startswith("ledger/") for path in world.changed_by(answer.commit))
+    assert refreshed() == {world.domain.name}
+    asker.release("e")
+
+
+def test_a_chart_edited_in_its_folder_is_what_healthy_is_of(
+    world: World, asker: DemandClient, refreshed: Callable[[], set[str]]
+) -> None:
+    asker.put("d", [fusion("vehicle00")], answer="healthy")
+    whole = with_chart(world, OF_CHART)
+    asker.put("d", [fusion("vehicle00", "vehicle01")], answer="healthy")
+    made = {name_of(item) for item in world.domain.find("ConfigMap")}
+    assert "od-edge-vehicle00-new" in made
+    assert "od-edge-vehicle00" in refreshed()
+    world.push(dict(whole))
+    asker.send({"operation": "release", "demand": "d", "answer": "healthy"})
+
+
+@pytest.mark.parametrize("secret", [None, b"another"])
+def test_a_call_with_another_signature_or_none_is_refused(
+    world: World, rig: Rig, secret: bytes | None
+) -> None:
+    call = webhook.to_argocd(rig.git_url(world.name), "", world.tip(), None)
+    url = f"{rig.url(SERVER)}/api/webhook"
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        webhook.send(url, call, secret, 5)
+    assert caught.value.code == 400
+    webhook.send(url, call, WEBHOOK_SECRET.encode(), 5)

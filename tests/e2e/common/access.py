@@ -1,0 +1,72 @@
+"""How the generator reaches a cluster: the operator's file, and a kubeconfig with few rights."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tests.e2e.rig.kube import Kube, Manifest
+
+_RBAC = "rbac.authorization.k8s.io"
+_ACCOUNT = "generator"
+_STATUS_PAGE = Path(__file__).parents[3] / "docs" / "status.md"
+
+
+def access_file(folder: Path, cluster: str, **reached: object) -> Path:
+    """What the operator of the generator writes."""
+    file = folder / "clusters.yaml"
+    clusters = {cluster: {key: str(value) for key, value in reached.items()}}
+    content = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": clusters}
+    file.write_text(yaml.safe_dump(content))
+    return file
+
+
+def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
+    """The rights that docs/status.md asks for with a controller, by namespace."""
+    blocks = re.findall(r"```yaml\n(.*?)```", _STATUS_PAGE.read_text(), re.DOTALL)
+    (block,) = [text for text in blocks if f"# with {gitops}\n" in text.lower()]
+    roles = list(yaml.safe_load_all(block))
+    return {role["metadata"]["namespace"]: role["rules"] for role in roles}
+
+
+def limited(
+    kube: Kube, administrator: Path, folder: Path, rights: Mapping[str, Sequence[Manifest]]
+) -> Path:
+    """A kubeconfig that has these rights in these namespaces and no others."""
+    home, *_ = rights
+    subject = {"kind": "ServiceAccount", "name": _ACCOUNT, "namespace": home}
+    role = {"apiGroup": _RBAC, "kind": "Role", "name": _ACCOUNT}
+    kube.apply(
+        _object("v1", "ServiceAccount", home),
+        _object("v1", "Secret", home, type="kubernetes.io/service-account-token"),
+    )
+    for namespace, rules in rights.items():
+        kube.apply(
+            _object(f"{_RBAC}/v1", "Role", namespace, rules=list(rules)),
+            _object(f"{_RBAC}/v1", "RoleBinding", namespace, roleRef=role, subjects=[subject]),
+        )
+
+    def token() -> str:
+        return str(((kube.get("Secret", _ACCOUNT, home) or {}).get("data") or {}).get("token", ""))
+
+    found = base64.b64decode(kube.wait("a token", token)).decode()
+    config = yaml.safe_load(administrator.read_text())
+    config["users"] = [{"name": _ACCOUNT, "user": {"token": found}}]
+    (context,) = [c for c in config["contexts"] if c["name"] == config["current-context"]]
+    context["context"]["user"] = _ACCOUNT
+    config["contexts"] = [context]
+    file = folder / "generator.kubeconfig"
+    file.write_text(yaml.safe_dump(config))
+    return file
+
+
+def _object(version: str, kind: str, namespace: str, **rest: Any) -> dict[str, Any]:
+    metadata: dict[str, Any] = {"name": _ACCOUNT, "namespace": namespace}
+    if kind == "Secret":
+        metadata["annotations"] = {"kubernetes.io/service-account.name": _ACCOUNT}
+    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}

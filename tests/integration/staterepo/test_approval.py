@@ -1,0 +1,586 @@
+"""Demands that need approval wait on a branch; what a person does with it decides.
+
+The person's part is played by git itself: merges, squashes, rebases, deleted branches.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import staterepo_rig as rig
+import yaml
+from approving import Petra, Proposed, branches
+from git_over_http import serving
+from staterepo_rig import git, goal, leave
+
+from generator.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
+from generator.service import Ticket, approval
+
+
+@pytest.fixture(autouse=True)
+def _eager(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have branches looked at often."""
+    monkeypatch.setattr(approval, "ASK_EMBEDDED_S", 0.05)
+    monkeypatch.setattr(approval, "ASK_REMOTE_S", 0.1)
+
+
+@pytest.fixture
+def petra(bare: Path, tmp_path: Path) -> Petra:
+    made = Petra(bare, tmp_path / "petra")
+    made.policy(approval="required")
+    return made
+
+
+def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_it(
+    address: str, bare: Path, petra: Petra
+) -> None:
+    before = rig.tip(bare)
+    with rig.running(address) as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        branch = proposed.branch
+        assert branches(bare) == [branch]
+        assert branch.startswith("demand/demand-1-")
+        assert rig.tip(bare) == before and not proposed.ticket.future.done()
+        assert "(asked for by access domain '" in proposed.told[-1][1]
+        [commit] = rig.commits(bare, f"main..{branch}")
+        assert dict(commit.trailers)["Proposal"] == branch
+        assert commit.one("Operation-Id") == "op-1"
+        petra.merge(branch, "--ff-only")
+        receipt = rig.receipt(proposed.ticket)
+        assert (receipt.outcome, receipt.commit) == ("booked", commit.id)
+        rig.wait_until(lambda: not branches(bare), "the merged branch is taken away")
+    assert [stage for stage, _ in proposed.told] == ["admitted", "booked", "proposed", "pushed"]
+    assert rig.books(bare) == rig.books_after([goal(1)])
+    assert rig.restart(address) is True
+    assert rig.tip(bare) == commit.id, "the merge fits, so nothing follows"
+
+
+Way = Callable[[Petra, str], None]
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        pytest.param(lambda p, b: p.merge(b, "--ff"), id="fast-forward"),
+        pytest.param(lambda p, b: p.merge(b, "--no-ff", "-m", "Merge it"), id="merge-commit"),
+        pytest.param(lambda p, b: p.squash(b, "Squashed, and its trailers lost"), id="squash"),
+        pytest.param(
+            lambda p, b: p.squash(b, f"Squashed\n\n{git(p.bare, 'log', '-1', '--format=%B', b)}"),
+            id="squash-with-trailers",
+        ),
+        pytest.param(Petra.rebase, id="rebase"),
+    ],
+)
+@pytest.mark.parametrize("moved", [False, True], ids=["same-main", "main-moved-on"])
+def test_however_it_is_merged_the_demand_is_booked_and_the_files_fit(
+    bare: Path, petra: Petra, way: Way, moved: bool
+) -> None:
+    with rig.running(bare) as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        branch = proposed.branch
+        if moved:
+            petra.change({"inventory/README.md": "Ours"})
+        way(petra, branch)
+        assert proposed.outcome() == "booked"
+        rig.wait_until(lambda: not branches(bare), "the merged branch is taken away")
+    assert rig.books(bare) == rig.books_after([goal(1)])
+    assert_rendered(bare)
+
+
+def assert_rendered(bare: Path) -> None:
+    """What stands below clusters/ is what the books and the configuration give."""
+    import pygit2
+
+    from generator.decision import rendered
+    from generator.staterepo import snapshot as snapshots
+    from generator.staterepo import tree as trees
+
+    repo = pygit2.Repository(str(bare))
+    state = snapshots.load(repo, "main").state
+    stands = trees.texts(repo.revparse_single("main").peel(pygit2.Tree), ("clusters",))
+    stands = {path: text for path, text in stands.items() if path.endswith(".yaml")}
+    wanted = {p: t for p, t in rendered(state).items() if p.startswith("clusters/")}
+    assert stands == {path: text for path, text in wanted.items() if path.endswith(".yaml")}
+
+
+def test_a_deleted_branch_turns_the_demand_down(address: str, bare: Path, petra: Petra) -> None:
+    before = rig.tip(bare)
+    with rig.running(address) as generator:
+        proposed = Proposed(generator, goal(1))
+        branch = proposed.branch
+        petra.delete(branch)
+        with pytest.raises(TurnedDown) as error:
+            rig.receipt(proposed.ticket)
+    assert str(error.value) == f"was turned down: {branch} is gone and was not merged"
+    assert (rig.tip(bare), branches(bare)) == (before, [])
+    assert rig.restart(address) is True
+    assert branches(bare) == []
+
+
+def test_a_demand_that_waits_can_be_taken_back(address: str, bare: Path, petra: Petra) -> None:
+    with rig.running(address) as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        assert [proposed.branch] == branches(bare)
+        assert generator.withdraw("op-1") is True
+        with pytest.raises(Withdrawn):
+            rig.receipt(proposed.ticket)
+        assert branches(bare) == []
+    assert rig.claims(bare) == []
+
+
+def test_a_proposal_outlives_the_generator(address: str, bare: Path, petra: Petra) -> None:
+    with rig.running(address) as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        branch = proposed.branch
+        stands = git(bare, "rev-parse", branch)
+    with pytest.raises(ShuttingDown):
+        rig.receipt(proposed.ticket)
+    with rig.running(address) as generator:
+        again = Proposed(generator, goal(2), "op-2")  # behind it: the first was looked at
+        other = again.branch
+        assert sorted(branches(bare)) == sorted([branch, other])
+        assert git(bare, "rev-parse", branch) == stands, "no second push"
+        assert generator.withdraw("op-1") is True, "it is known"
+        rig.wait_until(lambda: branches(bare) == [other], "the branch is taken away")
+
+
+def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
+    address: str, bare: Path, petra: Petra
+) -> None:
+    with rig.running(address) as generator:
+        taken, refused = (Proposed(generator, goal(n), f"op-{n}") for n in (1, 2))
+        yes, no = taken.branch, refused.branch
+    petra.merge(yes)
+    petra.delete(no)
+    with rig.running(address) as generator:
+        rig.wait_until(lambda: branches(bare) == [], "the merged branch is taken away")
+        rig.wait_until(lambda: generator._waiting.operations == (), "both are answered")
+    assert rig.books(bare) == rig.books_after([goal(1)])
+    assert branches(bare) == []
+
+
+@pytest.mark.parametrize("how", ["generator-runs", "merged-while-away", "rebased-while-away"])
+def test_two_proposals_from_one_tip_come_to_what_two_demands_come_to(
+    bare: Path, petra: Petra, how: str
+) -> None:
+    """Both change the same fusion, so the second does not fit once the first is merged."""
+    one, two = goal(0, vehicle=0), goal(5, vehicle=1)
+    with rig.running(bare) as generator:
+        first, second = Proposed(generator, one, "op-1"), Proposed(generator, two, "op-2")
+        a, b = first.branch, second.branch
+        stood = git(bare, "rev-parse", b)
+        if how == "generator-runs":
+            petra.merge(a, "--no-ff", "-m", "First")
+            assert first.outcome() == "booked"
+            rig.wait_until(lambda: git(bare, "rev-parse", b) != stood, "it is laid anew")
+            petra.merge(b, "--no-ff", "-m", "Second")
+            assert second.outcome() == "booked"
+    if how == "merged-while-away":
+        petra.merge(a, "--no-ff", "-m", "First")
+        petra.merge(b, "--no-ff", "-m", "Second", "-X", "theirs")
+    elif how == "rebased-while-away":
+        petra.rebase(a)
+        petra.rebase(b, "-X", "theirs")
+    if how != "generator-runs":
+        with pytest.raises(AssertionError):
+            assert_rendered(bare)
+        assert rig.restart(bare) is True
+    assert rig.books(bare) == rig.books_after([one, two])
+    assert_rendered(bare)
+
+
+def test_a_proposal_that_still_fits_is_left_where_it_is(bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        first = Proposed(generator, goal(1, vehicle=1))
+        stood = git(bare, "rev-parse", first.branch)
+        petra.change({"inventory/README.md": "Ours"})
+        second = Proposed(generator, goal(2, vehicle=2))
+        assert second.branch != first.branch
+        tip = rig.tip(bare)
+        rig.wait_until(lambda: str(generator.snapshot.commit) == tip, "main is taken in")
+        assert git(bare, "rev-parse", first.branch) == stood
+
+
+def test_a_branch_that_a_person_works_on_is_left_to_them(bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        one = Proposed(generator, goal(0, vehicle=0))
+        branch = one.branch
+        petra.fetch()
+        git(petra.folder, "checkout", "--quiet", "-B", "work", f"origin/{branch}")
+        git(petra.folder, "commit", "--quiet", "--allow-empty", "--message", "Looked at")
+        git(petra.folder, "push", "--quiet", "origin", f"HEAD:{branch}")
+        stands = git(bare, "rev-parse", branch)
+        other = Proposed(generator, goal(5, vehicle=1))
+        petra.merge(other.branch)
+        assert other.outcome() == "booked"
+        assert git(bare, "rev-parse", branch) == stands
+        petra.fetch()
+        git(petra.folder, "merge", "--quiet", "-X", "theirs", "-m", "Merge", f"origin/{branch}")
+        git(petra.folder, "push", "--quiet", "origin", "HEAD:main")
+        assert one.outcome() == "booked"
+    assert rig.books(bare) == rig.books_after([goal(5, vehicle=1), goal(0, vehicle=0)])
+    assert_rendered(bare)
+
+
+def test_the_same_request_sent_twice_waits_on_one_branch(
+    address: str, bare: Path, petra: Petra
+) -> None:
+    with rig.running(address) as generator:
+        first = Proposed(generator, goal(1), "op-1")
+        branch = first.branch
+        second = Proposed(generator, goal(1), "op-2")
+        assert second.branch == branch
+        assert branches(bare) == [branch]
+        assert len(rig.commits(bare, f"main..{branch}")) == 1
+        petra.merge(branch)
+        assert (first.outcome(), second.outcome()) == ("booked", "booked")
+
+
+def test_a_release_of_what_waits_takes_the_branch_away(
+    address: str, bare: Path, petra: Petra
+) -> None:
+    with rig.running(address) as generator:
+        proposed = Proposed(generator, goal(1))
+        assert [proposed.branch] == branches(bare)
+        assert rig.book(generator, leave(1))[0].outcome == "released"
+        assert branches(bare) == []
+        with pytest.raises(Withdrawn, match="given up"):
+            rig.receipt(proposed.ticket)
+        with pytest.raises(Refused):
+            rig.book(generator, leave(1))
+
+
+def test_a_release_right_behind_the_demand_leaves_no_branch(bare: Path, petra: Petra) -> None:
+    gate = rig.Gate()
+    with rig.running(bare) as generator:
+        generator.submit(leave(3), listener=rig.Stages())
+        held = generator.submit(goal(2), "op-0", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        asked, gone = generator.submit(goal(1), "op-1"), generator.submit(leave(1), "op-2")
+        gate.open.set()
+        assert rig.receipt(gone).outcome == "released"
+        with pytest.raises(Withdrawn):
+            rig.receipt(asked)
+        rig.wait_until(lambda: len(branches(bare)) == 1, "only the other demand waits")
+        generator.withdraw("op-0")
+        with pytest.raises(Withdrawn):
+            rig.receipt(held)
+
+
+def put(demand: str, vehicle: int, lease: int | None = None, who: str = "user") -> Any:
+    made = {
+        "apiVersion": "demandops/v1",
+        "kind": "Demand",
+        "demand": demand,
+        "requesters": [who],
+        "applications": [
+            {
+                "id": f"edge/{demand}",
+                "type": "object-detection-fusion",
+                "node": "edge",
+                "inputs": {
+                    "ego_data": [
+                        {
+                            "topic": f"/vehicles/vehicle{vehicle:02}/ego_data",
+                            "source": f"vehicle{vehicle:02}",
+                        }
+                    ]
+                },
+            }
+        ],
+    }
+    return made | ({"lease": lease} if lease else {})
+
+
+def test_a_put_of_the_same_demand_replaces_the_proposal(bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        first = Proposed(generator, put("d", 1), "op-1")
+        branch = first.branch
+        second = Proposed(generator, put("d", 2), "op-2")
+        with pytest.raises(Withdrawn, match="replaced by a later demand"):
+            rig.receipt(first.ticket)
+        assert (second.branch, branches(bare)) == (branch, [branch])
+        with pytest.raises(Refused, match="is a demand of user"):
+            rig.receipt(generator.submit(put("d", 3, who="stranger")))
+        petra.merge(branch)
+        assert second.outcome() == "booked"
+    [claim] = [path for path in rig.claims(bare) if "/applications/" in path]
+    assert "vehicle02" in git(bare, "show", f"main:{claim}")
+    assert "vehicle01" not in git(bare, "show", f"main:{claim}")
+
+
+def test_giving_up_and_renewing_need_no_approval(bare: Path, petra: Petra) -> None:
+    petra.policy(approval="none")
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1), put("d", 1, 600))
+        petra.policy(approval="required")
+        renew = {"demand": "d", "operation": "renew", "requesters": ["user"]}
+        head = {"apiVersion": "demandops/v1", "kind": "Demand"}
+        assert rig.book(generator, head | renew)[0].outcome in ("booked", "unchanged")
+        assert rig.book(generator, put("d", 1, 900))[0].outcome == "booked", "a longer lease"
+        assert rig.book(generator, goal(1))[0].outcome == "unchanged"
+        assert rig.book(generator, leave(1))[0].outcome == "released"
+        assert branches(bare) == []
+
+
+def test_a_lease_counts_from_the_merge(bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        proposed = Proposed(generator, put("d", 1, 600), "op-1")
+        branch = proposed.branch
+        names = git(bare, "ls-tree", "-r", "--name-only", branch, "ledger/applications/")
+        path = next(line for line in names.splitlines() if line.endswith(".yaml"))
+        claim = yaml.safe_load(git(bare, "show", f"{branch}:{path}"))
+        assert claim["lease"] == {"seconds": 600, "slack": 30}, "no end yet"
+        petra.merge(branch)
+        receipt = rig.receipt(proposed.ticket)
+        assert (receipt.outcome, receipt.lease_s) == ("booked", 600)
+    lease = yaml.safe_load(git(bare, "show", f"main:{path}"))["lease"]
+    followed = git(bare, "log", "-1", "--format=%cI", "main")
+    end, began = lease["until"][:19], followed[:19]
+    from datetime import datetime
+
+    term = datetime.fromisoformat(end) - datetime.fromisoformat(began)
+    assert 598 <= term.total_seconds() <= 601
+    assert rig.commits(bare)[-1].one("Operation") == "follow"
+
+
+def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(
+    bare: Path, petra: Petra
+) -> None:
+    with rig.running(bare) as generator:
+        first = goal(0)
+        second = goal(5)
+        second["apps"][0]["header"]["node_id"] = "cloud"
+        one, two = Proposed(generator, first), Proposed(generator, second)
+        gone = two.branch
+        petra.merge(one.branch)
+        assert one.outcome() == "booked"
+        with pytest.raises(Refused, match="contradicts what stands"):
+            rig.receipt(two.ticket)
+        rig.wait_until(lambda: gone not in branches(bare), "the branch is taken away")
+
+
+def test_a_policy_that_asks_no_more_lets_what_waits_through(bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        assert [proposed.branch] == branches(bare)
+        petra.policy(approval="none")
+        receipt = rig.receipt(proposed.ticket)
+        assert receipt.outcome == "booked"
+        assert branches(bare) == []
+    assert rig.operations(bare) == ["op-1"]
+    rig.assert_sound(bare)
+
+
+def test_demands_that_need_none_go_on_meanwhile(address: str, bare: Path, petra: Petra) -> None:
+    petra.policy(
+        approval="none",
+        rules=[
+            {"name": "visitors", "requesters": ["user1", "station00"], "approval": "required"},
+            {"name": "residents", "requesters": ["user2", "station00"]},
+        ],
+    )
+    with rig.running(address) as generator:
+        waits = Proposed(generator, goal(1))
+        assert "rule 'visitors' of access domain" in waits.told[-1][1] if waits.branch else False
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+        assert not waits.ticket.future.done()
+    assert rig.books(bare) == rig.books_after([goal(2)])
+
+
+@pytest.fixture
+def hooked(bare: Path) -> Iterator[Path]:
+    """Where a server's hook writes the push options that reach it."""
+    git(bare, "config", "receive.advertisePushOptions", "true")
+    log = bare / "options"
+    hook = bare / "hooks" / "pre-receive"
+    hook.parent.mkdir(exist_ok=True)
+    hook.write_text(
+        '#!/bin/sh\nread old new ref\necho "$ref" >> options\ni=0\n'
+        'while [ "$i" -lt "${GIT_PUSH_OPTION_COUNT:-0}" ]; do\n'
+        '  eval "echo \\"  \\$GIT_PUSH_OPTION_$i\\"" >> options\n  i=$((i+1))\ndone\n'
+        'case "$ref" in refs/heads/demand/*) echo "View merge request for $ref:"\n'
+        'echo "  https://git.example.org/its/state/-/merge_requests/7";; esac\n'
+    )
+    hook.chmod(0o755)
+    yield log
+
+
+def test_gitlab_is_asked_for_a_merge_request_by_push_options(
+    url: str, bare: Path, petra: Petra, hooked: Path
+) -> None:
+    root = git(bare, "show", "main:demandops.yaml")
+    text = f"{root}\nproposals: {{forge: gitlab, labels: [demand, its]}}\n"
+    petra.change({"demandops.yaml": text})
+    hooked.unlink()
+    with rig.running(url) as generator:
+        proposed = Proposed(generator, goal(1))
+        branch = proposed.branch
+        link = "https://git.example.org/its/state/-/merge_requests/7"
+        assert f" {link} " in proposed.told[-1][1]
+    options = hooked.read_text().splitlines()
+    assert options[0] == f"refs/heads/{branch}"
+    assert options[1:4] == [
+        "  merge_request.create",
+        "  merge_request.target=main",
+        "  merge_request.title=Join edge/fusion-1, vehicle01/edge",
+    ]
+    assert options[4].startswith("  merge_request.description=A demand that needs approval, asked")
+    assert "Why: request 'demand-1', received" in options[4]
+    assert options[5:] == [
+        "  merge_request.remove_source_branch",
+        "  merge_request.label=demand",
+        "  merge_request.label=its",
+    ]
+
+
+def test_a_server_that_takes_no_push_options_gets_the_branch_without(
+    url: str, bare: Path, petra: Petra
+) -> None:
+    root = git(bare, "show", "main:demandops.yaml")
+    petra.change({"demandops.yaml": f"{root}\nproposals: {{forge: gitlab}}\n"})
+    with rig.running(url) as generator:
+        assert [Proposed(generator, goal(1)).branch] == branches(bare)
+
+
+def test_a_server_that_refuses_the_branch_is_told_to_the_requester(
+    url: str, bare: Path, petra: Petra
+) -> None:
+    hook = bare / "hooks" / "pre-receive"
+    hook.parent.mkdir(exist_ok=True)
+    hook.write_text("#!/bin/sh\necho 'no branches here' >&2\nexit 1\n")
+    hook.chmod(0o755)
+    refused = pytest.raises(StateRepoError, match=r"takes no push: .*no branches here")
+    with rig.running(url) as generator, refused:
+        rig.receipt(generator.submit(goal(1)))
+    assert branches(bare) == []
+
+
+@pytest.mark.parametrize(
+    "point", ["journaled:1", "journaled:2", "journaled:3", "proposing", "proposed", "journaled:4"]
+)
+def test_killed_while_proposing_there_is_one_branch_after_the_restart(
+    drivers: rig.Drivers, address: str, bare: Path, petra: Petra, point: str
+) -> None:
+    drivers.start(address, [[rig.demand("one", goal(1))]], die_at=point).listen()
+    with rig.running(address) as generator:
+        other = Proposed(generator, goal(2))
+        other_branch = other.branch
+        rig.wait_until(lambda: len(branches(bare)) == 2, "both wait")
+        [branch] = [one for one in branches(bare) if one != other_branch]
+        assert [c.one("Operation-Id") for c in rig.commits(bare, f"main..{branch}")] == ["op-one"]
+        petra.merge(branch)
+        rig.wait_until(lambda: branches(bare) == [other_branch], "the merge was seen")
+    assert rig.books(bare) == rig.books_after([goal(1)])
+
+
+def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the_restart(
+    drivers: rig.Drivers, address: str, bare: Path, petra: Petra
+) -> None:
+    lanes = [[rig.demand("leave", leave(1))]]
+    opening = rig.demand("join", goal(1))
+    drivers.start(address, lanes, opening=opening, die_at="retracting").listen()
+    with rig.running(address) as generator:
+        rig.wait_until(lambda: not branches(bare), "the branch is deleted")
+        rig.wait_until(lambda: generator._waiting.operations == (), "both are answered")
+    assert rig.claims(bare) == []
+
+
+def test_two_generators_that_take_one_demand_agree_once_it_is_merged(
+    address: str, bare: Path, petra: Petra
+) -> None:
+    with rig.running(address) as one, rig.running(address) as two:
+        first, second = Proposed(one, goal(1)), Proposed(two, goal(1))
+        assert len({first.branch, second.branch}) == 2
+        petra.merge(first.branch)
+        assert (first.outcome(), second.outcome()) == ("booked", "booked")
+        rig.wait_until(lambda: branches(bare) == [], "neither branch is left")
+    assert rig.books(bare) == rig.books_after([goal(1)])
+
+
+def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
+    bare: Path, petra: Petra
+) -> None:
+    with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        assert [proposed.branch] == branches(bare)
+        server.faults.away = True
+        assert generator.withdraw("op-1") is True
+        rig.wait_until(lambda: server.refused, "it was tried in vain")
+        server.faults.away = False
+        with pytest.raises(Withdrawn):
+            rig.receipt(proposed.ticket)
+        assert branches(bare) == []
+
+
+def test_a_push_whose_answer_got_lost_makes_no_second_branch(bare: Path, petra: Petra) -> None:
+    with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
+        server.faults.cut_answers = 1
+        proposed = Proposed(generator, goal(1), "op-1")
+        assert [proposed.branch] == branches(bare)
+        petra.merge(proposed.branch)
+        assert proposed.outcome() == "booked"
+
+
+def _is_decided_or_waits(ticket: Ticket) -> bool:
+    return ticket.future.done() or bool(ticket.proposal and ticket.proposal.pushed)
+
+
+def test_odd_ids_give_branches_that_git_takes(bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        for number, id in enumerate(["", "..", "a..b/.lock", "Ä ö", "x" * 900, "-o", "@{0}"]):
+            made = goal(number) | {"id": id}
+            ticket = generator.submit(made, f"op-{number}")
+            done = partial(_is_decided_or_waits, ticket)
+            rig.wait_until(done, f"{id!r} is refused, or waits on a branch")
+        names = branches(bare)
+    assert len(names) >= 4
+    assert all(len(name) < 70 and name.isascii() for name in names)
+
+
+def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petra: Petra) -> None:
+    """The reference's demands add up, so both are on the branch, one commit each."""
+    more = goal(1, vehicle=2) | {"connections": []}
+    with rig.running(bare) as generator:
+        first = Proposed(generator, goal(1), "op-1")
+        branch = first.branch
+        second = Proposed(generator, more, "op-2")
+        assert second.branch == branch
+        found = rig.commits(bare, f"main..{branch}")
+        assert [commit.one("Operation-Id") for commit in found] == ["op-1", "op-2"]
+        assert generator.withdraw("op-2")
+        with pytest.raises(Withdrawn):
+            rig.receipt(second.ticket)
+        rig.wait_until(lambda: len(rig.commits(bare, f"main..{branch}")) == 1, "one is left")
+        petra.merge(branch)
+        assert first.outcome() == "booked"
+    assert rig.books(bare) == rig.books_after([goal(1)])
+
+
+def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Petra) -> None:
+    """The latched bookkeeping and the clusters' wake-up hang on it; nothing else is published."""
+    heard = threading.Event()
+    with rig.running(bare) as generator:
+        proposed = Proposed(generator, goal(1))
+        branch = proposed.branch
+        generator.watch(lambda catalog: heard.set())
+        petra.merge(branch, "--ff-only")
+        assert proposed.outcome() == "booked"
+        assert heard.wait(rig.PATIENCE_S)
+
+
+def test_a_proposal_passes_the_check_of_pull_requests(
+    bare: Path, petra: Petra, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from generator.cli.main import run
+
+    with rig.running(bare) as generator:
+        branch = Proposed(generator, put("d", 1, 600)).branch
+    petra.fetch()
+    git(petra.folder, "checkout", "--quiet", f"origin/{branch}")
+    assert run(["check", str(petra.folder)]) == 0, capsys.readouterr()

@@ -1,0 +1,177 @@
+"""A forge is asked for a pull request, and what a person does there decides as well.
+
+The forge is a small one on the loopback that keeps pull requests as GitHub's API does.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlparse
+
+import pytest
+import staterepo_rig as rig
+from approving import Petra, Proposed, branches
+from staterepo_rig import git, goal
+
+from generator.errors import TurnedDown, Withdrawn
+from generator.service import approval, desk
+
+TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
+
+
+@dataclass
+class Hub:
+    """A forge's pull requests."""
+
+    url: str = ""
+    pulls: list[dict[str, Any]] = field(default_factory=list)
+    away: bool = False
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def answer(self, method: str, path: str, body: dict[str, Any] | None) -> tuple[int, Any]:
+        url = urlparse(path)
+        if self.away:
+            return 503, {"message": "Service unavailable"}
+        if method == "POST" and url.path == "/repos/its/state/pulls":
+            assert body is not None
+            number = len(self.pulls) + 1
+            link = f"https://github.com/its/state/pull/{number}"
+            made = {"number": number, "state": "open", "merged_at": None, "html_url": link} | body
+            self.pulls.append(made)
+            return 201, made
+        if method == "PATCH":
+            assert body is not None
+            self.pulls[int(url.path.rsplit("/", 1)[1]) - 1].update(body)
+            return 200, self.pulls[-1]
+        branch = parse_qs(url.query)["head"][0].removeprefix("its:")
+        return 200, [pull for pull in self.pulls if pull["head"] == branch][-1:]
+
+
+@pytest.fixture
+def hub() -> Iterator[Hub]:
+    made = Hub()
+
+    class Handler(BaseHTTPRequestHandler):
+        def _serve(self) -> None:
+            length = int(self.headers.get("Content-Length") or 0)
+            body = json.loads(self.rfile.read(length)) if length else None
+            assert self.headers["Authorization"] == f"Bearer {TOKEN}"
+            with made.lock:
+                status, answer = made.answer(self.command, self.path, body)
+            data = json.dumps(answer).encode()
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data)
+
+        do_GET = do_POST = do_PATCH = _serve
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Keep quiet."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    made.url = f"http://127.0.0.1:{server.server_port}"
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    yield made
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+@pytest.fixture
+def petra(hub: Hub, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Petra:
+    monkeypatch.setattr(approval, "ASK_EMBEDDED_S", 0.05)
+    monkeypatch.setattr(approval, "ASK_REMOTE_S", 0.1)
+    monkeypatch.setattr(desk, "POLL_S", 0.05)
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    (tmp_path / "token").write_text(TOKEN)
+    monkeypatch.setenv("DEMANDOPS_FORGE_TOKEN_FILE", str(tmp_path / "token"))
+    made = Petra(bare, tmp_path / "petra")
+    made.policy(approval="required")
+    root = git(bare, "show", "main:demandops.yaml")
+    where = f"forge: github, url: 'https://github.com/its/state', api: '{hub.url}'"
+    made.change({"demandops.yaml": f"{root}\nproposals: {{{where}}}\n"})
+    return made
+
+
+def test_a_pull_request_is_opened_and_its_link_told(
+    hub: Hub, address: str, bare: Path, petra: Petra
+) -> None:
+    with rig.running(address) as generator:
+        proposed = Proposed(generator, goal(1))
+        branch = proposed.branch
+        [pull] = hub.pulls
+        assert f"{branch} {pull['html_url']} (asked for by" in proposed.told[-1][1]
+        assert (pull["head"], pull["base"]) == (branch, "main")
+        assert pull["title"] == "Join edge/fusion-1, vehicle01/edge"
+        assert "A demand that needs approval, asked for by access domain" in pull["body"]
+        assert "```text\nJoin edge/fusion-1, vehicle01/edge\n" in pull["body"]
+        petra.merge(branch)
+        assert proposed.outcome() == "booked"
+    assert [one["state"] for one in hub.pulls] == ["open"], "merging is the person's"
+
+
+def test_a_closed_pull_request_turns_the_demand_down(hub: Hub, bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        proposed = Proposed(generator, goal(1))
+        assert [proposed.branch] == branches(bare)
+        with hub.lock:
+            hub.pulls[0]["state"] = "closed"
+        with pytest.raises(TurnedDown) as error:
+            rig.receipt(proposed.ticket)
+        assert str(error.value) == "was turned down: https://github.com/its/state/pull/1 was closed"
+    assert branches(bare) == []
+
+
+def test_one_closed_while_no_generator_ran_is_not_opened_again(
+    hub: Hub, bare: Path, petra: Petra
+) -> None:
+    with rig.running(bare) as generator:
+        assert [Proposed(generator, goal(1)).branch] == branches(bare)
+    hub.pulls[0]["state"] = "closed"
+    with rig.running(bare):
+        rig.wait_until(lambda: branches(bare) == [], "it is turned down")
+    assert len(hub.pulls) == 1
+
+
+def test_a_restart_opens_no_second_one(hub: Hub, bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        branch = Proposed(generator, goal(1)).branch
+    with rig.running(bare) as generator:
+        assert Proposed(generator, goal(2)).branch != branch
+    assert [pull["head"] for pull in hub.pulls].count(branch) == 1
+
+
+def test_what_is_taken_back_is_closed(hub: Hub, bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        assert [proposed.branch] == branches(bare)
+        assert generator.withdraw("op-1")
+        with pytest.raises(Withdrawn):
+            rig.receipt(proposed.ticket)
+        rig.wait_until(lambda: hub.pulls[0]["state"] == "closed", "the request is closed")
+
+
+def test_a_forge_that_is_away_holds_nothing_up_and_is_asked_again(
+    hub: Hub, bare: Path, petra: Petra, caplog: pytest.LogCaptureFixture
+) -> None:
+    hub.away = True
+    with caplog.at_level(logging.INFO), rig.running(bare) as generator:
+        proposed = Proposed(generator, goal(1))
+        branch = proposed.branch
+        assert "https://" not in proposed.told[-1][1]
+        hub.away = False
+        rig.wait_until(lambda: "/pull/1 " in proposed.told[-1][1], "the link is told")
+        petra.merge(branch)
+        assert proposed.outcome() == "booked"
+    assert f"{branch}: GET http://127.0.0.1" in caplog.text
+    assert "503 'Service unavailable'" in caplog.text
+    assert TOKEN not in caplog.text

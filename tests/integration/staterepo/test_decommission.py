@@ -1,0 +1,233 @@
+"""`demandops decommission`: all that a node or a requester holds goes in one commit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Person, goal, leave
+
+from generator.cli.main import run
+from generator.service import Generator
+
+NODES = "inventory/nodes.yaml"
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def demandops(capsys: pytest.CaptureFixture[str]) -> Command:
+    def call(*args: str | Path) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = run([str(arg) for arg in args])
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+def of(generator: Generator, subject: str) -> list[str]:
+    """Who holds a subject, one text for each claim."""
+    claims = [c for c in generator.snapshot.state.ledger if c.subject.id == subject]
+    return sorted(" ".join(claim.requesters) for claim in claims)
+
+
+def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
+    address: str, bare: Path, tmp_path: Path, demandops: Command
+) -> None:
+    """With a generator running, whose look takes both in."""
+    person = Person(bare, tmp_path / "person")
+    with rig.running(address, fetch_interval=0.1) as generator:
+        rig.book(generator, goal(1), goal(2), goal(6))
+        code, out, err = demandops("decommission", "vehicle01", "--state-repo", address)
+        assert (code, err) == (0, "")
+        commit = rig.commits(bare)[-1]
+        assert out.splitlines() == [
+            "reduced:  application 'edge/fusion-1' for station00, user1; kept for station00, user1",
+            "released: connection 'vehicle01/edge' for station00, user1",
+            f"'vehicle01' is decommissioned in {commit.id}",
+        ]
+        assert commit.summary == "Decommission vehicle01"
+        assert [pair for pair in commit.trailers if pair[0] != "Operation-Id"] == [
+            ("Operation", "decommission"),
+            ("Node", "vehicle01"),
+            ("Demand-Id", dict(commit.trailers)["Demand-Id"]),
+            ("Requester", "station00"),
+            ("Requester", "user1"),
+            ("Application", "edge/fusion-1"),
+            ("Connection", "vehicle01/edge"),
+            ("Request-Id", "vehicle01"),
+            ("Render-Version", "1"),
+        ]
+        author = rig.git(bare, "log", "-1", "--format=%an <%ae> %cn", commit.id)
+        assert author == "Petra Platform <petra@example.org> DemandOps generator"
+        nodes = rig.git(bare, "show", f"main:{NODES}") + "\n"
+        start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
+        made = person.change({NODES: nodes[:start] + nodes[end:]}, "vehicle01 is sold")
+        assert demandops("check", tmp_path / "person")[0] == 0
+        rig.wait_until(
+            lambda: "vehicle01" not in generator.snapshot.state.catalog.nodes, "it is taken in"
+        )
+        assert generator.condition.problems == ()
+        assert rig.git(bare, "ls-tree", "main", ".demandops") == ""
+        assert made in [c.id for c in rig.commits(bare)]
+        rig.book(generator, goal(3))
+    assert not rig.git(bare, "grep", "-l", "vehicle01", "main", "--", "ledger", check=False)
+    rig.assert_sound(bare)
+
+
+def test_applications_at_a_node_go_in_whosever_name(bare: Path, demandops: Command) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1), goal(2))
+    assert demandops("decommission", "edge", "--node", "--state-repo", bare)[0] == 0
+    assert rig.claims(bare) == []
+    assert rig.git(bare, "ls-tree", "-r", "--name-only", "main", "clusters").count("of-edge") == 0
+    rig.assert_sound(bare)
+
+
+def _by_the_edges_broker(target: str) -> rig.Goal:
+    made = goal(1)
+    made["connections"][0] |= {"target_node_id": target, "broker_node_id": "edge"}
+    made["apps"] = []
+    return made
+
+
+def test_of_a_broker_that_was_asked_for_another_takes_the_place(
+    bare: Path, demandops: Command
+) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, _by_the_edges_broker("cloud"))
+    code, out, err = demandops("decommission", "edge", "--state-repo", bare)
+    assert code == 0, err
+    (path,) = rig.claims(bare)
+    assert "broker" not in rig.git(bare, "show", f"main:{path}")
+    assert "reduced:  connection 'vehicle01/edge'" in out
+    rig.assert_sound(bare)
+
+
+def test_where_no_other_broker_would_do_it_is_refused_whole(bare: Path, demandops: Command) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, _by_the_edges_broker("station00"), goal(2))
+    tip = rig.tip(bare)
+    assert demandops("decommission", "edge", "--state-repo", bare) == (
+        1,
+        "",
+        "error: broker: connection 'vehicle01/edge' finds no broker; add one to "
+        "inventory/brokers.yaml\n",
+    )
+    assert rig.tip(bare) == tip
+
+
+def test_a_requester_is_taken_out_and_what_only_it_held_goes(
+    bare: Path, demandops: Command
+) -> None:
+    alone = goal(2)
+    for subject in (alone["apps"][0]["object_detection_fusion_app"], alone["connections"][0]):
+        subject["requester_ids"] = ["user1"]
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1), alone)
+        assert of(generator, "edge/fusion-1") == ["station00 user1"]
+    before = rig.git(bare, "rev-parse", "main:clusters")
+    code, out, _ = demandops("decommission", "user1", "--state-repo", bare, "--output", "json")
+    told = json.loads(out)
+    assert (code, told["name"], told["outcome"]) == (0, "user1", "released")
+    assert told["commit"] == rig.tip(bare)
+    assert {(c["kind"], c["id"]): c["left"] for c in told["claims"]} == {
+        ("application", "edge/fusion-1"): ["station00"],
+        ("connection", "vehicle01/edge"): ["station00"],
+        ("application", "edge/fusion-2"): None,
+        ("connection", "vehicle02/edge"): None,
+    }
+    commit = rig.commits(bare)[-1]
+    assert "Node" not in dict(commit.trailers)
+    assert ("Requester", "user1") in commit.trailers
+    assert rig.git(bare, "rev-parse", "main:clusters") != before
+    with rig.running(bare) as generator:
+        assert of(generator, "edge/fusion-1") == ["station00"]
+        assert of(generator, "edge/fusion-2") == []
+        rig.book(generator, goal(1))  # it is back: the same demand stands in both names again
+        assert "station00 user1" in of(generator, "edge/fusion-1")
+        rig.book(generator, leave(1))
+    rig.assert_sound(bare)
+
+
+def test_as_a_requester_only_a_node_keeps_what_is_at_it(bare: Path, demandops: Command) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+    assert demandops("decommission", "station00", "--requester", "--state-repo", bare)[0] == 0
+    with rig.running(bare) as generator:
+        assert of(generator, "edge/fusion-1") == ["user1"]
+        topics = [
+            topic.topic
+            for claim in generator.snapshot.state.ledger.application("edge/fusion-1")
+            for _, topic in claim.all_inputs()
+        ]
+    assert "/stations/station00/pointcloud" in topics
+
+
+def test_dry_run_shows_the_consequence_and_releases_nothing(bare: Path, demandops: Command) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+    tip = rig.tip(bare)
+    code, out, _ = demandops("decommission", "vehicle01", "--dry-run", "--state-repo", bare)
+    assert code == 0
+    assert "would be released: connection 'vehicle01/edge' for station00, user1" in out
+    assert "remove clusters/" in out
+    assert rig.tip(bare) == tip
+
+
+def test_what_holds_nothing_is_told_and_a_typo_shows(bare: Path, demandops: Command) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+    tip = rig.tip(bare)
+
+    def call(name: str, *more: str) -> tuple[int, str, str]:
+        return demandops("decommission", name, "--state-repo", bare, *more)
+
+    assert call("cloud") == (0, "'cloud' holds nothing\n", "")
+    assert json.loads(call("cloud", "--output", "json")[1])["outcome"] == "unchanged"
+    assert call("vehicel01") == (
+        1,
+        "",
+        "error: name: 'vehicel01' holds nothing as a node or requester; did you mean "
+        "'vehicle01'?\n",
+    )
+    assert call("user1", "--node")[0] == 1
+    assert call("user1\n")[0] == 1
+    assert call("")[0] == 1
+    assert rig.tip(bare) == tip
+
+
+def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
+    url: str, bare: Path, demandops: Command
+) -> None:
+    """As for any demand: it is in the outbox, and the next start carries it out."""
+    from generator.demand import leaving
+
+    generator = Generator(url)
+    rig.book(generator, goal(1))
+    away = bare.rename(bare.with_name("away.git"))
+    generator.submit(leaving.as_data("vehicle01", ("node",), ""), "op-leave")
+    assert generator.close(timeout=0.3) is False
+    away.rename(bare)
+    assert rig.restart(url) is True
+    assert rig.operations(bare)[-1] == "op-leave"
+    assert rig.commits(bare)[-1].one("Node") == "vehicle01"
+    author = rig.git(bare, "log", "-1", "--format=%an", "main")
+    assert author == "DemandOps generator", "nobody is named who had it done"
+    rig.assert_sound(bare)
+
+
+def test_no_file_of_demands_and_no_goal_decommissions(bare: Path, tmp_path: Path) -> None:
+    asked: dict[str, Any] = {"kind": "Decommission", "name": "vehicle01", "as": ["node"]}
+    file = tmp_path / "goal.yaml"
+    file.write_text(json.dumps(asked))
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+    tip = rig.tip(bare)
+    assert run(["request", str(file), "--state-repo", str(bare)]) == 1
+    assert rig.tip(bare) == tip

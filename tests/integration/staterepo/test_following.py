@@ -1,0 +1,485 @@
+"""What people merge is honoured while the generator runs, without any demand coming.
+
+Embedded, over a file URL and over smart HTTP; nothing is measured, all waits are for what has to
+come. Every break is mended again, and every commit verifies.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Iterator
+from concurrent.futures import TimeoutError as NotAnswered
+from pathlib import Path
+
+import pytest
+import staterepo_rig as rig
+import yaml
+from git_over_http import Server, serving
+from staterepo_rig import Person, Stages, goal, leave
+
+from generator import settings
+from generator.cli.main import run
+from generator.errors import QueueFull, Withdrawn
+from generator.service import Generator
+from generator.staterepo import reports
+from generator.staterepo.outbox import Outbox
+
+NODES, CLUSTERS = "inventory/nodes.yaml", "inventory/clusters.yaml"
+BROKERS, CHARTS = "inventory/brokers.yaml", "registry/charts.yaml"
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+SOON_S = 0.1
+
+
+@pytest.fixture
+def person(bare: Path, tmp_path: Path) -> Person:
+    return Person(bare, tmp_path / "person")
+
+
+@pytest.fixture
+def server(bare: Path) -> Iterator[Server]:
+    with serving(bare.parent) as running:
+        yield running
+
+
+@pytest.fixture
+def http(server: Server) -> str:
+    return f"{server.url}/state.git"
+
+
+@pytest.fixture(params=["embedded", "file-url", "http"])
+def place(request: pytest.FixtureRequest, bare: Path) -> str:
+    """The same state repo by all three ways."""
+    if request.param == "embedded":
+        return str(bare)
+    return bare.as_uri() if request.param == "file-url" else request.getfixturevalue("http")
+
+
+def file_of(bare: Path, path: str) -> str:
+    return rig.git(bare, "show", f"main:{path}") + "\n"
+
+
+def without_vehicle01(bare: Path) -> dict[str, str | None]:
+    nodes = file_of(bare, NODES)
+    start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
+    return {NODES: nodes[:start] + nodes[end:]}
+
+
+def claim_of(bare: Path, who: str) -> str:
+    return next(path for path in rig.claims(bare, who) if "applications" in path)
+
+
+def newest(bare: Path) -> rig.Commit:
+    return rig.commits(bare)[-1]
+
+
+def followed(bare: Path, made: str) -> rig.Commit:
+    """Wait until a person's commit has been followed; return the commit that does."""
+    rig.wait_until(lambda: newest(bare).id != made, "the generator follows")
+    (commit,) = [c for c in rig.commits(bare, f"{made}..main") if c.one("Operation") == "follow"]
+    assert commit.one("Follows") == made
+    return commit
+
+
+def problems(bare: Path) -> list[dict[str, str]]:
+    text = rig.git(bare, "show", f"main:{reports.PATH}", check=False)
+    data = yaml.safe_load(text) if "problems:" in text else {"problems": []}
+    return list(data["problems"])
+
+
+# ---- honoured ----
+
+
+def _delete_claim(bare: Path) -> dict[str, str | None]:
+    return dict.fromkeys(rig.claims(bare, "user1"))
+
+
+def _edit_claim(bare: Path) -> dict[str, str | None]:
+    path = claim_of(bare, "user1")
+    old = "/vehicles/vehicle01/ego_data"
+    return {path: file_of(bare, path).replace(old, "/another/topic")}
+
+
+def _move_node(bare: Path) -> dict[str, str | None]:
+    nodes = file_of(bare, NODES)
+    start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
+    moved = nodes[start:end].replace("cluster: c-its", "cluster: garage")
+    clusters = file_of(bare, CLUSTERS) + "  - name: garage\n"
+    return {NODES: nodes[:start] + moved + nodes[end:], CLUSTERS: clusters}
+
+
+def _move_broker(bare: Path) -> dict[str, str | None]:
+    return {BROKERS: file_of(bare, BROKERS).replace("service-mqtt-broker-edge", "elsewhere")}
+
+
+CHANGES = {
+    "deleted-claim": (_delete_claim, lambda text: "user1" not in text),
+    "edited-claim": (_edit_claim, lambda text: "/another/topic" in text),
+    "moved-node": (_move_node, lambda text: "garage" in text),
+    "moved-broker": (_move_broker, lambda text: "elsewhere" in text),
+}
+
+
+def _everything(bare: Path) -> str:
+    """All that is generated or booked, as one text: paths and contents."""
+    return rig.git(bare, "grep", "", "main", "--", "clusters", "ledger")
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_is_honoured_without_any_demand(
+    place: str, bare: Path, person: Person, change: str
+) -> None:
+    make, holds = CHANGES[change]
+    with rig.running(place, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1), goal(2))
+        made = person.change(make(bare), f"A {change}")
+        commit = followed(bare, made)
+        assert commit.one("Caused-By") == f"{made} Petra Platform <petra@example.org>"
+        assert holds(_everything(bare))
+        by_petra = rig.git(bare, "log", "--author=petra@example.org", "--format=%H", "main")
+        assert by_petra.splitlines() == [commit.id, made]
+        committer = rig.git(bare, "log", "-1", "--format=%cn", commit.id)
+        assert committer == "DemandOps generator"
+        rig.book(generator, goal(3))
+        assert holds(_everything(bare)), "still so after a further demand"
+    rig.assert_sound(bare)
+
+
+def test_a_bumped_chart_version_reaches_its_releases(
+    place: str, bare: Path, person: Person
+) -> None:
+    metadata = "appdefs/object-detection-fusion/charts/object-fusion/Chart.yaml"
+    version = yaml.safe_load(file_of(bare, metadata))["version"]
+    registry = file_of(bare, CHARTS)
+    start = registry.index("object-fusion")
+    bumped = registry[:start] + registry[start:].replace(f"{version}", "9.8.7", 1)
+    files: dict[str, str | None] = {
+        metadata: file_of(bare, metadata).replace(f"version: {version}", "version: 9.8.7"),
+        CHARTS: bumped,
+    }
+    with rig.running(place, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1))
+        followed(bare, person.change(files, "A better fusion"))
+        assert "9.8.7" in rig.git(bare, "grep", "-h", "9.8.7", "main", "--", "clusters")
+    rig.assert_sound(bare)
+
+
+# ---- broken ----
+
+
+def _break_claim(bare: Path) -> dict[str, str | None]:
+    return {claim_of(bare, "user1"): "requesters: nobody\n"}
+
+
+def _claim_on_no_node(bare: Path) -> dict[str, str | None]:
+    path = claim_of(bare, "user1")
+    return {path: file_of(bare, path).replace("node: edge\n", "node: nowhere\n")}
+
+
+def _node_on_no_cluster(bare: Path) -> dict[str, str | None]:
+    return {NODES: file_of(bare, NODES).replace("cluster: c-its", "cluster: c-itz", 1)}
+
+
+def _appdef_in_use_gone(bare: Path) -> dict[str, str | None]:
+    return {APPDEF: None}
+
+
+def _no_version(bare: Path) -> dict[str, str | None]:
+    return {CHARTS: file_of(bare, CHARTS).replace("    version:", "    verison:")}
+
+
+BREAKS = {
+    "claim-that-does-not-parse": (_break_claim, "ledger/applications/"),
+    "claim-on-an-unknown-node": (_claim_on_no_node, "ledger/applications/"),
+    "node-on-an-unknown-cluster": (_node_on_no_cluster, NODES),
+    "node-in-use-gone": (without_vehicle01, NODES),
+    "appdef-in-use-gone": (_appdef_in_use_gone, APPDEF),
+    "misspelt-registry": (_no_version, CHARTS),
+}
+
+
+@pytest.mark.parametrize("change", BREAKS)
+def test_a_broken_change_is_reported_with_its_commit_until_it_is_mended(
+    address: str, bare: Path, person: Person, change: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    make, where = BREAKS[change]
+    with rig.running(address, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1), goal(2))
+        broken = make(bare)
+        mended: dict[str, str | None] = {path: file_of(bare, path) for path in broken}
+        standing = rig.git(bare, "rev-parse", "main:clusters")
+        made = person.change(broken, "A merge gone wrong")
+        followed(bare, made)
+        told = problems(bare)
+        assert told and all(problem["since"] == made for problem in told)
+        assert {problem["author"] for problem in told} == {"Petra Platform <petra@example.org>"}
+        assert all(problem["file"].startswith(where) for problem in told), told
+        rig.wait_until(lambda: generator.condition.problems, "diagnostics tell it")
+        assert rig.git(bare, "rev-parse", "main:clusters") == standing
+        report = rig.git(bare, "rev-parse", f"main:{reports.PATH}")
+        rig.book(generator, goal(3), goal(6), leave(3))
+        assert rig.git(bare, "rev-parse", f"main:{reports.PATH}") == report, "demands go on"
+        assert [c.one("Operation") for c in rig.commits(bare)][-3:] == ["join", "join", "shutdown"]
+        logged = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
+        assert len(logged) == len(set(logged)) == len(told)
+        followed(bare, person.change(mended, "Mend it"))
+        assert problems(bare) == []
+        rig.wait_until(lambda: not generator.condition.problems, "diagnostics tell it")
+    assert rig.books(bare) == rig.books_after([goal(1), goal(2), goal(6)])
+    rig.assert_sound(bare)
+
+
+def test_a_problem_that_stands_at_a_restart_is_reported_no_second_time(
+    address: str, bare: Path, person: Person
+) -> None:
+    with rig.running(address, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1), goal(2))
+        followed(bare, person.change(_claim_on_no_node(bare), "Nowhere"))
+        rig.book(generator, goal(6))  # of the same application as goal 1
+    tip = rig.tip(bare)
+    with rig.running(address, fetch_interval=SOON_S) as generator:
+        rig.wait_until(lambda: generator.condition.problems, "it is seen again")
+        assert rig.tip(bare) == tip
+        assert rig.book(generator, leave(6))[0].outcome == "released"
+    rig.assert_sound(bare)
+
+
+def test_a_report_that_a_person_removes_or_edits_is_put_right(bare: Path, person: Person) -> None:
+    with rig.running(bare, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1))
+        made = person.change(_node_on_no_cluster(bare), "A merge gone wrong")
+        followed(bare, made)
+        report = file_of(bare, reports.PATH)
+        followed(bare, person.change({reports.PATH: None}, "No reports, please"))
+        assert file_of(bare, reports.PATH) == report
+        followed(bare, person.change({reports.PATH: "problems: [{file: x}, 3]\n"}, "Mine"))
+        assert file_of(bare, reports.PATH) == report
+    rig.assert_sound(bare)
+
+
+def test_several_peoples_commits_are_all_named_and_a_readme_is_not(
+    address: str, bare: Path, person: Person
+) -> None:
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        first = person.change(_move_broker(bare), "Elsewhere")
+        person.change({"README.md": "Ours\n"}, "Say whose it is")
+        rig.git(person._folder, "config", "user.name", "-")
+        second = person.edit(BROKERS, "elsewhere", "somewhere")
+        rig.book(generator, goal(2))
+    (commit,) = [c for c in rig.commits(bare) if c.one("Operation") == "follow"]
+    named = [value.split()[0] for key, value in commit.trailers if key == "Caused-By"]
+    assert named == [first, second]
+
+
+def test_two_generators_follow_a_change_once(
+    url: str, bare: Path, person: Person, tmp_path: Path
+) -> None:
+    with (
+        rig.running(url, fetch_interval=SOON_S) as one,
+        rig.running(url, fetch_interval=SOON_S, data=tmp_path / "other") as two,
+    ):
+        rig.book(one, goal(1))
+        commit = followed(bare, person.change(_move_broker(bare)))
+        for generator in (one, two):
+            rig.wait_until(
+                lambda: generator.condition.commit == commit.id,  # noqa: B023 - waited for here
+                "both have taken it in",
+            )
+    assert newest(bare).id == commit.id
+    rig.assert_sound(bare)
+
+
+def test_off_means_off(url: str, bare: Path, person: Person) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        made = person.change(_move_broker(bare))
+        assert generator._settler.follower.pause() is None
+        generator.look()  # as a webhook would
+        followed(bare, made)
+
+
+# ---- the remote is slow, or away ----
+
+
+def test_a_look_that_hangs_holds_up_no_demand(http: str, server: Server, bare: Path) -> None:
+    with rig.running(http, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1))
+        hang = server.faults.hang = threading.Event()
+        follower = generator._settler.follower
+        rig.wait_until(lambda: generator._repository._talking, "a look is under way and hangs")  # type: ignore[attr-defined]
+        talking = generator._repository._talking  # type: ignore[attr-defined]
+        stages = Stages()
+        ticket = generator.submit(goal(2), listener=stages)
+        rig.wait_until(lambda: "committed" in stages.names, "it is judged although the look hangs")
+        assert talking.poll() is not None, "the look was ended for it"
+        assert not follower.link.is_away
+        server.faults.hang = None
+        hang.set()
+        assert rig.receipt(ticket).outcome == "booked"
+    rig.assert_sound(bare)
+
+
+def test_stopping_does_not_wait_for_a_look_that_hangs(http: str, server: Server) -> None:
+    generator = Generator(http, fetch_interval=SOON_S)
+    hang = server.faults.hang = threading.Event()
+    try:
+        rig.wait_until(lambda: generator._repository._talking, "a look is under way and hangs")  # type: ignore[attr-defined]
+        assert generator.stop(timeout=60).result(10) is True
+    finally:
+        server.faults.hang = None
+        hang.set()
+
+
+def test_a_remote_away_is_logged_once_and_once_when_it_is_back(
+    http: str, server: Server, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, logger="demandops")
+    with rig.running(http, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1))
+        server.faults.away = True
+        rig.wait_until(lambda: server.refused > 4, "it was looked at again and again")
+        assert "503" in generator.condition.contact.trouble
+        made = person.change(_move_broker(bare))
+        server.faults.away = False
+        generator.look()
+        followed(bare, made)
+        rig.wait_until(lambda: not generator.condition.contact.trouble, "it is known to be back")
+    told = [record.getMessage() for record in caplog.records]
+    assert sum("trying again until it is back" in text for text in told) == 1
+    assert sum(" is back after " in text for text in told) == 1
+
+
+def test_a_goal_is_told_why_it_waits_and_can_be_taken_back_meanwhile(
+    http: str, server: Server, bare: Path
+) -> None:
+    with rig.running(http, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1))
+        server.faults.away = True
+        rig.wait_until(lambda: generator.condition.contact.trouble, "it is known to be away")
+        stages = Stages()
+        stays = generator.submit(goal(2), "op-2")
+        goes = generator.submit(goal(3), "op-3", stages)
+        rig.wait_until(lambda: stages.told, "the requester hears of it")
+        ((stage, text),) = stages.told
+        assert stage == "away" and text.startswith(f"waiting: {http} cannot be fetched")
+        assert "503" in text
+        assert generator.withdraw("op-3") is True
+        with pytest.raises(Withdrawn):
+            rig.receipt(goes)
+        with pytest.raises(NotAnswered):
+            stays.future.result(0)
+        assert generator.snapshot.state.ledger.of_requester("user1"), "what is known can be read"
+        server.faults.away = False
+        assert rig.receipt(stays).outcome == "booked"
+    assert rig.operations(bare)[-1] == "op-2"
+
+
+def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server, bare: Path) -> None:
+    with rig.running(http, fetch_interval=SOON_S, queue_limit=3) as generator:
+        server.faults.away = True
+        rig.wait_until(lambda: generator.condition.contact.trouble, "it is known to be away")
+        tickets = []
+        with pytest.raises(QueueFull, match=r"waiting already for the state repo: .*503"):
+            for number in range(500):
+                tickets.append(generator.submit(goal(number)))
+        server.faults.away = False
+        for ticket in tickets:
+            rig.receipt(ticket)
+
+
+def test_all_that_waits_while_the_remote_is_away_survives_a_kill(
+    url: str, bare: Path, drivers: rig.Drivers
+) -> None:
+    """More than go into one push: those behind it are on the disk as well."""
+    many = 250
+    rig.restart(url)  # makes the clone
+    away = bare.rename(bare.with_name("away.git"))
+    lanes = [[rig.demand(f"{n}", goal(n % 3))] for n in range(many)]
+    run = drivers.start(url, lanes)
+    journal = settings.data_home(url) / "slot-0" / "outbox.jsonl"
+    watcher = threading.Thread(target=run.listen)
+    watcher.start()
+    rig.wait_until(lambda: len(_kept(journal)) == many, "all are in the outbox")
+    run.kill()
+    watcher.join()
+    away.rename(bare)
+    assert rig.restart(url) is True
+    assert rig.books(bare) == rig.books_after(map(goal, range(3)))
+    assert Outbox(journal).pending == {}
+
+
+def _kept(journal: Path) -> list[str]:
+    return [line for line in journal.read_text().splitlines() if line.endswith("}")]
+
+
+def test_a_lease_that_ends_while_the_remote_is_away_goes_when_it_is_back(
+    http: str, server: Server, bare: Path, person: Person
+) -> None:
+    short = {
+        "kind": "Demand",
+        "demand": "short",
+        "requesters": ["vehicle00"],
+        "lease": 1,
+        "applications": [
+            {
+                "id": "edge/short",
+                "type": "object-detection-fusion",
+                "node": "edge",
+                "inputs": {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]},
+            }
+        ],
+    }
+    domains = "policy/access-domains.yaml"
+    person.change(
+        {
+            domains: file_of(bare, domains)
+            .rstrip("\n")
+            .replace("name: perception\n", "name: perception\n    leases: {slack: 0s}\n")
+            + "\n"
+        }
+    )
+    with rig.running(http, fetch_interval=SOON_S) as generator:
+        rig.book(generator, short)
+        server.faults.away = True
+        refused = server.refused
+        rig.wait_until(lambda: server.refused > refused + 3, "the end of the lease is tried")
+        assert generator.snapshot.state.ledger.of_demand("short")
+        server.faults.away = False
+        rig.wait_until(
+            lambda: not generator.snapshot.state.ledger.of_demand("short"), "it is released"
+        )
+    assert newest(bare).one("Operation") == "expire"
+    rig.assert_sound(bare)
+
+
+# ---- what the command line tells ----
+
+
+def test_views_go_on_while_something_is_not_valid_and_say_so(
+    bare: Path, person: Person, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with rig.running(bare, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1))
+        made = person.change(_node_on_no_cluster(bare), "A merge gone wrong")
+        followed(bare, made)
+    problem = (
+        f"{NODES}: nodes[0].cluster: 'c-itz' is not in clusters.yaml; "
+        f"did you mean 'c-its'? (since {made[:10]} of Petra Platform <petra@example.org>)"
+    )
+    capsys.readouterr()
+    assert run(["status", "--state-repo", str(bare)]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[:2] == [
+        "1 problem; of each file the last valid version is in force:",
+        f"  {problem}",
+    ]
+    assert "of-edge-fusion-1" in out
+    assert run(["status", "--state-repo", str(bare), "--output", "json"]) == 0
+    (told,) = json.loads(capsys.readouterr().out)["problems"]
+    assert (told["file"], told["field"], told["since"]) == (NODES, "nodes[0].cluster", made)
+    assert run(["bookkeeping", "--state-repo", str(bare)]) == 0
+    shown = capsys.readouterr()
+    assert "edge/fusion-1" in shown.out
+    assert shown.err == f"warning: {problem}; its last valid version is in force\n"

@@ -1,0 +1,49 @@
+"""What the readers of clusters ask of commits: which is later, and what differs; with real Git."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import staterepo_rig as rig
+from staterepo_rig import Person
+
+from generator.staterepo import reader, remote
+
+CHART = "appdefs/object-detection-fusion/charts/object-fusion"
+
+
+@pytest.fixture
+def line(bare: Path, tmp_path: Path) -> list[str]:
+    """The first commit, then a change of a text, then one of a chart."""
+    person = Person(bare, tmp_path / "person")
+    first = rig.tip(bare)
+    other = person.change({"notes.txt": "one\n"})
+    return [first, other, person.change({f"{CHART}/notes.txt": "two\n"})]
+
+
+def test_a_commit_includes_those_before_it(bare: Path, line: list[str]) -> None:
+    with reader.opened(str(bare)) as repo:
+        assert repo.includes(line[2], line[0]) and repo.includes(line[1], line[1])
+        assert not repo.includes(line[0], line[1])
+        assert not repo.includes("f" * 40, line[0])
+
+
+def test_a_folder_is_unchanged_where_its_content_is(bare: Path, line: list[str]) -> None:
+    first, other, chart = line
+    with reader.opened(str(bare)) as repo:
+        assert repo.unchanged(first, other, CHART)
+        assert not repo.unchanged(first, chart, CHART)
+        assert not repo.unchanged(first, other, ".")
+        # what is not there is not the same as anything
+        assert not repo.unchanged(first, other, "no/such/folder")
+        assert not repo.unchanged(first, "f" * 40, CHART)
+        assert not repo.unchanged("", first, CHART)
+
+
+def test_the_paths_that_differ_are_told(bare: Path, tmp_path: Path, line: list[str]) -> None:
+    repository = remote.connect(str(bare), tmp_path / "data")
+    assert repository.changed(line[0], line[2]) == [f"{CHART}/notes.txt", "notes.txt"]
+    assert repository.changed(line[2], line[2]) == []
+    assert repository.changed("", line[2]) is None
+    assert repository.changed("f" * 40, line[2]) is None

@@ -1,0 +1,393 @@
+"""A person merges overrides while a generator runs: each is honoured, kept, and taken back.
+
+Merged is what the next demand finds. After every story each commit of it verifies.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import pytest
+import staterepo_rig as rig
+import yaml
+from staterepo_rig import Person
+
+from generator.errors import InvalidInput, Refused
+from generator.service import Generator
+
+EDGE = "clusters/c-its/perception/edge"
+DETECTION = f"{EDGE}/od-edge-station00.yaml"
+WATCHED: dict[str, Any] = {"services": ["object-detection"], "nodes": ["edge"]}
+
+
+def override(*select: dict[str, Any], **fields: Any) -> str:
+    head = {"apiVersion": "demandops/v1", "kind": "Override"}
+    told = {"reason": "a field test", "owner": "petra", "select": list(select)}
+    return yaml.safe_dump(head | told | fields, sort_keys=False)
+
+
+@pytest.fixture
+def person(bare: Path, tmp_path: Path) -> Person:
+    return Person(bare, tmp_path / "person")
+
+
+@pytest.fixture
+def generator(bare: Path) -> Iterator[Generator]:
+    with rig.running(bare) as running:
+        yield running
+
+
+@pytest.fixture
+def anywhere(address: str) -> Iterator[Generator]:
+    """A generator on the state repo in place, and one on a remote."""
+    with rig.running(address) as running:
+        yield running
+
+
+def file(bare: Path, path: str) -> str:
+    return rig.git(bare, "show", f"main:{path}", check=False)
+
+
+def parsed(bare: Path, path: str) -> Any:
+    return yaml.safe_load(file(bare, path))
+
+
+def body(bare: Path, path: str) -> str:
+    lines = file(bare, path).splitlines()
+    return "\n".join(line for line in lines if not line.startswith("#"))
+
+
+def values(commit: rig.Commit, key: str) -> list[str]:
+    return [value for known, value in commit.trailers if known == key]
+
+
+def merge(person: Person, **overrides: str | None) -> str:
+    """Merge ``name=text`` as overrides/<name>.yaml, or remove it."""
+    return person.change({f"overrides/{name}.yaml": text for name, text in overrides.items()})
+
+
+def next_demand(generator: Generator, number: int = 100) -> rig.Receipt:
+    """A demand that has nothing to do with the matter."""
+    (receipt,) = rig.book(generator, rig.goal(number))
+    return receipt
+
+
+def follow_of(bare: Path, cause: str) -> rig.Commit:
+    (found,) = [commit for commit in rig.commits(bare) if commit.one("Follows") == cause]
+    return found
+
+
+EFFECTS: dict[str, tuple[dict[str, Any], Any]] = {
+    "replicas": ({"replicas": 3}, lambda spec: spec["values"]["replicas"] == 3),
+    "values": (
+        {"values": {"resources": {"limits": {"memory": "2Gi"}}}},
+        lambda spec: spec["values"]["resources"]["limits"]["memory"] == "2Gi",
+    ),
+    "images": (
+        {"images": {"object-detection": {"tag": "field-test"}}},
+        lambda spec: spec["values"]["image"]["tag"] == "field-test",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_what_is_merged_arrives_stays_and_goes(
+    name: str, generator: Generator, bare: Path, person: Person
+) -> None:
+    fields, arrived = EFFECTS[name]
+    rig.book(generator, rig.goal(1))
+    plain = file(bare, DETECTION)
+    cause = merge(person, tested=override(WATCHED, **fields))
+    next_demand(generator)
+    assert arrived(parsed(bare, DETECTION)["spec"])
+    assert file(bare, DETECTION).splitlines()[0] == (
+        f"# override overrides/tested.yaml: {name}; priority 0; owner petra; reason: a field test"
+    )
+    assert values(follow_of(bare, cause), "Override") == ["overrides/tested.yaml"]
+    rig.book(generator, *(rig.goal(number) for number in range(2, 8)))
+    rig.book(generator, *(rig.leave(number) for number in range(1, 8)), rig.leave(100))
+    assert file(bare, DETECTION) == ""
+    (again,) = rig.book(generator, rig.goal(9))
+    assert arrived(parsed(bare, DETECTION)["spec"])
+    (commit,) = [commit for commit in rig.commits(bare) if commit.id == again.commit]
+    assert values(commit, "Override") == ["overrides/tested.yaml"]
+    cause = merge(person, tested=None)
+    next_demand(generator)
+    assert file(bare, DETECTION) == plain
+    assert values(follow_of(bare, cause), "Override") == ["overrides/tested.yaml"]
+    rig.assert_sound(bare)
+
+
+def test_a_service_is_moved_and_comes_back(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, rig.goal(1))
+    moved = "clusters/c-its/perception/cloud/od-edge-station00.yaml"
+    merge(person, moved=override(WATCHED, node="cloud"))
+    next_demand(generator)
+    assert file(bare, DETECTION) == ""
+    spec = parsed(bare, moved)["spec"]
+    assert spec["values"]["nodeSelector"] == {"node_id": "cloud"}
+    assert rig.books(bare)["services"]["od-edge-station00"]["node"] == "cloud"
+    merge(person, moved=None)
+    next_demand(generator, 101)
+    assert file(bare, moved) == ""
+    assert file(bare, DETECTION)
+    rig.assert_sound(bare)
+
+
+def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, rig.goal(1))
+    (fusion,) = [name for name in rig.books(bare)["services"] if name.startswith("of-")]
+    path = f"{EDGE}/{fusion}.yaml"
+    before = body(bare, path)
+    merge(person, frozen=override({"services": ["object-fusion"]}, hold=True))
+    next_demand(generator, 2)
+    held = file(bare, path)
+    assert held.startswith("# override overrides/frozen.yaml: hold; priority 0; owner petra")
+    assert body(bare, path) == before
+    (late,) = rig.book(generator, rig.goal(6))  # one more input for this fusion
+    assert late.warnings[-1] == (
+        f"{fusion} is held by overrides/frozen.yaml, so what is asked of it waits until it is let "
+        "go"
+    )
+    person.edit("registry/images.yaml", "2025-04", "2025-05")
+    next_demand(generator, 3)
+    assert "2025-05" in file(bare, DETECTION)
+    assert file(bare, path) == held
+    others = [n for n in rig.books(bare)["services"] if n.startswith("of-") and n != fusion]
+    for other in others:
+        first = file(bare, f"{EDGE}/{other}.yaml").splitlines()[0]
+        assert "frozen.yaml: hold" in first, "rendered once, then held"
+    merge(person, frozen=None)
+    next_demand(generator, 7)
+    assert "/vehicles/vehicle02/ego_data" in file(bare, path)
+    merge(person, frozen=override({"services": ["object-fusion"]}, hold=True))
+    rig.book(generator, rig.leave(1), rig.leave(6))
+    assert file(bare, path) == "", "what nobody demands goes, held or not"
+    rig.assert_sound(bare)
+
+
+def test_what_is_denied_is_refused_and_suspended_until_the_override_goes(
+    anywhere: Generator, bare: Path, person: Person
+) -> None:
+    generator = anywhere
+    rig.book(generator, rig.goal(1), rig.goal(2))
+    running = rig.books(bare)
+    files = rig.git(bare, "rev-parse", "main:clusters")
+    cause = merge(person, closed=override({"requesters": ["user1"]}, deny=True))
+    next_demand(generator, 2)
+    now = rig.books(bare)
+    assert "vehicle01/edge" not in now["connections"]
+    assert {entry["id"] for entry in now["suspended"]} == {"edge/fusion-1", "vehicle01/edge"}
+    assert {entry["override"] for entry in now["suspended"]} == {"overrides/closed.yaml"}
+    assert len(rig.claims(bare, "user1")) == 2, "they stay in the ledger"
+    assert values(follow_of(bare, cause), "Override") == ["overrides/closed.yaml"]
+    anew = rig.goal(11, vehicle=3)
+    anew["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["user5", "user1"]
+    with pytest.raises(Refused) as refusal:
+        rig.book(generator, anew)
+    assert [(one.code, str(one)) for one in refusal.value.faults] == [
+        (
+            "denied",
+            "apps[0].object_detection_fusion_app.requester_ids[1]: is denied by "
+            "overrides/closed.yaml: a field test; ask its owner, petra, or leave it out",
+        )
+    ]
+    (renewed,) = rig.book(generator, rig.goal(1))
+    assert renewed.outcome == "unchanged"
+    assert any("is suspended by overrides/closed.yaml" in text for text in renewed.warnings)
+    merge(person, closed=None)
+    next_demand(generator, 2)
+    assert rig.git(bare, "rev-parse", "main:clusters") == files
+    assert rig.books(bare) == running
+    merge(person, closed=override({"requesters": ["user1"]}, deny=True))
+    (left,) = rig.book(generator, rig.leave(1))
+    assert left.outcome == "released"
+    assert rig.claims(bare, "user1") == []
+    rig.assert_sound(bare)
+
+
+def test_a_denied_service_does_not_run_and_the_rest_does(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, rig.goal(1))
+    merge(person, off=override({"services": ["object-detection"]}, deny=True))
+    rig.book(generator, rig.leave(2) | {"shutdown": False, "apps": []})
+    books = rig.books(bare)
+    assert sorted({entry["service"] for entry in books["services"].values()}) == ["object-fusion"]
+    assert "suspended" not in books
+    with pytest.raises(Refused, match=r"apps\[0\].type: is denied by overrides/off.yaml"):
+        rig.book(generator, rig.goal(3))
+    merge(person, off=None)
+    rig.book(generator, rig.goal(3))
+    assert file(bare, DETECTION)
+    rig.assert_sound(bare)
+
+
+def test_what_is_kept_runs_on_until_somebody_asks_again_or_the_override_goes(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, rig.goal(1))
+    merge(person, lasting=override({"applications": ["edge/*"]}, keep=True))
+    (left,) = rig.book(generator, rig.leave(1))
+    (commit,) = [commit for commit in rig.commits(bare) if commit.id == left.commit]
+    assert values(commit, "Override") == ["overrides/lasting.yaml"]
+    assert values(commit, "Requester") == ["user1", "station00"]
+    books = rig.books(bare)
+    assert books["services"]["od-edge-station00"]["requesters"] == ["petra"]
+    assert books["connections"] == {}, "it keeps applications, and this connection is none"
+    assert len(rig.claims(bare, "override:lasting")) == 1
+    assert "override overrides/lasting.yaml: keep;" in file(bare, DETECTION)
+    with pytest.raises(Refused):
+        rig.book(generator, rig.leave(1))
+    moved = rig.goal(6)
+    moved["apps"][0]["header"]["node_id"] = "cloud"
+    rig.book(generator, moved)
+    assert rig.claims(bare, "override:lasting") == [], "it gives way, wherever one asks for it"
+    rig.book(generator, moved | {"shutdown": True})
+    assert len(rig.claims(bare, "override:lasting")) == 1
+    cause = merge(person, lasting=None)
+    next_demand(generator, 2)
+    assert rig.claims(bare, "override:lasting") == []
+    assert values(follow_of(bare, cause), "Override") == ["overrides/lasting.yaml"]
+    rig.book(generator, rig.leave(2))
+    assert rig.books(bare)["services"] == {}
+    rig.assert_sound(bare)
+
+
+def test_a_claim_that_a_person_deletes_is_kept_too(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, rig.goal(1))
+    merge(person, lasting=override({"connections": ["vehicle01/*"]}, keep=True))
+    (path,) = rig.claims(bare, "ConnectionClaim")
+    cause = person.change({path: None})
+    next_demand(generator, 2)
+    assert rig.books(bare)["connections"]["vehicle01/edge"]["requesters"] == ["petra"]
+    assert values(follow_of(bare, cause), "Override") == ["overrides/lasting.yaml"]
+    rig.assert_sound(bare)
+
+
+def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
+    anywhere: Generator, bare: Path, person: Person
+) -> None:
+    generator = anywhere
+    rig.book(generator, rig.goal(1))
+    plain = file(bare, DETECTION)
+    end = datetime.now(timezone.utc) + timedelta(seconds=2)
+    short = end.isoformat()
+    merge(
+        person,
+        brief=override(WATCHED, replicas=3, expires=short),
+        late=override(WATCHED, replicas=4, priority=1, expires="2020-01-01T00:00:00Z"),
+    )
+    next_demand(generator)
+    assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 3, "late never applied"
+    assert "; until 20" in file(bare, DETECTION).splitlines()[0]
+    marker = "ledger/overrides/brief.yaml"
+    assert file(bare, "ledger/overrides/late.yaml")
+    assert file(bare, marker) == ""
+    rig.wait_until(lambda: file(bare, marker), "the override has ended")
+    assert datetime.now(timezone.utc) >= end
+    assert file(bare, DETECTION) == plain
+    (commit,) = [c for c in rig.commits(bare) if c.one("Operation") == "expire-override"]
+    assert commit.summary == "End override brief"
+    assert values(commit, "Override") == ["overrides/brief.yaml"]
+    assert "overrides/brief.yaml of petra (a field test) expired at" in rig.git(
+        bare, "log", "-1", "--format=%b", commit.id
+    )
+    assert parsed(bare, "overrides/brief.yaml")["expires"] == short, "the person's file stays"
+    next_demand(generator, 2)
+    assert file(bare, DETECTION) == plain
+    later = (end + timedelta(days=300)).isoformat()
+    merge(person, brief=override(WATCHED, replicas=3, expires=later), late=None)
+    next_demand(generator, 3)
+    assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 3
+    assert file(bare, marker) == file(bare, "ledger/overrides/late.yaml") == ""
+    rig.assert_sound(bare)
+
+
+def test_what_expired_while_no_generator_ran_ends_when_one_does(
+    address: str, bare: Path, person: Person
+) -> None:
+    with rig.running(address) as generator:
+        rig.book(generator, rig.goal(1))
+        end = datetime.now(timezone.utc) + timedelta(seconds=1)
+        merge(person, brief=override(WATCHED, replicas=3, expires=end.isoformat()))
+        next_demand(generator)
+    rig.wait_until(lambda: datetime.now(timezone.utc) > end, "its time has passed")
+    with rig.running(address):
+        rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "it is ended")
+    assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
+    rig.assert_sound(bare)
+
+
+BROKEN = {
+    "a patch that breaks the chart's schema": (
+        override(WATCHED, values={"replicas": "many"}),
+        "overrides/broken.yaml: values.replicas:",
+    ),
+    "a tie": (
+        override({"nodes": ["e*"]}, replicas=5),
+        "overrides/sound.yaml: priority: is 0, as in overrides/broken.yaml",
+    ),
+    "no YAML": ("apiVersion: [", "overrides/broken.yaml: line 2"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_override_is_reported_and_what_was_in_force_stays(
+    name: str,
+    generator: Generator,
+    bare: Path,
+    person: Person,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    text, told = BROKEN[name]
+    caplog.set_level(logging.ERROR, logger="demandops")
+    merge(person, sound=override(WATCHED, replicas=3, expires="2090-01-01T00:00:00Z"))
+    rig.book(generator, rig.goal(1))
+    merge(person, broken=text)
+    rig.book(generator, rig.goal(2), rig.leave(1))
+    assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 3
+    assert any(told in record.getMessage() for record in caplog.records), caplog.text
+    merge(person, broken=None, sound=None)
+    next_demand(generator)
+    assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
+    rig.assert_sound(bare)
+
+
+def test_an_override_ends_while_people_have_broken_another(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    end = datetime.now(timezone.utc) + timedelta(seconds=2)
+    merge(person, brief=override(WATCHED, replicas=3, expires=end.isoformat()))
+    rig.book(generator, rig.goal(1))
+    merge(person, broken="apiVersion: [")
+    next_demand(generator)
+    assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 3
+    rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "it is ended")
+    assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
+    next_demand(generator, 2)
+    rig.assert_sound(bare)
+
+
+def test_nobody_takes_an_overrides_demand_id(generator: Generator) -> None:
+    goal = {
+        "kind": "Demand",
+        "demand": "override:mine",
+        "requesters": ["petra"],
+        "operation": "release",
+    }
+    with pytest.raises(InvalidInput) as refusal:
+        rig.book(generator, goal)
+    assert "demand: starts with 'override:', as overrides do; choose another demand id" in str(
+        refusal.value
+    )

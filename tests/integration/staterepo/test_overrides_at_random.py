@@ -1,0 +1,100 @@
+"""A person merges overrides, broken ones among them, deletes claims and takes all back, at random.
+
+Demands go on meanwhile. In the end nothing of the overrides is left, and every commit verifies.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+import staterepo_rig as rig
+import yaml
+from staterepo_rig import Person
+
+from generator.demand.claim import KEPT
+from generator.errors import DemandOpsError
+
+STEPS = 25
+
+Write = Callable[[random.Random], str]
+
+
+def override(select: dict[str, object], **effects: object) -> Write:
+    head = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "chance", "owner": "petra"}
+
+    def write(chance: random.Random) -> str:
+        drawn = {
+            name: value(chance) if callable(value) else value for name, value in effects.items()
+        }
+        return yaml.safe_dump(head | {"select": [select]} | drawn)
+
+    return write
+
+
+def soon(chance: random.Random) -> str:
+    """A time that has just passed, or comes while the test runs."""
+    moment = datetime.now(timezone.utc) + timedelta(seconds=chance.uniform(-1, 2))
+    return moment.isoformat()
+
+
+POOL: dict[str, Write] = {
+    "frozen": override({"services": ["object-fusion"]}, hold=True, priority=5),
+    "frozen-links": override({"connections": ["vehicle0[01]/*", "vehicle02/*"]}, hold=True),
+    "lasting": override({"applications": ["edge/*"], "requesters": ["user1", "user5"]}, keep=True),
+    "lasting-links": override({"connections": ["*"]}, keep=True, expires=soon),
+    "closed": override({"requesters": ["user2"]}, deny=True),
+    "off": override({"services": ["object-detection"]}, deny=True, expires=soon),
+    "many": override({"requesters": ["user4", "user5"]}, replicas=3, priority=3),
+    "patched": override({"nodes": ["edge"]}, values={"tolerations": []}, priority=4, expires=soon),
+    "moved": override(
+        {"applications": ["edge/fusion-2"]}, node="cloud", priority=lambda c: c.choice([2, 7])
+    ),
+    "pinned": override(
+        {"connections": ["vehicle01/*"]}, images={"mqtt-client": {"tag": "t"}}, priority=9
+    ),
+    "broken": lambda chance: "apiVersion: [",
+    "unfit": override({"services": ["*"]}, values={"replicas": "many"}, priority=77),
+    "tied": override({"services": ["*"]}, hold=True, priority=4),
+}
+
+
+@pytest.mark.limit(120)
+def test_whatever_people_merge_history_verifies(address: str, bare: Path, tmp_path: Path) -> None:
+    chance = random.Random(1 if address == str(bare) else 2)
+    person = Person(bare, tmp_path / "person")
+    merged: set[str] = set()
+    with rig.running(address) as generator:
+        for _ in range(STEPS):
+            dice = chance.random()
+            if dice < 0.35:
+                name = chance.choice([*POOL])
+                merged.add(name)
+                with suppress(AssertionError):  # it stands like this already
+                    person.change({f"overrides/{name}.yaml": POOL[name](chance)})
+            elif dice < 0.5 and merged:
+                name = chance.choice(sorted(merged))
+                merged.remove(name)
+                person.change({f"overrides/{name}.yaml": None})
+            elif dice < 0.57 and (claims := rig.claims(bare, "Claim")):
+                person.change({chance.choice(claims): None})
+            else:
+                number, leaves = chance.randrange(1, 8), chance.random() < 0.4
+                with suppress(DemandOpsError):
+                    rig.book(generator, rig.goal(number, shutdown=leaves))
+        if merged:
+            person.change({f"overrides/{name}.yaml": None for name in merged})
+        rig.book(generator, rig.goal(8))
+        snapshot = generator.snapshot
+    assert snapshot.problems == ()
+    assert not any(claim.demand.startswith(KEPT) for claim in snapshot.state.ledger)
+    assert rig.git(bare, "ls-tree", "-r", "--name-only", "main", "ledger/overrides/") == ""
+    texts = rig.git(
+        bare, "grep", "-l", "# override overrides/", "main", "--", "clusters", check=False
+    )
+    assert texts == ""
+    rig.assert_sound(bare)

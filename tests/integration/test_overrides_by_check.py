@@ -1,0 +1,147 @@
+"""Overrides at `check` and `upgrade`: the one suggested does what the edit by hand was to do."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from asking import perception
+
+Run = Callable[..., Any]
+EDGE = "clusters/c-its/perception/edge"
+FUSION = f"{EDGE}/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
+DETECTION = f"{EDGE}/od-edge-vehicle00.yaml"
+CLIENT = "clusters/c-its/perception/vehicle00/mqtt-vehicle00-edge-source-d3ca91c2df6c.yaml"
+HOLD = """\
+apiVersion: demandops/v1
+kind: Override
+reason: The race is on Sunday
+owner: Petra
+select: [{services: [object-fusion]}]
+hold: true
+"""
+
+
+def git(folder: Path, *args: str) -> str:
+    who = ["-c", "user.name=Petra", "-c", "user.email=petra@example.org"]
+    command = ["git", "-C", str(folder), *who, *args]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.fixture
+def book(demandops: Run, state: Any) -> Callable[..., Any]:
+    def call(**options: Any) -> Any:
+        goal = yaml.safe_dump(perception(**options))
+        ran = demandops("request", "-", "--state-repo", state.path, stdin=goal)
+        assert ran.code == 0, ran.err
+        return ran
+
+    return call
+
+
+@pytest.fixture
+def clone(state: Any, book: Callable[..., Any], tmp_path: Path) -> Path:
+    book()
+    git(tmp_path, "clone", "--quiet", str(state.path), "clone")
+    return tmp_path / "clone"
+
+
+def bodies(text: str) -> list[Any]:
+    return list(yaml.safe_load_all(text))
+
+
+@pytest.mark.parametrize(
+    ("path", "replaced"),
+    [
+        (FUSION, [("domainId: 0", "domainId: 7"), ("replicas: 1", "replicas: 3")]),
+        (FUSION, [("tolerations: []", "tolerations: [{key: gpu, operator: Exists}]")]),
+        (DETECTION, [('tag: "2025-04"', 'tag: "2026-01"')]),
+        (CLIENT, [("mqtt_client:kilted", "mqtt_client:jazzy")]),
+    ],
+    ids=["values-and-replicas", "list", "image", "image-of-a-client"],
+)
+def test_the_override_suggested_gives_the_file_that_was_edited_by_hand(
+    demandops: Run,
+    state: Any,
+    book: Callable[..., Any],
+    clone: Path,
+    path: str,
+    replaced: list[tuple[str, str]],
+) -> None:
+    text = (clone / path).read_text()
+    for old, new in replaced:
+        assert old in text
+        text = text.replace(old, new)
+    (clone / path).write_text(text)
+    (suggested,) = demandops("check", clone, "--output", "json").json()["overrides"]
+    git(clone, "checkout", "--quiet", ".")
+    (clone / suggested["file"]).parent.mkdir(exist_ok=True)
+    (clone / suggested["file"]).write_text(suggested["text"])
+
+    found = demandops("check", clone, "--output", "json").json()
+    assert (found["faults"], found["outdated"]) == ([], [path])
+    git(clone, "add", "--all")
+    git(clone, "commit", "--quiet", "-m", "Override instead")
+    git(clone, "push", "--quiet", "origin", "main")
+    book(id="second")
+    assert bodies(state.files()[path]) == bodies(text)
+
+
+def test_the_deletion_suggested_stops_what_was_deleted_by_hand(
+    demandops: Run, state: Any, book: Callable[..., Any], clone: Path
+) -> None:
+    (clone / CLIENT).unlink()
+    (suggested,) = demandops("check", clone, "--output", "json").json()["overrides"]
+    git(clone, "checkout", "--quiet", ".")
+    state.commit({suggested["file"]: suggested["text"]})
+    goal = yaml.safe_dump(perception(id="second"))
+    demandops("request", "-", "--state-repo", state.path, stdin=goal)
+    assert CLIENT not in state.files()
+
+
+def test_a_markers_edit_is_refused(demandops: Run, clone: Path) -> None:
+    marker = clone / "ledger" / "overrides" / "race.yaml"
+    marker.parent.mkdir()
+    marker.write_text("a: b\n")
+    (fault,) = demandops("check", clone, "--output", "json").json()["faults"]
+    assert fault["file"] == "ledger/overrides/race.yaml"
+
+
+def test_a_release_that_is_held_keeps_the_controller_from_being_changed(
+    demandops: Run, state: Any, book: Callable[..., Any]
+) -> None:
+    book()
+    before = state.commit({"overrides/race.yaml": HOLD})
+    ran = demandops("upgrade", "--state-repo", state.path, "--gitops", "argocd")
+    assert (ran.code, ran.out, state.tip) == (1, "", before)
+    assert ran.err == (
+        "error: overrides/race.yaml: hold: keeps of-edge-object-detection-fusion-cf7e0180a8bb as "
+        "it is rendered for the other controller; remove it, and hold the release again "
+        "afterwards\n"
+    )
+    state.commit({"overrides/race.yaml": None})
+    assert demandops("upgrade", "--state-repo", state.path, "--gitops", "argocd").code == 0
+
+
+def test_an_upgrade_takes_in_what_people_changed_before_it(
+    demandops: Run, state: Any, book: Callable[..., Any]
+) -> None:
+    """An application whose claims are deleted in the same breath as an override keeps it."""
+    book()
+    keep = HOLD.replace("services: [object-fusion]", "applications: ['*']")
+    claims = dict.fromkeys(state.files("ledger/applications/"))
+    state.commit({"overrides/race.yaml": keep.replace("hold", "keep"), **claims})
+    ran = demandops("upgrade", "--state-repo", state.path, "--gitops", "argocd")
+    assert ran.code == 0, ran.err
+    assert FUSION in state.files()
+    rows = demandops("verify", "--state-repo", state.path, "--output", "json").json()
+    assert [(row["holds"], row["skipped"]) for row in rows] == [(True, None)]
+    tip = state.tip
+    book()
+    assert FUSION in state.files()
+    assert len(state.files("ledger/applications/")) >= 1
+    assert state.tip != tip

@@ -1,0 +1,153 @@
+"""``demandops overrides``, and what check, bookkeeping and schema say of overrides."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pygit2
+import pytest
+import yaml
+from asking import perception
+
+if TYPE_CHECKING:  # several folders have a conftest
+    from conftest import Ran, Run, StateRepo
+
+HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
+
+
+def text(**fields: Any) -> str:
+    return yaml.safe_dump(HEAD | fields, sort_keys=False)
+
+
+@pytest.fixture
+def overridden(state: StateRepo, request_json: Callable[..., Ran]) -> StateRepo:
+    """A state repo with perception for vehicle00, and overrides of each sort in force."""
+    request_json(perception())
+    many = {
+        "select": [{"services": ["object-detection"]}],
+        "values": {"replicas": 2, "nodeSelector": None},
+        "images": {"object-detection": {"tag": "x"}},
+        "priority": 3,
+    }
+    state.commit(
+        {
+            "overrides/many.yaml": text(**many),
+            "overrides/closed.yaml": text(select=[{"connections": ["*"]}], deny=True),
+            "overrides/off.yaml": text(select=[{"services": ["object-fusion"]}], deny=True),
+            "overrides/lasting.yaml": text(select=[{"applications": ["edge/*"]}], keep=True),
+            "overrides/idle.yaml": text(select=[{"nodes": ["cloud"]}], hold=True),
+            "overrides/over.yaml": text(
+                select=[{"nodes": ["cloud"]}], keep=True, expires="2020-01-01T00:00:00Z"
+            ),
+        }
+    )
+    request_json(perception())
+    return state
+
+
+def test_overrides_are_listed_with_what_each_does(demandops: Run, overridden: StateRepo) -> None:
+    listed = demandops("overrides", "--state-repo", overridden.path, "--output", "json")
+    assert listed.code == 0
+    rows = {row["name"]: row for row in listed.json()}
+    assert [*rows] == ["closed", "idle", "lasting", "many", "off", "over"]
+    assert rows["many"] == {
+        "name": "many",
+        "file": "overrides/many.yaml",
+        "state": "in force",
+        "effects": {
+            "values": {"replicas": 2, "nodeSelector": None},
+            "images": {"object-detection": {"tag": "x"}},
+        },
+        "releases": ["od-edge-vehicle00"],
+        "claims": [],
+        "priority": 3,
+        "owner": "petra",
+        "until": None,
+        "reason": "why",
+    }
+    assert {name: row["state"] for name, row in rows.items()} == {
+        "closed": "in force",
+        "idle": "matches nothing",
+        "lasting": "in force",
+        "many": "in force",
+        "off": "in force",
+        "over": "expired",
+    }
+    (suspended,) = rows["closed"]["claims"]
+    assert suspended.startswith("connection 'vehicle00/edge' of ")
+    (kept,) = rows["lasting"]["claims"]
+    assert kept.startswith("application 'edge/object_detection_fusion' of ")
+    (off,) = rows["off"]["releases"]
+    assert off.startswith("of-edge-")
+    table = demandops("overrides", "--state-repo", overridden.path)
+    for word in ("od-edge-vehicle00", "matches nothing", "2020-01-01T00:00:00Z", "petra"):
+        assert word in table.out
+    before = demandops("overrides", "--state-repo", overridden.path, "--at", "main~2")
+    assert before.out == "no overrides; docs/overrides.md says how to write one\n"
+
+
+def test_bookkeeping_shows_what_is_suspended(demandops: Run, overridden: StateRepo) -> None:
+    books = demandops("bookkeeping", "--state-repo", overridden.path, "--output", "json").json()
+    (entry,) = books["suspended"]
+    demand = entry.pop("demand")
+    assert entry == {
+        "kind": "connection",
+        "id": "vehicle00/edge",
+        "requesters": ["vehicle00"],
+        "override": "overrides/closed.yaml",
+        "reason": "why",
+    }
+    assert books["connections"] == {}
+    table = demandops("bookkeeping", "--state-repo", overridden.path)
+    assert demand in table.out
+    assert "overrides/closed.yaml" in table.out
+
+
+def test_check_says_what_an_override_would_do_and_warns_of_idle_ones(
+    demandops: Run, state: StateRepo, request_json: Callable[..., Ran], tmp_path: Path
+) -> None:
+    request_json(perception())
+    clone = tmp_path / "clone"
+    pygit2.clone_repository(str(state.path), str(clone))
+    folder = clone / "overrides"
+    select = [{"services": ["object-detection"]}]
+    (folder / "many.yaml").write_text(text(select=select, replicas=2))
+    (folder / "idle.yaml").write_text(text(select=[{"nodes": ["nowhere"]}], hold=True, priority=1))
+    (folder / "over.yaml").write_text(
+        text(select=select, replicas=5, expires="2020-01-01T00:00:00Z", priority=9)
+    )
+    found = demandops("check", clone)
+    assert found.code == 0
+    assert found.err.splitlines() == [
+        "warning: overrides/idle.yaml: matches nothing at present; mend select if it should",
+        "warning: overrides/over.yaml: expired at 2020-01-01T00:00:00Z and applies no more; remove "
+        "the file, or write a later time",
+    ]
+    told = "  ~ od-edge-vehicle00 (object-detection on edge for vehicle00)"
+    assert told in found.out.splitlines()
+    (folder / "many.yaml").write_text(text(select=select, values={"replicas": "two"}))
+    (folder / "idle.yaml").unlink()
+    found = demandops("check", clone, "--output", "json")
+    assert found.code == 1
+    (fault,) = found.json()["faults"]
+    assert (fault["file"], fault["field"]) == ("overrides/many.yaml", "values.replicas")
+
+
+def test_a_dry_run_tells_of_a_denial_and_books_nothing(
+    demandops: Run, overridden: StateRepo
+) -> None:
+    tip = overridden.tip
+    goal = yaml.safe_dump(perception(id="another"))
+    ran = demandops("request", "-", "--state-repo", overridden.path, "--dry-run", stdin=goal)
+    assert ran.code == 1
+    assert "connections[0].id: is denied by overrides/closed.yaml: why; ask its owner" in ran.err
+    assert overridden.tip == tip
+
+
+def test_there_is_a_schema_for_overrides(demandops: Run) -> None:
+    schema = json.loads(demandops("schema", "override").out)
+    assert set(schema["required"]) == {"apiVersion", "kind", "reason", "owner", "select"}
+    assert "name" not in schema["properties"]

@@ -1,0 +1,245 @@
+"""The pipelines that `init` lays down: valid by their schemas, of least rights, run as they are."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import textwrap
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from generator import __version__
+from generator.cli.main import run
+from generator.cli.markdown import MARK
+from generator.staterepo import layout
+
+GITHUB, GITLAB = layout.PIPELINES
+ROOT = str(Path(__file__).parents[2])
+BASH = shutil.which("bash") or "bash"
+
+
+@pytest.fixture(scope="module")
+def laid_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pipelines") / "fleet"
+    assert run(["init", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def repo(laid_down: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(laid_down, tmp_path / "fleet"))
+
+
+@pytest.fixture(scope="module")
+def github(laid_down: Path) -> dict[str, Any]:
+    data: dict[str, Any] = yaml.safe_load((laid_down / GITHUB).read_text())
+    return data
+
+
+@pytest.fixture(scope="module")
+def gitlab(laid_down: Path) -> dict[str, Any]:
+    data: dict[str, Any] = yaml.safe_load((laid_down / GITLAB).read_text())
+    return data
+
+
+@pytest.mark.parametrize(
+    ("path", "options"),
+    [
+        (GITHUB, ["--builtin-schema", "vendor.github-workflows"]),
+        (GITLAB, ["--builtin-schema", "vendor.gitlab-ci", "--data-transform", "gitlab-ci"]),
+    ],
+    ids=["github", "gitlab"],
+)
+def test_a_pipeline_is_valid_by_its_schema(laid_down: Path, path: str, options: list[str]) -> None:
+    command = [sys.executable, "-m", "check_jsonschema", *options, str(laid_down / path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("path", layout.PIPELINES, ids=["github", "gitlab"])
+def test_a_pipeline_installs_the_version_that_laid_it_down(laid_down: Path, path: str) -> None:
+    assert re.findall(r"demandops==(\S+)", (laid_down / path).read_text()) == [__version__]
+
+
+def test_who_may_write_runs_nothing_of_the_pull_request(github: dict[str, Any]) -> None:
+    assert github["permissions"] == {}
+    check, comment = github["jobs"]["check"], github["jobs"]["comment"]
+    assert check["permissions"] == {"contents": "read"}
+    assert comment["permissions"] == {"pull-requests": "write"}
+    uses = [step.get("uses", "") for step in comment["steps"]]
+    assert not [one for one in uses if one.startswith("actions/checkout")]
+    checkout = check["steps"][0]["with"]
+    assert (checkout["persist-credentials"], checkout["fetch-depth"]) == (False, 0)
+    scripts = [step["run"] for job in (check, comment) for step in job["steps"] if "run" in step]
+    # what a pull request names (a branch, a title) reaches no shell as text
+    assert not [script for script in scripts if "${{" in script]
+    for script in scripts:
+        subprocess.run([BASH, "-n"], input=script, text=True, check=True)
+
+
+def environment(tmp_path: Path, **more: str) -> dict[str, str]:
+    return {**os.environ, "DEMANDOPS_DATA_HOME": str(tmp_path / "data"), **more}
+
+
+def put_demandops(at: Path) -> None:
+    """Put this program where the pipeline installs it."""
+    at.parent.mkdir(parents=True)
+    at.write_text(f'#!{BASH}\nexec "{sys.executable}" -m generator.cli.main "$@"\n')
+    at.chmod(at.stat().st_mode | stat.S_IXUSR)
+
+
+def git(folder: Path, *args: str) -> None:
+    who = ["-c", "user.name=Petra", "-c", "user.email=petra@example.org"]
+    command = ["git", "-C", str(folder), *who, *args]
+    subprocess.run(command, check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("sound", [True, False], ids=["sound", "faulty"])
+def test_github_checks_and_reports(
+    repo: Path, tmp_path: Path, github: dict[str, Any], sound: bool
+) -> None:
+    git(repo, "update-ref", "refs/remotes/origin/main", "HEAD")
+    if not sound:
+        (repo / "inventory" / "brokers.yaml").write_text("kind: [\n")
+    put_demandops(tmp_path / "demandops" / "bin" / "demandops")
+    (step,) = [one for one in github["jobs"]["check"]["steps"] if one.get("name") == "Check"]
+    summary = tmp_path / "summary.md"
+    more = {"RUNNER_TEMP": str(tmp_path), "GITHUB_STEP_SUMMARY": str(summary)}
+    done = subprocess.run(
+        [BASH, "-e", "-c", step["run"]],
+        cwd=repo,
+        env=environment(tmp_path, BASE="origin/main", PYTHONPATH=ROOT, **more),
+        check=False,
+    )
+    assert done.returncode == (0 if sound else 1)
+    report = (tmp_path / "report.md").read_text()
+    assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else 'one thing to mend'}")
+    assert summary.read_text() == report
+
+
+@pytest.mark.parametrize("sound", [True, False], ids=["sound", "faulty"])
+def test_gitlab_checks_and_reports(
+    repo: Path, tmp_path: Path, gitlab: dict[str, Any], sound: bool
+) -> None:
+    remote = tmp_path / "remote.git"
+    git(tmp_path, "clone", "--quiet", "--bare", str(repo), str(remote))
+    git(repo, "remote", "add", "origin", remote.as_uri())
+    if not sound:
+        (repo / "inventory" / "brokers.yaml").write_text("kind: [\n")
+    program = tmp_path / "venv" / "bin" / "demandops"
+    put_demandops(program)
+    lines = [line for line in gitlab["demandops"]["script"] if "venv" not in line]
+    script = "\n".join(line for line in lines if "/bin/pip" not in line)
+    done = subprocess.run(
+        [BASH, "-e", "-c", script.replace("/tmp/demandops/bin/demandops", str(program))],
+        cwd=repo,
+        env=environment(tmp_path, CI_MERGE_REQUEST_TARGET_BRANCH_NAME="main", PYTHONPATH=ROOT),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == (0 if sound else 1), done.stderr
+    report = (repo / "report.md").read_text()
+    assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else 'one thing to mend'}")
+    assert report in done.stdout
+
+
+class Notes(ThreadingHTTPServer):
+    """As much of GitLab as the note needs: who I am, and the notes of one merge request."""
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.notes: list[dict[str, Any]] = [
+            {"id": number, "body": f"{MARK}\nby somebody else", "author": {"id": 1}}
+            for number in range(120)
+        ]
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: Notes
+
+    def _answer(self, data: object, **headers: str) -> None:
+        assert self.headers["PRIVATE-TOKEN"] == "token"
+        self.send_response(200)
+        for key, value in headers.items():
+            self.send_header(key.replace("_", "-"), value)
+        self.end_headers()
+        self.wfile.write(json.dumps(data).encode())
+
+    def do_GET(self) -> None:
+        if self.path == "/api/user":
+            self._answer({"id": 7})
+            return
+        assert self.path.startswith("/api/projects/5/merge_requests/3/notes?per_page=100&page=")
+        page = int(self.path.rsplit("=", 1)[1])
+        shown = self.server.notes[100 * (page - 1) : 100 * page]
+        more = len(self.server.notes) > 100 * page
+        self._answer(shown, X_Next_Page=str(page + 1) if more else "")
+
+    def _body(self) -> str:
+        return str(json.loads(self.rfile.read(int(self.headers["Content-Length"])))["body"])
+
+    def do_POST(self) -> None:
+        note = {"id": 500, "body": self._body(), "author": {"id": 7}}
+        self.server.notes.append(note)
+        self._answer(note)
+
+    def do_PUT(self) -> None:
+        (note,) = [one for one in self.server.notes if self.path.endswith(f"/notes/{one['id']}")]
+        note["body"] = self._body()
+        self._answer(note)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def notes() -> Iterator[Notes]:
+    server = Notes()
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield server
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def test_gitlabs_note_is_written_once_and_then_changed(
+    tmp_path: Path, gitlab: dict[str, Any], notes: Notes
+) -> None:
+    script = textwrap.dedent("\n".join(gitlab["demandops-note"]["script"]))
+    script = script.replace("python note.py", f"{sys.executable} note.py")
+    more = {
+        "CI_API_V4_URL": f"http://127.0.0.1:{notes.server_address[1]}/api",
+        "CI_PROJECT_ID": "5",
+        "CI_MERGE_REQUEST_IID": "3",
+        "DEMANDOPS_NOTE_TOKEN": "token",
+    }
+    for text in ("first", "second"):
+        (tmp_path / "report.md").write_text(f"{MARK}\n{text} →\n")
+        subprocess.run(
+            [BASH, "-e", "-c", script], cwd=tmp_path, env=environment(tmp_path, **more), check=True
+        )
+        mine = [one["body"] for one in notes.notes if one["author"]["id"] == 7]
+        assert mine == [f"{MARK}\n{text} →\n"]
+    assert {one["body"] for one in notes.notes if one["author"]["id"] == 1} == {
+        f"{MARK}\nby somebody else"
+    }
+
+
+def test_the_token_is_only_where_nothing_of_the_merge_request_runs(gitlab: dict[str, Any]) -> None:
+    assert "TOKEN" not in json.dumps(gitlab["demandops"])
+    note = gitlab["demandops-note"]
+    assert note["variables"] == {"GIT_STRATEGY": "none"}
+    assert "DEMANDOPS_NOTE_TOKEN" in note["rules"][0]["if"]

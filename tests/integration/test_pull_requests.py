@@ -1,0 +1,535 @@
+"""`demandops check` on pull requests: real branches of a state repo in which a demand runs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from generator.cli import markdown
+from generator.cli.main import run
+from generator.staterepo import checkout as checking
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "experiment"
+GOLDEN = Path(__file__).with_name("pull-request.md")
+EDGE = "clusters/c-its/perception/edge"
+FUSION = f"{EDGE}/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
+DETECTION = f"{EDGE}/od-edge-station00.yaml"
+CLIENT = "clusters/c-its/perception/vehicle00/mqtt-vehicle00-edge-source-d3ca91c2df6c.yaml"
+LOST = "is generated, and an edit by hand is lost; take it back"
+
+Check = Callable[..., tuple[int, str, str]]
+
+
+def git(folder: Path, *args: str) -> str:
+    who = ["-c", "user.name=Petra", "-c", "user.email=petra@example.org"]
+    command = ["git", "-C", str(folder), *who, *args]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def laid_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bare state repo in which vehicle00's demand runs."""
+    folder = tmp_path_factory.mktemp("pull-requests") / "state.git"
+    assert run(["init", str(folder), "--bare"]) == 0
+    book(folder, "1-vehicle00-joins")
+    return folder
+
+
+def book(bare: Path, step: str) -> None:
+    assert run(["request", str(EXAMPLES / f"{step}.yaml"), "--state-repo", str(bare)]) == 0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _data(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path_factory.mktemp("data")))
+        patch.delenv("DEMANDOPS_STATE_REPO", raising=False)
+        yield
+
+
+@pytest.fixture
+def bare(laid_down: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(laid_down, tmp_path / "state.git"))
+
+
+@pytest.fixture
+def branch(bare: Path, tmp_path: Path) -> Path:
+    """A clone with a branch of somebody's own checked out."""
+    folder = tmp_path / "clone"
+    git(tmp_path, "clone", "--quiet", str(bare), str(folder))
+    git(folder, "checkout", "--quiet", "-b", "edit")
+    return folder
+
+
+@pytest.fixture
+def check(branch: Path, capsys: pytest.CaptureFixture[str]) -> Check:
+    def checked(*args: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = run(["check", str(branch), *args])
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return checked
+
+
+@pytest.fixture
+def found(check: Check) -> Callable[..., dict[str, Any]]:
+    return lambda *args: json.loads(check("--output", "json", *args)[1])
+
+
+def commit(folder: Path, text: str = "An edit") -> None:
+    git(folder, "add", "--all")
+    git(folder, "commit", "--quiet", "-m", text)
+
+
+def edit(file: Path, *replaced: tuple[str, str]) -> None:
+    text = file.read_text()
+    for old, new in replaced:
+        assert old in text
+        text = text.replace(old, new)
+    file.write_text(text)
+
+
+def claims(folder: Path, needle: str = "") -> list[Path]:
+    found = sorted((folder / "ledger").rglob("*.yaml"))
+    return [path for path in found if needle in path.read_text()]
+
+
+# ---- hand edits ----
+
+
+def test_edited_values_image_and_replicas_become_an_override_to_paste(
+    branch: Path, check: Check
+) -> None:
+    edit(branch / FUSION, ("replicas: 1", "replicas: 3"), ("domainId: 0", "domainId: 7"))
+    text = (branch / FUSION).read_text()
+    (branch / FUSION).write_text(text.replace('tag: "2025-04"', 'tag: "2025-05"', 1))
+    commit(branch)
+    code, out, errors = check()
+    name = "overrides/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
+    assert (code, errors) == (1, f"error: {FUSION}: {LOST}, and merge {name} as shown\n")
+    assert out == (
+        f"\ninstead of editing {FUSION}, {name}:\n"
+        "\n"
+        "apiVersion: demandops/v1\n"
+        "kind: Override\n"
+        'reason: "Say here why; this stands for an edit of a generated file by hand"\n'
+        "owner: Petra\n"
+        "select:\n"
+        "- applications:\n"
+        "  - edge/object_detection_fusion\n"
+        "  services:\n"
+        "  - object-fusion\n"
+        "values:\n"
+        "  ros:\n"
+        "    domainId: 7\n"
+        "images:\n"
+        "  object-fusion:\n"
+        '    tag: "2025-05"\n'
+        "replicas: 3\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("path", "replaced", "effects", "left"),
+    [
+        (
+            DETECTION,
+            [("object-detection-0.1.0", "object-detection-0.2.0")],
+            {"version": "0.2.0"},
+            [],
+        ),
+        (DETECTION, [("  interval: 10m\n", "  interval: 10m\n  suspend: true\n")],
+         {"hold": True}, []),
+        (DETECTION, [("tolerations: []", "tolerations: [{key: gpu}]"),
+                     ("interval: 10m", "interval: 1m")],
+         {"values": {"tolerations": [{"key": "gpu"}]}}, ["spec.interval"]),
+        (DETECTION, [('      digest: ""\n', ""), ("      rmwImplementation: ", "      other: ")],
+         {"values": {"image": {"digest": None},
+                     "ros": {"rmwImplementation": None, "other": "rmw_cyclonedds_cpp"}}}, []),
+        (CLIENT, [("mqtt_client:kilted", "mqtt_client:jazzy"), ("replicas: 1", "replicas: 2")],
+         {"images": {"mqtt-client": {"tag": "jazzy"}}}, ["Deployment spec.replicas"]),
+        (CLIENT, [("ghcr.io/ika-rwth-aachen/mqtt_client:kilted",
+                   f"mirror.example:5000/mqtt@sha256:{'0' * 64}")],
+         {"images": {"mqtt-client": {"digest": f"sha256:{'0' * 64}",
+                                     "repository": "mirror.example:5000/mqtt"}}}, []),
+    ],
+    ids=["version", "suspend", "values-and-more", "removed-values", "image", "digest"],
+)  # fmt: skip
+def test_other_edits_become_the_effect_that_is_made_for_them(
+    branch: Path,
+    found: Callable[..., dict[str, Any]],
+    path: str,
+    replaced: list[tuple[str, str]],
+    effects: dict[str, Any],
+    left: list[str],
+) -> None:
+    edit(branch / path, *replaced)
+    (suggested,) = found()["overrides"]
+    override = yaml.safe_load(suggested["text"])
+    head = ("apiVersion", "kind", "reason", "owner", "select")
+    assert {key: override[key] for key in override if key not in head} == effects
+    assert (suggested["instead_of"], suggested["left"]) == (path, left)
+    also = ["od-edge-vehicle00"] if path == DETECTION else []
+    assert suggested["also"] == also
+
+
+def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, check: Check) -> None:
+    edit(branch / DETECTION, ("interval: 10m", "interval: 1m"))
+    assert check()[2] == f"error: {DETECTION}: {LOST}, and change the configuration that it " \
+        "follows from\n"  # fmt: skip
+    (branch / DETECTION).write_text("kind: [\n")
+    assert check()[0] == 1
+
+
+def test_a_suggested_override_is_one_that_can_be_merged(
+    branch: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    override = pytest.importorskip("generator.catalog.override")
+    edit(branch / FUSION, ("replicas: 1", "replicas: 3"), ("domainId: 0", "domainId: 7"))
+    edit(branch / CLIENT, ("mqtt_client:kilted", "mqtt_client:jazzy"))
+    (branch / DETECTION).unlink()
+    suggested = found()["overrides"]
+    assert len(suggested) == 3
+    for one in suggested:
+        override.OverrideFile.model_validate(yaml.safe_load(one["text"]))
+
+
+def test_what_is_deleted_added_or_the_generators_own_is_refused_with_what_to_do(
+    branch: Path, check: Check
+) -> None:
+    (branch / DETECTION).unlink()
+    (branch / CLIENT).unlink()
+    (branch / EDGE / "extra.yaml").write_text("kind: Secret\n")
+    (branch / EDGE / "README.md").write_text("Ours.\n")
+    (branch / "ledger" / "notes.yaml").write_text("a: b\n")
+    (branch / ".demandops").mkdir()
+    (branch / ".demandops" / "report.yaml").write_text("all: well\n")
+    code, out, errors = check()
+    assert code == 1
+    stopped = (
+        "; to have it stopped, merge overrides/{} as shown, or delete the claims in ledger/ that "
+        "it follows from"
+    )
+    assert errors.splitlines() == [
+        "error: .demandops/report.yaml: is the generator's own, and written anew by it; take the "
+        "edit back",
+        f"error: {EDGE}/extra.yaml: is generated, and what no demand asks for is removed; take it "
+        "away, and demand it: demandops request",
+        f"error: {DETECTION}: {LOST}{stopped.format('od-edge-station00.yaml')}",
+        f"error: {CLIENT}: {LOST}{stopped.format(Path(CLIENT).name)}",
+        "error: ledger/notes.yaml: is no claim's place, and the generator removes it; take it away",
+    ]
+    assert "select:\n- connections:\n  - vehicle00/edge\ndeny: true\n" in out
+    assert out.count("deny: true") == 2
+
+
+def test_an_override_that_is_there_is_not_overwritten_by_the_one_suggested(
+    branch: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    (branch / "overrides").mkdir(exist_ok=True)
+    (branch / "overrides" / "od-edge-station00.yaml").write_text(
+        "apiVersion: demandops/v1\nkind: Override\nreason: r\nowner: o\n"
+        "select: [{nodes: [cloud]}]\nhold: true\n"
+    )
+    (branch / DETECTION).unlink()
+    assert found()["overrides"][0]["file"] == "overrides/od-edge-station00-2.yaml"
+
+
+# ---- claims and configuration, and what follows ----
+
+
+def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, check: Check) -> None:
+    (claim,) = claims(branch, "connection: vehicle00/edge")
+    claim.unlink()
+    commit(branch)
+    base = git(branch, "rev-parse", "origin/main")[:10]
+    source, target = Path(CLIENT).stem, "mqtt-vehicle00-edge-target-3c0f22bda69b"
+    assert check() == (
+        0,
+        f"{branch}: all files are valid and everything renders\n"
+        "\n"
+        f"what merging would do since {base}:\n"
+        "\n"
+        "desired state:\n"
+        f"  - {source} (MQTT source of connection vehicle00/edge on vehicle00)\n"
+        f"  - {target} (MQTT target of connection vehicle00/edge on edge)\n"
+        "\n"
+        "bookkeeping:\n"
+        "  - connection vehicle00/edge for station00, vehicle00\n"
+        "\n"
+        "the generator will write or remove 2 files:\n"
+        f"  remove {EDGE}/{target}.yaml\n"
+        f"  remove {CLIENT}\n",
+        "",
+    )
+
+
+def test_an_edited_claim_is_judged_as_a_claim(
+    branch: Path, check: Check, found: Callable[..., dict[str, Any]]
+) -> None:
+    (claim,) = claims(branch, "kind: ApplicationClaim")
+    sound = claim.read_text()
+    edit(claim, ("- station00\n", "- station00\n- tram07\n"))
+    code, out, _ = check()
+    assert code == 0
+    assert "~ service od-edge-station00\n      + requester tram07\n" in out
+    assert found()["files"] == []
+
+    claim.write_text(sound.replace("node: edge", "node: moon"))
+    path = claim.relative_to(branch).as_posix()
+    faults = found()["faults"]
+    assert {one["file"] for one in faults} == {path}
+    assert any("'moon' is in use, but not in" in one["message"] for one in faults)
+
+    claim.write_text(sound.replace("node: edge", "nodes: edge"))
+    assert {one["file"] for one in found()["faults"]} == {path}
+
+
+def test_all_faults_of_claims_configuration_and_hand_edits_are_told_together(
+    branch: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    (claim,) = claims(branch, "kind: ApplicationClaim")
+    edit(claim, ("node: edge", "nodes: edge"))
+    edit(branch / "inventory" / "brokers.yaml", ("node: edge", "node: egde"))
+    edit(branch / "policy" / "access-domains.yaml", ("kind: AccessDomains", "kind: Domains"))
+    edit(branch / FUSION, ("replicas: 1", "replicas: 3"))
+    data = found()
+    assert {one["file"].split("/")[0] for one in data["faults"]} == {
+        "ledger", "inventory", "policy", "clusters",
+    }  # fmt: skip
+    assert len(data["overrides"]) == 1
+
+
+def test_a_node_in_use_that_is_taken_away_is_told_for_each_claim(
+    branch: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    edit(branch / "inventory" / "nodes.yaml", ("- id: vehicle00\n", "- id: vehicle99\n"))
+    faults = found()["faults"]
+    (connection,) = claims(branch, "connection: vehicle00/edge")
+    assert connection.relative_to(branch).as_posix() in {one["file"] for one in faults}
+
+
+def test_configuration_shows_in_which_fields_releases_change(
+    branch: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    data = found()
+    assert [one["name"] for one in data["releases"]] == [
+        "od-edge-station00", "od-edge-vehicle00", Path(FUSION).stem,
+    ]  # fmt: skip
+    assert data["releases"][0]["details"] == ["spec.values.image.tag: '2025-04' → '2025-09'"]
+    assert '-      tag: "2025-04"\n+      tag: "2025-09"\n' in data["files"][0]["diff"]
+    assert data["bookkeeping"] == []
+
+
+def test_a_base_that_was_broken_is_mended_by_the_branch(
+    bare: Path, branch: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    git(branch, "checkout", "--quiet", "main")
+    edit(branch / "inventory" / "brokers.yaml", ("node: edge", "node: egde"))
+    commit(branch, "A merge gone wrong")
+    git(branch, "push", "--quiet", "origin", "main")
+    git(branch, "checkout", "--quiet", "-b", "mend")
+    edit(branch / "inventory" / "brokers.yaml", ("node: egde", "node: edge"))
+    data = found()
+    assert (data["faults"], data["base_valid"], data["files"]) == ([], False, [])
+
+
+def test_a_symbolic_link_is_not_followed(
+    branch: Path, tmp_path: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("password: hunter2\n")
+    brokers = branch / "inventory" / "brokers.yaml"
+    brokers.unlink()
+    brokers.symlink_to(secret)
+    data = found()
+    assert {
+        "file": "inventory/brokers.yaml",
+        "field": "",
+        "message": "is a symbolic link, which is not followed; put a file there",
+    } in data["faults"]
+    assert "hunter2" not in json.dumps(data)
+
+
+def test_the_check_of_another_render_version_says_so(
+    branch: Path, check: Check, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checking, "RENDER_VERSION", 2)
+    assert check()[2] == (
+        "error: demandops.yaml: renderVersion: is 1, but this program renders version 2; check "
+        "with the program that the generator runs, or have all rendered anew by `demandops "
+        "upgrade`\n"
+    )
+
+
+# ---- branches ----
+
+
+def test_a_branch_of_several_commits_is_seen_whole_while_main_moves_on(
+    bare: Path, branch: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    commit(branch)
+    (claim,) = claims(branch, "connection: vehicle00/edge")
+    claim.unlink()
+    commit(branch)
+    before = found()
+    assert {one["change"] for one in before["releases"]} == {"change", "stop"}
+
+    book(bare, "2-vehicle01-joins")
+    git(branch, "fetch", "--quiet", "origin")
+    assert found() == before
+    git(branch, "merge", "--quiet", "--no-edit", "origin/main")
+    after = found()
+    assert (after["faults"], after["base"]) == ([], git(branch, "rev-parse", "origin/main"))
+    assert {one["change"] for one in after["releases"]} == {"change", "stop"}
+    assert not [one for one in after["bookkeeping"] if one["change"] == "added"]
+
+
+def test_what_the_generator_wrote_itself_is_no_hand_edit(
+    bare: Path, branch: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    old = git(branch, "rev-parse", "HEAD")
+    book(bare, "2-vehicle01-joins")
+    git(branch, "pull", "--quiet", "origin", "main")
+    data = found("--base", old)
+    assert data["faults"] == []
+    assert "start" in {one["change"] for one in data["releases"]}
+
+
+def test_without_a_remote_main_is_compared_with(
+    branch: Path, found: Callable[..., dict[str, Any]]
+) -> None:
+    git(branch, "remote", "remove", "origin")
+    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    commit(branch)
+    assert len(found()["releases"]) == 3
+    assert found("--base", "HEAD")["releases"] == found()["releases"]  # not followed up yet
+
+
+SHALLOW = (
+    "this clone is shallow and does not hold the commit that the edit started from; fetch all of "
+    "it: git fetch --unshallow origin (in a pipeline fetch-depth: 0, or GIT_DEPTH: 0)"
+)
+
+
+@pytest.mark.parametrize("base", [[], ["--base", "origin/main"]], ids=["default", "named"])
+def test_a_shallow_clone_is_told_how_to_become_whole(
+    bare: Path,
+    branch: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    base: list[str],
+) -> None:
+    (claim,) = claims(branch, "connection: vehicle00/edge")
+    claim.unlink()
+    commit(branch)
+    git(branch, "push", "--quiet", "origin", "edit")
+    folder = tmp_path / "shallow"
+    git(tmp_path, "clone", "-q", "--depth", "1", "--branch", "edit", bare.as_uri(), str(folder))
+    capsys.readouterr()
+    assert run(["check", str(folder), *base]) == 1
+    named = "'origin/main': " if base else ""
+    assert capsys.readouterr() == ("", f"error: {named}{SHALLOW}\n")
+    git(folder, "fetch", "--quiet", "origin", "+refs/heads/main:refs/remotes/origin/main")
+    assert run(["check", str(folder), *base]) == 1
+    assert SHALLOW in capsys.readouterr().err
+    git(folder, "fetch", "--quiet", "--unshallow", "origin")
+    assert run(["check", str(folder), *base]) == 0
+
+
+def test_a_base_that_is_none_is_told(branch: Path, check: Check) -> None:
+    code, out, errors = check("--base", "nowhere")
+    assert (code, out) == (1, "")
+    assert errors.startswith("error: 'nowhere' is no commit")
+    git(branch, "checkout", "--quiet", "--orphan", "alone")
+    commit(branch)
+    assert check()[2] == (
+        "error: HEAD and refs/remotes/origin/main have no commit in common; name with --base what "
+        "the edit is to be merged into\n"
+    )
+
+
+# ---- Markdown ----
+
+
+def test_the_report_is_ready_to_be_posted(branch: Path, check: Check) -> None:
+    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    (claim,) = claims(branch, "connection: vehicle00/edge")
+    claim.unlink()
+    edit(branch / DETECTION, ("tolerations: []", "tolerations: [{key: gpu}]"))
+    commit(branch)
+    code, out, errors = check("--output", "markdown")
+    assert (code, errors) == (1, "")
+    report = out.replace(git(branch, "rev-parse", "origin/main")[:10], "0123456789")
+    assert report == GOLDEN.read_text()
+
+
+def test_a_report_of_nothing_says_so(branch: Path, check: Check) -> None:
+    base = git(branch, "rev-parse", "HEAD")[:10]
+    assert check("--output", "markdown") == (
+        0,
+        "<!-- demandops check -->\n"
+        "## DemandOps: valid, and everything renders\n"
+        f"\nCompared with `{base}`.\n"
+        "\nMerging changes nothing that runs, and nobody's demand.\n",
+        "",
+    )
+
+
+def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Check) -> None:
+    evil = "`@everyone` </details> [x](javascript:0) ```` ![i](http://x) <b>|"
+    (claim,) = claims(branch, "kind: ApplicationClaim")
+    text = yaml.safe_load(claim.read_text())
+    claim.write_text(json.dumps(text | {"requesters": [evil]}))
+    (branch / EDGE / "a&<b>`.yaml").write_text("x")
+    code, out, _ = check("--output", "markdown")
+    assert code == 1
+    assert f"`````requester {evil}`````" in out
+    outside = without_code(out)
+    for mark in ("@", "javascript", "http:", "<b>", "]("):
+        assert mark not in outside
+
+
+def without_code(text: str) -> str:
+    """Return what of Markdown is no code, by the rule of CommonMark for spans and fences."""
+    kept, rest = "", text
+    while "`" in rest:
+        before, _, rest = rest.partition("`")
+        marks = 1 + len(rest) - len(rest.lstrip("`"))
+        rest = rest.lstrip("`")
+        kept += before
+        end = next(
+            i
+            for i in range(len(rest))
+            if rest.startswith("`" * marks, i)
+            and not rest.startswith("`", i + marks)
+            and (i == 0 or rest[i - 1] != "`")
+        )
+        rest = rest[end + marks :]
+    return kept + rest
+
+
+def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Check) -> None:
+    (claim,) = claims(branch, "kind: ApplicationClaim")
+    crowd = [f"vehicle-{number:05}" for number in range(4_000)]
+    claim.write_text(json.dumps(yaml.safe_load(claim.read_text()) | {"requesters": crowd}))
+    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    code, out, _ = check("--output", "markdown")
+    assert code == 0
+    assert len(out) <= markdown.LONGEST == 60_000
+    assert out.startswith(f"{markdown.MARK}\n## DemandOps: valid")
+    assert "Releases: 3 to change." in out
+    assert out.endswith(
+        "\n3 parts of this report left out, for a comment has a longest length; `demandops check` "
+        "shows all.\n"
+    )

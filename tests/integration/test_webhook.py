@@ -1,0 +1,220 @@
+"""The inbound webhook, over real HTTP on loopback."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import http.client
+import logging
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from generator.errors import InvalidInput
+from generator.service import webhook
+from generator.service.webhook import Webhook, read_secret
+
+SECRET = b"s3cret-of-the-hook"
+BODY = b'{"ref": "refs/heads/main"}'
+
+
+class Heard:
+    """Counts the pushes that were heard of."""
+
+    def __init__(self) -> None:
+        self.times = 0
+
+    def __call__(self) -> None:
+        self.times += 1
+
+
+@pytest.fixture
+def heard() -> Heard:
+    return Heard()
+
+
+@pytest.fixture
+def signed(heard: Heard) -> Iterator[Webhook]:
+    hook = Webhook("127.0.0.1:0", SECRET, heard)
+    yield hook
+    hook.close()
+
+
+@pytest.fixture
+def unsigned(heard: Heard) -> Iterator[Webhook]:
+    hook = Webhook("127.0.0.1:0", b"", heard)
+    yield hook
+    hook.close()
+
+
+def send(
+    hook: Webhook,
+    headers: dict[str, str] | None = None,
+    *,
+    method: str = "POST",
+    path: str = "/push",
+    body: bytes | None = BODY,
+) -> tuple[int, str]:
+    connection = http.client.HTTPConnection(str(urlsplit(hook.url).netloc), timeout=10)
+    try:
+        connection.request(method, path, body, headers or {})
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode().strip()
+    finally:
+        connection.close()
+
+
+def mac(body: bytes = BODY, secret: bytes = SECRET) -> str:
+    return hmac.new(secret, body, hashlib.sha256).hexdigest()
+
+
+GENUINE = {
+    "github": {"X-Hub-Signature-256": f"sha256={mac()}", "X-GitHub-Event": "push"},
+    "gitea": {"X-Gitea-Signature": mac()},
+    "forgejo": {"X-Forgejo-Signature": mac(), "X-Gitea-Signature": mac()},
+    "gitlab": {"X-Gitlab-Token": SECRET.decode(), "X-Gitlab-Event": "Push Hook"},
+}
+
+FORGED = {
+    "nothing": {},
+    "another-secret": {"X-Hub-Signature-256": f"sha256={mac(secret=b'guess')}"},
+    "another-body": {"X-Hub-Signature-256": f"sha256={mac(b'{}')}"},
+    "no-secret": {"X-Hub-Signature-256": f"sha256={mac(secret=b'')}"},
+    "sha1": {"X-Hub-Signature": f"sha1={hmac.new(SECRET, BODY, hashlib.sha1).hexdigest()}"},
+    "empty": {"X-Hub-Signature-256": "", "X-Gitea-Signature": "", "X-Gitlab-Token": ""},
+    "cut-off": {"X-Gitea-Signature": mac()[:-1]},
+    "token": {"X-Gitlab-Token": SECRET.decode()[:-1]},
+    "not-ascii": {"X-Gitlab-Token": "s\xe9cret", "X-Gitea-Signature": "\xe9" * 64},
+}
+
+
+@pytest.mark.parametrize("server", GENUINE)
+def test_who_knows_the_secret_is_heard(signed: Webhook, heard: Heard, server: str) -> None:
+    assert send(signed, GENUINE[server]) == (202, "looking")
+    assert heard.times == 1
+
+
+@pytest.mark.parametrize("case", FORGED)
+def test_who_does_not_is_refused_and_the_log_holds_nothing_of_it(
+    signed: Webhook, heard: Heard, case: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    for _ in range(3):
+        assert send(signed, FORGED[case]) == (403, "not signed with the secret")
+    assert heard.times == 0
+    warnings = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warnings) == 1, "not one for each"
+    for text in (SECRET.decode(), *(value for value in FORGED[case].values() if value)):
+        assert text not in caplog.text
+
+
+def test_without_a_secret_whoever_is_on_this_machine_is_heard(
+    unsigned: Webhook, heard: Heard
+) -> None:
+    assert send(unsigned) == (202, "looking")
+    assert send(unsigned, body=None, headers={"Content-Length": "0"})[0] == 202
+    assert heard.times == 2
+
+
+def test_what_else_is_asked_is_answered_and_does_nothing(signed: Webhook, heard: Heard) -> None:
+    github = GENUINE["github"]
+    assert send(signed, method="GET", path="/", body=None) == (200, "ok")
+    assert send(signed, method="HEAD", path="/", body=None) == (200, "")
+    assert send(signed, method="GET", path="/push", body=None)[0] == 405
+    assert send(signed, method="GET", path="/admin", body=None) == (404, "nothing is here")
+    assert send(signed, github, path="/") == (404, "notifications go to /push")
+    assert send(signed, github, path="/push/../push")[0] == 404
+    assert send(signed, github, method="PUT")[0] == 501
+    assert heard.times == 0
+
+
+@pytest.mark.parametrize(
+    ("length", "status"),
+    [("26214401", 413), ("9" * 400, 413), ("-1", 411), ("many", 411), ("\u00b2", 411)],
+)
+def test_a_body_without_bounds_is_not_read(
+    signed: Webhook, heard: Heard, length: str, status: int
+) -> None:
+    with _connected(signed) as raw:
+        raw.sendall(f"POST /push HTTP/1.1\r\nContent-Length: {length}\r\n\r\n".encode("latin-1"))
+        assert raw.recv(100).split()[1] == str(status).encode()
+    assert heard.times == 0
+
+
+def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
+    signed: Webhook, heard: Heard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(webhook, "_TIMEOUT_S", 0.3)
+    slow = [_connected(signed) for _ in range(40)]
+    for raw in slow:
+        raw.sendall(b"POST /push HTTP/1.1\r\nContent-Length: 100\r\n\r\nx")
+    for raw in slow:
+        assert raw.recv(200)[:12] in (b"", b"HTTP/1.0 403"), "cut off, or refused for want of more"
+        raw.close()
+    assert send(signed, GENUINE["gitea"])[0] == 202
+    assert heard.times == 1
+
+
+def test_many_at_once_are_all_answered(unsigned: Webhook, heard: Heard) -> None:
+    answers: list[int] = []
+    threads = [threading.Thread(target=lambda: answers.append(send(unsigned)[0])) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert answers == [202] * 8
+
+
+def _connected(hook: Webhook) -> socket.socket:
+    parts = urlsplit(hook.url)
+    return socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=10)
+
+
+# ---- what is given at the start ----
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("8090", "'8090' is no address to listen on; write one like 127.0.0.1:8090"),
+        (":8090", "':8090' is no address to listen on; write one like 127.0.0.1:8090"),
+        ("localhost:http", "'localhost:http' is no address to listen on; write one like "
+         "127.0.0.1:8090"),
+        ("127.0.0.1:65536", "'127.0.0.1:65536' is no address to listen on; write one like "
+         "127.0.0.1:8090"),
+        ("0.0.0.0:0", "'0.0.0.0:0' can be reached from other machines, so notifications must be "
+         "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1"),
+        ("nowhere.invalid:0", "'nowhere.invalid:0': the host 'nowhere.invalid' is not known here; "
+         "write an address of this machine"),
+    ],
+)  # fmt: skip
+def test_an_address_that_will_not_do_is_told(address: str, message: str) -> None:
+    with pytest.raises(InvalidInput) as error:
+        Webhook(address, b"", lambda: None)
+    assert str(error.value) == f"--webhook: {message}"
+
+
+def test_a_port_in_use_is_told(unsigned: Webhook) -> None:
+    taken = urlsplit(unsigned.url).netloc
+    with pytest.raises(InvalidInput, match=f"'{taken}' cannot be listened on: Address already"):
+        Webhook(taken, b"", lambda: None)
+
+
+def test_with_a_secret_others_may_be_listened_to(heard: Heard) -> None:
+    hook = Webhook("0.0.0.0:0", SECRET, heard)
+    hook.close()
+
+
+def test_the_secret_comes_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "secret"
+    path.write_bytes(SECRET + b"\n")
+    assert read_secret(path) == SECRET
+    path.write_bytes(b" \n")
+    with pytest.raises(InvalidInput, match="is empty; put there the secret"):
+        read_secret(path)
+    with pytest.raises(InvalidInput, match="cannot be read: No such file"):
+        read_secret(tmp_path / "none")

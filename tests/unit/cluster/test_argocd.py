@@ -1,0 +1,261 @@
+"""What Argo CD's objects say about releases, told from objects as the API gives them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from generator.cluster.health import Health, Named, Place, Target, Watched, reading
+from tests.unit.cluster.commits import Letters
+from tests.unit.cluster.test_flux import condition, deployment
+
+URL = "https://git.example/fleet.git"
+COMMITS = Letters()
+PLACE = Place("c-its", "perception", "ns", Named("argocd", "demandops-perception"))
+ARGOCD = reading(PLACE)
+SERVICE = Target(PLACE, "od-edge", by_helm=True)
+CLIENT = Target(PLACE, "mqtt-a", by_helm=False)
+GONE = Target(PLACE, "od-edge", by_helm=True, wanted=False)
+FOLDER = {"repoURL": URL, "path": "clusters/c-its/perception", "targetRevision": "main"}
+CHART = "appdefs/od/charts/od"
+OVER = ("Application", "argocd", "demandops-perception")
+CHILD = ("Application", "ns", "od-edge")
+AT = "2026-05-04T12:00:00Z"
+
+
+def source(**values: Any) -> dict[str, Any]:
+    helm = {"releaseName": "od-edge", "valuesObject": values}
+    return {"repoURL": URL, "path": CHART, "targetRevision": "main", "helm": helm}
+
+
+def application(
+    wanted: dict[str, Any],
+    *,
+    sync: str = "",
+    at: str = "",
+    compared: dict[str, Any] | None = None,
+    operation: dict[str, Any] | None = None,
+    conditions: tuple[dict[str, str], ...] = (),
+    health: str = "Healthy",
+    resources: tuple[dict[str, str], ...] = (),
+) -> dict[str, Any]:
+    """An Application; it was compared with what is wanted where nothing else is said."""
+    status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
+    status["health"] = {"status": health, "lastTransitionTime": AT}
+    if sync:
+        against = {"source": wanted if compared is None else compared}
+        status["sync"] = {"status": sync, "revision": at, "comparedTo": against}
+    if operation:
+        status["operationState"] = operation
+    return {"metadata": {"name": "x"}, "spec": {"source": wanted}, "status": status}
+
+
+def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
+    """The state of a sync."""
+    result = {"revision": revision, "source": more.pop("of", FOLDER)}
+    result["resources"] = more.pop("resources", [])
+    asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}
+    return {
+        "phase": phase, "message": message, "syncResult": result, "operation": asked, **more
+    }  # fmt: skip
+
+
+def over(**status: Any) -> dict[str, Any]:
+    return application(FOLDER, **status)
+
+
+FAILED = {"kind": "Application", "name": "od-edge", "status": "SyncFailed", "message": "forbidden"}
+
+
+@pytest.mark.parametrize(
+    ("found", "state", "reason", "failing"),
+    [
+        (None, "waiting", "is not there; apply bootstrap/", False),
+        (over(), "waiting", "has not applied the commit yet", False),
+        (over(sync="Synced", at="a"), "waiting", "has not applied the commit yet", False),
+        (over(sync="Synced", at="b"), "reconciled", "", False),
+        (over(sync="Synced", at="c"), "reconciled", "", False),
+        # compared with, and not applied
+        (over(sync="OutOfSync", at="b"), "waiting", "has not applied the commit yet", False),
+        # Synced, before bootstrap/ was applied with another path
+        (over(sync="Synced", at="b", compared={**FOLDER, "path": "clusters/x"}), "waiting",
+         "has not applied the commit yet", False),
+        # a newer commit is compared with already
+        (over(sync="OutOfSync", at="c", operation=synced("Succeeded", "b")), "reconciled", "",
+         False),
+        (over(sync="OutOfSync", at="b", operation=synced("Succeeded", "a")), "waiting",
+         "has not applied the commit yet", False),
+        (over(sync="OutOfSync", at="b", operation=synced("Running", "b")), "waiting",
+         "has not applied the commit yet", False),
+        # a sync of one object only, by a person's hand
+        (over(sync="OutOfSync", at="b", operation=synced("Succeeded", "b", only=[{"name": "x"}])),
+         "waiting", "has not applied the commit yet", False),
+        (over(sync="OutOfSync", at="b", operation=synced("Failed", "b", "one failed")), "waiting",
+         "one failed", True),
+        # tried again without end, it is called Running
+        (over(sync="OutOfSync", at="b", operation=synced("Running", "b", "one failed. Retrying",
+              finishedAt=AT, resources=[FAILED])),
+         "waiting", "one failed. Retrying; Application od-edge: forbidden", True),
+        (over(sync="OutOfSync", at="a", operation=synced("Running", "a", "no", finishedAt=AT)),
+         "waiting", "has not applied the commit yet; of a it says: no", False),
+        (over(sync="Unknown", at="", conditions=(condition("ComparisonError", "", "no route"),)),
+         "waiting", "ComparisonError: no route", True),
+        (over(sync="Synced", at="a", conditions=(condition("OrphanedResourceWarning", "", "w"),)),
+         "waiting", "has not applied the commit yet", False),
+    ],
+)  # fmt: skip
+def test_an_access_domain_is_as_far_as_the_application_over_its_folder(
+    found: dict[str, Any] | None, state: str, reason: str, failing: bool
+) -> None:
+    health = ARGOCD.of_place(PLACE, "b", {OVER: found} if found else {}, COMMITS)
+    assert (health.state, health.failing) == (state, failing)
+    assert health.reason.startswith(reason)
+    assert health.object in ("", "Application argocd/demandops-perception")
+
+
+NEW, OLD = source(inputs=2), source(inputs=1)
+MADE = ({"group": "apps", "kind": "Deployment", "namespace": "ns", "name": "x"},)
+BAD = condition("Progressing", "False", "timed out")
+
+
+@pytest.mark.parametrize(
+    ("child", "made", "state", "reason", "failing"),
+    [
+        (None, None, "reconciled", "is not there yet", False),
+        (application(NEW), None, "reconciled", "was not looked at yet", False),
+        (application(NEW, sync="Synced", at="b"), None, "healthy", "", False),
+        # Healthy as it was before the change
+        (application(NEW, sync="Synced", at="b", compared=OLD), None, "reconciled",
+         "was not compared in its present form yet", False),
+        (application(NEW, sync="OutOfSync", at="b"), None, "reconciled", "is being synced", False),
+        (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "waiting for "
+                     "healthy state", of=NEW)), None, "reconciled", "waiting for healthy", False),
+        (application(NEW, sync="Synced", at="b", health="Progressing"), None, "reconciled",
+         "its health is Progressing", False),
+        (application(NEW, sync="Synced", at="b", health="Degraded"), None, "reconciled",
+         "its health is Degraded", True),
+        (application(NEW, sync="Synced", at="b", health="Missing"), None, "reconciled",
+         "its health is Missing", False),
+        # what it is made of says more, and sooner
+        (application(NEW, sync="Synced", at="b", resources=MADE), None, "reconciled",
+         "is not there yet", False),
+        (application(NEW, sync="Synced", at="b", resources=MADE), deployment("x"), "healthy", "",
+         False),
+        (application(NEW, sync="Synced", at="b", resources=MADE),
+         deployment("x", availableReplicas=1), "reconciled", "1 of 2 replicas", False),
+        (application(NEW, sync="Synced", at="b", resources=MADE, health="Degraded"),
+         deployment("x", BAD, availableReplicas=1), "reconciled", "timed out", True),
+        (application(NEW, sync="Unknown", conditions=(condition("ComparisonError", "", "no chart"),)
+                     ), None, "reconciled", "ComparisonError: no chart", True),
+        (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
+                     of=NEW)), None, "reconciled", "denied", True),
+        # a failure of its former form: past, unless it still holds the new one up
+        (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
+                     of=OLD)), None, "reconciled", "denied", False),
+        (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "denied",
+                     of=OLD, finishedAt=AT)), None, "reconciled",
+         "its former form is still tried: denied", True),
+    ],
+)  # fmt: skip
+def test_a_service_is_healthy_when_it_is_synced_as_it_stands_now_and_all_is_there(
+    child: dict[str, Any] | None,
+    made: dict[str, Any] | None,
+    state: str,
+    reason: str,
+    failing: bool,
+) -> None:
+    objects = {OVER: over(sync="Synced", at="b"), CHILD: child, ("Deployment", "ns", "x"): made}
+    found = {key: item for key, item in objects.items() if item}
+    health = ARGOCD.of_target(SERVICE, "b", found, COMMITS)
+    assert (health.state, health.failing) == (state, failing)
+    assert health.reason.startswith(reason)
+
+
+def test_what_argo_cd_leaves_out_or_writes_out_makes_no_other_source() -> None:
+    wanted = {**source(inputs=[], image=None, port=1), "directory": {"recurse": True}}
+    compared = {**source(port=1), "directory": {"recurse": True, "jsonnet": {}}}
+    child = application(wanted, sync="Synced", at="b", compared=compared)
+    objects = {OVER: over(sync="Synced", at="b"), CHILD: child}
+    assert ARGOCD.of_target(SERVICE, "b", objects, COMMITS).state == "healthy"
+
+
+@pytest.mark.parametrize(
+    ("at", "changing", "state"),
+    [
+        ("a", [], "healthy"),
+        ("a", [("b", "appdefs/other")], "healthy"),
+        ("a", [("b", CHART)], "reconciled"),
+        ("b", [("b", CHART)], "healthy"),
+        ("c", [("b", CHART)], "healthy"),
+    ],
+)
+def test_a_chart_that_changed_in_its_folder_is_waited_for(
+    at: str, changing: list[tuple[str, str]], state: str
+) -> None:
+    """The Application does not change with it, only the commit that it is Synced at."""
+    objects = {
+        OVER: over(sync="Synced", at="b"),
+        CHILD: application(NEW, sync="Synced", at=at),
+    }
+    health = ARGOCD.of_target(SERVICE, "b", objects, Letters(changing))
+    assert health.state == state
+    assert health.reason == ("" if state == "healthy" else "has not taken the commit's chart yet")
+
+
+def test_a_chart_of_a_registry_has_its_version_in_the_source() -> None:
+    chart = {"repoURL": "oci://r.example/od", "path": ".", "targetRevision": "1.2.0"}
+    objects = {
+        OVER: over(sync="Synced", at="b"),
+        CHILD: application(chart, sync="Synced", at="1.2.0"),
+    }
+    history = Letters([("b", ".")])
+    assert ARGOCD.of_target(SERVICE, "b", objects, history).state == "healthy"
+
+
+def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
+    key = ("Deployment", "ns", "mqtt-a")
+    assert ARGOCD.of_target(CLIENT, "b", {}, COMMITS).state == "reconciled"
+    assert ARGOCD.of_target(CLIENT, "b", {key: deployment("mqtt-a")}, COMMITS).state == "healthy"
+
+
+def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
+    child = application(NEW, sync="Synced", at="b")
+    left = deployment("x")
+    left["metadata"]["annotations"] = {
+        "argocd.argoproj.io/tracking-id": "ns_od-edge:apps/Deployment:ns/x"
+    }
+    other = deployment("y")
+    other["metadata"]["annotations"] = {
+        "argocd.argoproj.io/tracking-id": "ns_od-edge-2:apps/Deployment:ns/y"
+    }
+    removing = Health("reconciled", "is still being removed", "Application ns/od-edge")
+    assert ARGOCD.of_target(GONE, "b", {CHILD: child}, COMMITS) == removing
+    assert ARGOCD.of_target(GONE, "b", {("Deployment", "ns", "x"): left}, COMMITS) == removing
+    found = {("Deployment", "ns", "y"): other}
+    assert ARGOCD.of_target(GONE, "b", found, COMMITS) == Health("healthy")
+    child["status"]["conditions"] = [condition("DeletionError", "", "forbidden")]
+    health = ARGOCD.of_target(GONE, "b", {CHILD: child}, COMMITS)
+    assert health.failing and health.reason.endswith("DeletionError: forbidden")
+
+
+def test_one_that_is_being_removed_is_not_what_is_wanted_anew() -> None:
+    child = application(NEW, sync="Synced", at="b")
+    child["metadata"]["deletionTimestamp"] = AT
+    health = ARGOCD.of_target(SERVICE, "b", {CHILD: child}, COMMITS)
+    assert health.state == "reconciled" and "made anew" in health.reason
+
+
+def test_seen_and_since_when_are_the_cluster_s_to_say() -> None:
+    objects = {OVER: over(sync="Synced", at="b"), CHILD: application(NEW)}
+    assert ARGOCD.applied(PLACE, objects) == "b"
+    assert ARGOCD.applied(PLACE, {}) == ""
+    under_way = over(sync="OutOfSync", at="c", operation=synced("Succeeded", "b"))
+    assert ARGOCD.applied(PLACE, {OVER: under_way}) == "b"
+    assert ARGOCD.since(SERVICE, objects) == AT
+    assert ARGOCD.since(CLIENT, objects) == ""
+
+
+def test_of_argo_cd_s_own_namespace_one_object_is_asked_for() -> None:
+    """An operator may keep the rest from the generator."""
+    assert ARGOCD.watched(PLACE)[0] == Watched("Application", "argocd", "demandops-perception")

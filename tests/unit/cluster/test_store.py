@@ -1,0 +1,107 @@
+"""Reading a cluster's objects over real HTTP: what is asked for, and what is told of faults."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from generator.cluster.access import Reached
+from generator.cluster.health import Watched
+from generator.cluster.store import ClusterStore
+
+OVER = Watched("Application", "argocd", "demandops-perception")
+CHILDREN = Watched("Application", "perception")
+DEPLOYMENTS = Watched("Deployment", "perception")
+
+
+@dataclass
+class Api:
+    """An API server with one Application in each namespace, and what it was asked."""
+
+    reached: Reached
+    asked: list[str] = field(default_factory=list)
+    refused: str = "nothing"
+
+
+@pytest.fixture
+def api(tmp_path: Path) -> Iterator[Api]:
+    found: list[Api] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            (api,) = found
+            api.asked.append(self.path)
+            self.send_response(403 if api.refused in self.path else 200)
+            self.send_header("Content-Type", "application/json")
+            self.end_headers()
+            item = {"metadata": {"name": "one", "resourceVersion": "1"}}
+            listed = {"metadata": {"resourceVersion": "1"}, "items": [item]}
+            self.wfile.write(json.dumps(listed).encode())
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Say nothing."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    config = {
+        "apiVersion": "v1",
+        "kind": "Config",
+        "current-context": "c",
+        "clusters": [
+            {"name": "c", "cluster": {"server": f"http://127.0.0.1:{server.server_port}"}}
+        ],
+        "users": [{"name": "u", "user": {}}],
+        "contexts": [{"name": "c", "context": {"cluster": "c", "user": "u"}}],
+    }
+    kubeconfig = tmp_path / "kubeconfig"
+    kubeconfig.write_text(json.dumps(config))
+    found.append(Api(Reached(kubeconfig=kubeconfig)))
+    yield found[0]
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def store(api: Api) -> ClusterStore:
+    return ClusterStore("c-its", api.reached, lambda: None)
+
+
+def test_one_object_is_asked_for_by_its_name(api: Api) -> None:
+    read = store(api)
+    read.read([OVER, CHILDREN])
+    over, children = api.asked
+    assert over.endswith(
+        "/namespaces/argocd/applications?fieldSelector=metadata.name%3Ddemandops-perception"
+    )
+    assert children.endswith("/namespaces/perception/applications")
+    assert set(read.objects()) == {
+        ("Application", "argocd", "one"),
+        ("Application", "perception", "one"),
+    }
+
+
+def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
+    api.refused = "/argocd/"
+    read = store(api)
+    read.read([OVER, CHILDREN])
+    assert read.trouble == "applications in argocd: Forbidden"
+    assert read.unread([OVER]) == "applications in argocd: Forbidden"
+    assert read.unread([CHILDREN]) == ""
+    assert read.unread([DEPLOYMENTS]) == "it was not read yet"
+
+
+def test_a_cluster_that_is_away_is_asked_once(api: Api, tmp_path: Path) -> None:
+    nowhere = tmp_path / "nowhere"
+    text = Path(str(api.reached.kubeconfig)).read_text()
+    nowhere.write_text(text.replace(text.split("127.0.0.1:")[1].split('"')[0], "1"))
+    read = ClusterStore("away", Reached(kubeconfig=nowhere), lambda: None)
+    read.read([OVER, CHILDREN])
+    assert read.unread([OVER]).startswith("MaxRetryError")
+    assert read.unread([CHILDREN]) == read.unread([OVER])

@@ -1,0 +1,230 @@
+"""Signed calls of webhooks, over real HTTP; the signatures are verified by openssl."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from email.message import Message
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+
+from generator.cluster import access, webhook
+from generator.cluster.wake import Wake
+from generator.errors import InvalidInput
+from tests.golden.cases import start
+
+SECRET = "It's a Secret to Everybody"  # noqa: S105 - of an example
+
+
+@dataclass
+class Heard:
+    """A server's URL, what it was sent, and what it answers."""
+
+    url: str = ""
+    calls: list[tuple[Message, bytes]] = field(default_factory=list)
+    status: int = 200
+
+
+@pytest.fixture
+def hook() -> Iterator[Heard]:
+    heard = Heard()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            heard.calls.append((self.headers, self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(heard.status)
+            self.send_header("Location", "/elsewhere")
+            self.end_headers()
+
+        do_GET = do_POST
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Say nothing."""
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    heard.url = f"http://127.0.0.1:{server.server_port}/hook"
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield heard
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.fixture
+def secret_file(tmp_path: Path) -> Path:
+    file = tmp_path / "secret"
+    file.write_text(f"{SECRET}\n")
+    file.chmod(0o640)
+    return file
+
+
+def by_openssl(body: bytes) -> str:
+    command = ["openssl", "dgst", "-sha256", "-hmac", SECRET]
+    told = subprocess.run(command, input=body, capture_output=True, check=True).stdout.decode()
+    return f"sha256={told.split()[-1]}"
+
+
+def test_the_signature_is_the_one_that_github_documents() -> None:
+    """Both controllers verify by GitHub's scheme; this is its own example."""
+    documented = "757107ea0eb2509fc211221cce984b8a37570b6d7586c22c46f4379c8b043e17"
+    assert webhook.signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
+
+
+def woken(case: str, reached: access.Reached, changed: list[str] | None = None) -> None:
+    state, _ = start(case)
+    waker = Wake({"c-its": reached}, lambda since: ("b" * 40, changed))
+    waker(state.catalog)
+    waker.close()
+
+
+def test_a_receiver_of_flux_is_called_with_a_signature(hook: Heard, secret_file: Path) -> None:
+    woken("experiment", access.Reached(receiver=hook.url, secret_file=secret_file))
+    headers, body = hook.calls[0]
+    assert headers["X-Signature"] == by_openssl(body)
+
+
+def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Heard, secret_file: Path) -> None:
+    changed = [
+        "appdefs/x/charts/x/Chart.yaml",
+        "clusters/c-its/perception/edge/a.yaml",
+        "clusters/other/perception/edge/b.yaml",
+        "ledger/applications/aa/b/c.yaml",
+    ]
+    reached = access.Reached(webhook=hook.url, secret_file=secret_file)
+    woken("argocd-experiment", reached, changed)
+    headers, body = hook.calls[0]
+    assert headers["X-Hub-Signature-256"] == by_openssl(body)
+    assert (headers["X-GitHub-Event"], headers["Content-Type"]) == ("push", "application/json")
+    event = json.loads(body)
+    assert event["ref"] == "refs/heads/main" and event["after"] == "b" * 40
+    (commit,) = event["commits"]
+    # the domain's folder is always looked at; books and other clusters are not Argo CD's to know
+    assert commit["modified"] == [
+        *changed[:1],
+        "clusters/c-its/perception/_domain.yaml",
+        changed[1],
+    ]
+
+
+def test_where_nothing_is_known_of_what_changed_argo_cd_looks_at_all(
+    hook: Heard, secret_file: Path
+) -> None:
+    woken("argocd-experiment", access.Reached(webhook=hook.url, secret_file=secret_file))
+    assert json.loads(hook.calls[0][1])["commits"] == []
+
+
+def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
+    hook: Heard, secret_file: Path
+) -> None:
+    asked: list[str] = []
+
+    def changed(since: str) -> tuple[str, list[str]]:
+        asked.append(since)
+        return f"{len(asked)}", []
+
+    state, _ = start("argocd-experiment")
+    reached = access.Reached(webhook=hook.url, secret_file=secret_file)
+    waker = Wake({"c-its": reached}, changed)
+    try:
+        hook.status = 503
+        waker(state.catalog)
+        wait_for(lambda: len(hook.calls) >= 1)
+        hook.status = 200
+        wait_for(lambda: len(hook.calls) >= 2)
+        waker(state.catalog)
+        wait_for(lambda: len(hook.calls) >= 3)
+    finally:
+        waker.close()
+    assert asked[:3] == ["", "", "2"]
+
+
+def wait_for(seen: object) -> None:
+    end = time.monotonic() + 30
+    while not seen():  # type: ignore[operator]
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("status", [302, 307, 400])
+def test_what_is_not_taken_is_told_and_no_redirection_followed(
+    hook: Heard, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
+) -> None:
+    hook.status = status
+    woken("experiment", access.Reached(receiver=hook.url, secret_file=secret_file))
+    assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
+    assert len(hook.calls) in (1, 2)  # the second, as it is closed
+    assert SECRET not in caplog.text and "/hook" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("case", "other", "needs"),
+    [("experiment", "webhook", "receiver"), ("argocd-experiment", "receiver", "webhook")],
+)
+def test_the_other_controller_s_webhook_is_not_called(
+    hook: Heard, caplog: pytest.LogCaptureFixture, case: str, other: str, needs: str
+) -> None:
+    woken(case, access.Reached.model_validate({other: hook.url}))
+    assert hook.calls == []
+    assert f"(it has neither a kubeconfig nor a {needs})" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("repo", "page"),
+    [
+        ("https://git.example/fleet/repo.git", "https://git.example/fleet/repo"),
+        ("https://me:pass@git.example:8443/fleet/repo", "https://git.example/fleet/repo"),
+        ("ssh://git@git.example:22/fleet/repo.git", "https://git.example/fleet/repo"),
+        ("git@git.example:fleet/repo.git", "https://git.example/fleet/repo"),
+    ],
+)
+def test_a_repository_is_named_by_the_page_that_a_forge_would_name(repo: str, page: str) -> None:
+    assert webhook.web_address(repo) == page
+
+
+def test_a_repository_without_a_host_cannot_be_named() -> None:
+    with pytest.raises(access.NoWay, match="names no host"):
+        webhook.web_address("file:///srv/fleet.git")
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "message"),
+    [
+        (None, 0, "{file} cannot be read: No such file or directory"),
+        ("", 0o600, "{file} is empty"),
+        ("\n", 0o600, "{file} is empty"),
+        (SECRET, 0o644, "{file} may be read by everybody on this machine; chmod o= it"),
+    ],
+)
+def test_a_secret_that_cannot_be_used_is_told_at_the_start(
+    tmp_path: Path, text: str | None, mode: int, message: str
+) -> None:
+    file = tmp_path / "secret"
+    if text is not None:
+        file.write_text(text)
+        file.chmod(mode)
+    clusters = tmp_path / "clusters.yaml"
+    clusters.write_text(
+        "apiVersion: demandops/v1\nkind: ClusterAccess\n"
+        f"clusters: {{a: {{receiver: 'http://h/hook', secret_file: {file}}}}}\n"
+    )
+    with pytest.raises(InvalidInput) as caught:
+        access.read(clusters)
+    told = message.format(file=file)
+    assert str(caught.value) == f"{clusters}: clusters.a.secret_file: {told}"
+
+
+def test_a_secret_that_signs_nothing_is_a_fault(tmp_path: Path) -> None:
+    clusters = tmp_path / "clusters.yaml"
+    clusters.write_text(
+        "apiVersion: demandops/v1\nkind: ClusterAccess\n"
+        "clusters: {a: {kubeconfig: /k, secret_file: /s}}\n"
+    )
+    with pytest.raises(InvalidInput, match="nothing it signs; add a receiver or a webhook"):
+        access.read(clusters)

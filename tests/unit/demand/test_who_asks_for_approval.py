@@ -1,0 +1,156 @@
+"""What asks for approval of which demands: access domains, their rules, application definitions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import yaml
+from asking import APP, Books, application, connection, edited, goal, perception, skeleton
+
+from generator.demand.lease import UNSTARTED
+
+POLICY = "policy/access-domains.yaml"
+DOMAIN = "access domain 'perception'"
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+
+
+def policy(**changed: Any) -> dict[str, str]:
+    """The skeleton's policy, its one domain changed."""
+    data = yaml.safe_load(skeleton()[POLICY])
+    data["domains"][0].update(changed)
+    return {POLICY: yaml.safe_dump(data)}
+
+
+def rules(*made: dict[str, Any], **more: Any) -> dict[str, str]:
+    return policy(rules=list(made), **more)
+
+
+NOBODY = ()
+ALL = {"name": "all"}
+ASKS = {"name": "asks", "approval": "required"}
+VEHICLES = {"name": "vehicles", "requesters": ["vehicle*"], "approval": "none"}
+
+
+@pytest.mark.parametrize(
+    ("config", "asks"),
+    [
+        pytest.param({}, NOBODY, id="nothing said"),
+        pytest.param(policy(approval="none"), NOBODY, id="none said"),
+        pytest.param(policy(approval="required"), (DOMAIN,), id="domain"),
+        pytest.param(rules(ALL, approval="required"), (DOMAIN,), id="rule inherits"),
+        pytest.param(rules(ASKS), (f"rule 'asks' of {DOMAIN}",), id="rule"),
+        pytest.param(rules(ASKS, ALL), NOBODY, id="another rule lets through"),
+        pytest.param(rules(ASKS, VEHICLES), NOBODY, id="a narrower rule lets through"),
+        pytest.param(rules(ALL, VEHICLES, approval="required"), NOBODY, id="rule excepts"),
+        pytest.param(
+            edited(
+                APPDEF,
+                "kind: ApplicationDefinition",
+                "kind: ApplicationDefinition\napproval: required",
+            ),
+            ("application definition 'object-detection-fusion'",),
+            id="appdef",
+        ),
+    ],
+)
+def test_who_asks_for_approval(config: dict[str, str], asks: tuple[str, ...]) -> None:
+    decision = Books(config).send(perception())
+    assert decision.approval == asks
+    assert decision.outcome == "booked", "what would come of it is decided all the same"
+
+
+def test_each_requester_needs_a_rule_that_lets_it_through() -> None:
+    books = Books(rules(VEHICLES, ASKS))
+    assert books.send(goal([application(who=["vehicle00", "truck"])])).approval == (
+        f"rule 'asks' of {DOMAIN}",
+    )
+
+
+def test_a_rule_for_another_application_or_node_lets_nothing_through() -> None:
+    elsewhere = {"name": "elsewhere", "nodes": ["cloud"], "approval": "none"}
+    other = {"name": "other", "applications": ["recorder"], "approval": "none"}
+    books = Books(rules(ASKS, elsewhere, other))
+    assert books.send(goal([application()])).approval == (f"rule 'asks' of {DOMAIN}",)
+    # a connection is not held to applications, so the rule for another one covers it
+    assert books.send(goal([], [connection()], id="other")).approval == ()
+
+
+def test_an_appdef_asks_for_its_applications_and_not_for_connections() -> None:
+    text = "kind: ApplicationDefinition"
+    books = Books(edited(APPDEF, text, f"{text}\napproval: required"))
+    assert books.send(goal([], [connection()])).approval == ()
+
+
+def test_what_stands_already_needs_no_approval() -> None:
+    books = Books(policy(approval="required"))
+    assert books.send(perception()).approval == (DOMAIN,)
+    assert books.send(perception()).approval == ()
+    assert books.send(perception(shutdown=True)).approval == ()
+
+
+def test_more_of_what_stands_needs_approval() -> None:
+    books = Books(policy(approval="required"))
+    books.send(perception())
+    more = goal([application(ego=[("/vehicles/vehicle00/ego_data", "vehicle00")])])
+    assert books.send(more).approval == (DOMAIN,)
+
+
+def put(**changed: Any) -> dict[str, Any]:
+    """A demand of our own, for one application."""
+    inputs = {"point_cloud": [{"topic": "/stations/station00/pointcloud", "source": "station00"}]}
+    app = {"id": APP, "type": "object-detection-fusion", "node": "edge", "inputs": inputs}
+    head = {"apiVersion": "demandops/v1", "kind": "Demand", "demand": "d", "requesters": ["v"]}
+    return head | {"applications": [app]} | changed
+
+
+def test_dropping_renewing_and_releasing_need_none() -> None:
+    books = Books(policy(approval="required", leases={"slack": "0s"}))
+    app = put()["applications"][0]
+    two = [app, app | {"id": "edge/second"}]
+    assert books.send(put(applications=two, lease=60)).approval == (DOMAIN,)
+    assert books.send(put(lease=60)).approval == (), "less than before"
+    assert books.send(put(lease=600)).approval == (), "only longer"
+    head = {key: value for key, value in put().items() if key != "applications"}
+    assert books.send(head | {"operation": "renew"}).approval == ()
+    assert books.send(head | {"operation": "release"}).approval == ()
+
+
+def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
+    from asking import NOW
+
+    from generator.decision import decide
+    from generator.demand.approval import proposed
+    from generator.ledger import format as ledger_format
+
+    books = Books(policy(approval="required"))
+    decision = decide(books.state, put(lease=60), NOW, books.files.get)
+    waiting = decide(books.state, proposed(decision.request), NOW, books.files.get)
+    [claim] = [one for one in waiting.state.ledger.of_demand("d") if "edge" in one.subject.id][:1]
+    assert claim.lease is not None
+    assert claim.lease.until == UNSTARTED
+    assert not claim.lease.has_started
+    path = ledger_format.path_of(claim.key)
+    text = ledger_format.write(claim)
+    assert "until" not in text
+    assert ledger_format.read(text, path) == claim
+    found = {one.key for one in waiting.state.ledger.unstarted()}
+    assert found == {one.key for one in waiting.state.ledger.of_demand("d")}
+    later = claim.lease.begun(NOW)
+    assert (later.seconds, (later.until - NOW).total_seconds()) == (60, 60)
+    assert waiting.state.ledger.ended(NOW.replace(year=2100)) == ()
+
+
+@pytest.mark.parametrize(
+    ("config", "field"),
+    [
+        (policy(approval="maybe"), "domains[0].approval"),
+        (rules({"name": "x", "approval": True}), "domains[0].rules[0].approval"),
+    ],
+)
+def test_another_word_is_a_fault(config: dict[str, str], field: str) -> None:
+    from generator.errors import InvalidInput
+
+    with pytest.raises(InvalidInput) as error:
+        Books(config)
+    assert [found.field for found in error.value.faults] == [field]

@@ -1,0 +1,215 @@
+"""The forges' adapters against recorded exchanges: method, path, headers and body of each call."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from replaying import TOKEN, Replay, replaying
+
+from generator.catalog.loading import load
+from generator.catalog.repository import Proposals
+from generator.errors import InvalidInput
+from generator.forge import Forge, ForgeError, PullRequest, forge_for
+
+BRANCH = "demand/one-0123456789ab"
+LINKS = {
+    "github": "https://github.com/its/state/pull/7",
+    "gitea": "https://git.example.org/its/state/pulls/7",
+}
+
+
+@pytest.fixture
+def token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    file = tmp_path / "token"
+    file.write_text(f"{TOKEN}\n")
+    return file
+
+
+@pytest.fixture(params=["github", "gitea"])
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@contextmanager
+def forge(kind: str, name: str, token: Path, **variables: str) -> Iterator[tuple[Forge, Replay]]:
+    with replaying(f"{kind}-{name}", variables=variables) as replay:
+        configured = Proposals.model_validate(
+            {"forge": kind, "url": "https://git.example.org/its/state", "api": replay.url}
+        )
+        made = forge_for(configured, token)
+        assert made is not None
+        yield made, replay
+        assert replay.problems == []
+        assert replay.left == []
+
+
+def open_one(made: Forge) -> PullRequest:
+    return made.open(BRANCH, "main", "Join one", "A *body*\n")
+
+
+@pytest.mark.parametrize("name", ["new", "there", "lost"])
+def test_a_request_is_opened_once_whatever_happened_before(
+    kind: str, name: str, token: Path
+) -> None:
+    with forge(kind, name, token) as (made, _):
+        assert open_one(made) == PullRequest(7, LINKS[kind], "open")
+
+
+def test_a_request_that_was_closed_is_not_opened_again(kind: str, token: Path) -> None:
+    with forge(kind, "closed", token) as (made, _):
+        assert open_one(made).state == "closed"
+
+
+@pytest.mark.parametrize("state", ["merged", "closed"])
+def test_what_became_of_a_request_is_told(kind: str, state: str, token: Path) -> None:
+    with forge(kind, state, token) as (made, _):
+        found = made.find(BRANCH, "main")
+    assert found is not None
+    assert found.state == state
+
+
+def test_no_request_is_nothing(kind: str, token: Path) -> None:
+    with forge(kind, "none", token) as (made, _):
+        assert made.find(BRANCH, "main") is None
+
+
+def test_a_request_is_closed(kind: str, token: Path) -> None:
+    with forge(kind, "close", token) as (made, _):
+        made.close(PullRequest(7, LINKS[kind], "open"))
+
+
+def test_a_refusal_is_told_in_the_forges_words_without_the_token(kind: str, token: Path) -> None:
+    with forge(kind, "denied", token) as (made, _), pytest.raises(ForgeError) as error:
+        open_one(made)
+    assert error.value.status == 401
+    assert str(error.value).endswith(": 401 'Bad credentials'")
+    assert TOKEN not in str(error.value)
+
+
+class _Elsewhere(BaseHTTPRequestHandler):
+    came: list[str] = []  # noqa: RUF012 - shared on purpose
+
+    def do_GET(self) -> None:
+        self.came.append(str(self.headers))
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Keep quiet."""
+
+
+def test_the_token_follows_no_redirect(kind: str, token: Path) -> None:
+    server = HTTPServer(("127.0.0.1", 0), _Elsewhere)
+    thread = Thread(target=server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    try:
+        there = f"http://127.0.0.1:{server.server_port}"
+        with forge(kind, "moved", token, elsewhere=there) as (made, _), pytest.raises(ForgeError):
+            made.find(BRANCH, "main")
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+    assert _Elsewhere.came == []
+
+
+def test_a_forge_that_is_away_is_told(kind: str, token: Path) -> None:
+    with replaying(f"{kind}-none") as replay:
+        gone = replay.url
+    made = forge_for(
+        Proposals.model_validate({"forge": kind, "url": "https://x.org/a/b", "api": gone}), token
+    )
+    assert made is not None
+    with pytest.raises(ForgeError, match="refused") as error:
+        made.find(BRANCH, "main")
+    assert error.value.status is None
+
+
+Write = Callable[[Path], object]
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda path: None, "cannot be read: No such file or directory"),
+        (lambda path: path.write_text("\n"), "holds no token: one line of plain text"),
+        (lambda path: path.write_text("two\nlines"), "holds no token: one line of plain text"),
+        (lambda path: path.write_bytes(b"\xff\xfe"), "cannot be read: it is no text"),
+    ],
+)
+def test_a_token_file_that_is_none_is_told(tmp_path: Path, write: Write, message: str) -> None:
+    file = tmp_path / "token"
+    write(file)
+    configured = Proposals.model_validate({"forge": "github", "url": "https://github.com/a/b"})
+    with pytest.raises(ForgeError) as error:
+        forge_for(configured, file)
+    assert str(error.value) == f"the token file {file} {message}"
+
+
+def test_no_token_file_is_told_with_the_remedy() -> None:
+    configured = Proposals.model_validate({"forge": "gitea", "url": "https://x.org/a/b"})
+    with pytest.raises(ForgeError, match="DEMANDOPS_FORGE_TOKEN_FILE"):
+        forge_for(configured, None)
+
+
+@pytest.mark.parametrize(
+    ("kind", "url", "address"),
+    [
+        ("github", "https://github.com/its/state", "https://api.github.com"),
+        ("github", "https://ghe.example.org/its/state.git", "https://ghe.example.org/api/v3"),
+        ("gitea", "https://git.example.org/its/state", "https://git.example.org/api/v1"),
+        ("gitea", "https://example.org:3000/git/its/state/", "https://example.org:3000/git/api/v1"),
+    ],
+)
+def test_the_apis_address_follows_from_the_projects(
+    kind: str, url: str, address: str, token: Path
+) -> None:
+    made = forge_for(Proposals.model_validate({"forge": kind, "url": url}), token)
+    assert made is not None
+    assert made._api._address == address  # type: ignore[attr-defined]
+    assert made._pulls == "/repos/its/state/pulls"  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("forge", ["none", "gitlab"])
+def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
+    assert forge_for(Proposals.model_validate({"forge": forge}), None) is None
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("{forge: github}", "proposals: forge: github needs url, the project's address"),
+        ("{forge: github, url: 'https://github.com/its'}", "needs url, the project's address"),
+        (
+            "{forge: gitea, url: 'http://git.example.org/a/b'}",
+            "proposals.url: 'http://git.example.org/a/b' is no address that a token is sent to",
+        ),
+        ("{forge: gitea, url: 'https://me:secret@x.org/a/b'}", "proposals.url: "),
+        ("{forge: none, api: 'https://x.org/a'}", "api: is not used with forge: none"),
+        ("{forge: gitea, url: 'https://x.org/a/b', labels: [x]}", "labels: only GitLab's push"),
+        ('{forge: gitlab, labels: ["a\\nb"]}', "proposals.labels[0]: "),
+        ("{forge: bitbucket}", "proposals.forge: "),
+    ],
+)
+def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> None:
+    from generator.staterepo import layout
+
+    files = layout.files()
+    config = {
+        path: text
+        for path, text in files.items()
+        if path.split("/")[0] not in ("clusters", "bootstrap", "ledger")
+    }
+    config["demandops.yaml"] += f"\nproposals: {section}\n"
+    with pytest.raises(InvalidInput) as error:
+        load(config)
+    assert any(message in str(found) for found in error.value.faults), json.dumps(
+        [str(found) for found in error.value.faults]
+    )

@@ -1,0 +1,276 @@
+"""Demands in memory under overrides: what is committed is what the books alone would give.
+
+A random crowd comes and goes; after each demand, all files rendered from the books are those that
+the demands left behind one by one, and who is suspended or kept is told from the claims alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import timedelta
+from typing import Any
+
+import pytest
+import yaml
+from asking import CLOUD, EGO, NOW, STATION_CLOUD, Books, application, connection, goal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from generator.decision import decide, rendered
+from generator.demand.claim import KEPT, Subject, SubjectKind
+from generator.demand.request import DemandRequest, Operation
+from generator.errors import InvalidInput, Refused
+from generator.plan.bookkeeping import bookkeeping
+
+HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
+
+
+def files(**overrides: Mapping[str, Any]) -> dict[str, str | None]:
+    return {
+        f"overrides/{name}.yaml": yaml.safe_dump(HEAD | dict(fields), sort_keys=False)
+        for name, fields in overrides.items()
+    }
+
+
+CROWD = files(
+    denied={"select": [{"requesters": ["eve"]}, {"connections": ["v2/*"]}], "deny": True},
+    off={"select": [{"services": ["object-detection"], "nodes": ["cloud"]}], "deny": True},
+    kept={
+        "select": [{"applications": ["app/a"], "requesters": ["adam"]}, {"connections": ["v1/*"]}],
+        "keep": True,
+    },
+    frozen={"select": [{"applications": ["app/b"]}], "hold": True, "priority": 5},
+    many={"select": [{"requesters": ["ada*"], "services": ["object-*"]}], "replicas": 3},
+    moved={
+        "select": [{"services": ["object-fusion"], "applications": ["app/a"]}],
+        "node": "cloud",
+        "priority": 9,
+    },
+    pinned={"select": [{"nodes": ["edge"]}], "images": {"mqtt-client": {"tag": "old"}}},
+)
+
+people = st.lists(
+    st.sampled_from(["adam", "ada", "bob", "eve"]), min_size=1, max_size=2, unique=True
+)
+
+
+@st.composite
+def demands(draw: st.DrawFn) -> tuple[str, Any]:
+    """A demand for an application and a connection, or its end."""
+    who = draw(people)
+    app = application(
+        f"app/{draw(st.sampled_from('ab'))}",
+        node=draw(st.sampled_from(["edge", "cloud"])),
+        who=who,
+        ego=[EGO] if draw(st.booleans()) else [],
+        clouds=[draw(st.sampled_from([CLOUD, STATION_CLOUD]))],
+    )
+    vehicle = draw(st.sampled_from(["v1", "v2"]))
+    link = connection(
+        f"{vehicle}/edge", who=who, topics=[draw(st.sampled_from([CLOUD[0], EGO[0]]))]
+    )
+    return goal([app], [link], id=draw(st.sampled_from("xy")), shutdown=draw(st.booleans()))
+
+
+@given(st.lists(demands(), max_size=14))
+@settings(max_examples=25, deadline=None)
+def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> None:
+    books = Books(CROWD)
+    for made in sent:
+        before = dict(books.files)
+        try:
+            books.send(made)
+        except Refused:
+            continue
+        ledger, catalog = books.state.ledger, books.catalog
+        generated = {p: t for p, t in books.files.items() if not p.startswith("ledger/")}
+        standing = {p: t for p, t in before.items() if p.startswith(("clusters/", "bootstrap/"))}
+        again = rendered(books.state, standing)
+        assert {p: t for p, t in generated.items() if p in again} == again
+        assert [p for p in generated if p.startswith("clusters/") and p not in again] == []
+        entries = bookkeeping(ledger, catalog)
+        told = {(one.id, one.demand) for one in entries.suspended}
+        for claim in ledger:
+            suspended = "eve" in claim.requesters or claim.subject.id == "v2/edge"
+            assert ((claim.subject.id, claim.demand) in told) is suspended
+            if claim.demand.startswith(KEPT):
+                assert claim.requesters == ("petra",)
+                assert ledger.of(claim.subject) == (claim,), "it gives way to any other"
+        for entry in entries.services.values():
+            assert (entry.service, entry.node) != ("object-detection", "cloud")
+        assert "v2/edge" not in entries.connections
+
+
+def _one(**fields: Any) -> Books:
+    return Books(files(tested=fields))
+
+
+def test_the_higher_priority_wins_and_patches_of_both_apply() -> None:
+    books = Books(
+        files(
+            low={
+                "select": [{"nodes": ["edge"]}],
+                "priority": -1,
+                "values": {"replicas": 7, "tolerations": [{"operator": "Exists"}]},
+            },
+            high={
+                "select": [{"services": ["object-detection"]}],
+                "values": {"replicas": 5, "nodeSelector": None},
+            },
+        )
+    )
+    books.send(goal([application()]))
+    values = books.objects("HelmRelease")["od-edge-vehicle00"]["spec"]["values"]
+    assert (values["replicas"], values["tolerations"]) == (5, [{"operator": "Exists"}])
+    assert "nodeSelector" not in values
+    fusion = books.objects("HelmRelease")
+    (name,) = [name for name in fusion if name.startswith("of-")]
+    assert fusion[name]["spec"]["values"]["replicas"] == 7
+
+
+def test_what_is_higher_than_a_hold_changes_what_it_holds() -> None:
+    def body(text: str) -> str:
+        return "".join(line for line in text.splitlines(True) if not line.startswith("#"))
+
+    hold = {"select": [{"services": ["object-detection"]}], "hold": True}
+    for priority, changed in ((1, True), (-1, False)):
+        books = Books({})
+        books.send(goal([application()]))
+        before = dict(books.files)
+        more = {"select": [{"nodes": ["edge"]}], "replicas": 4, "priority": priority}
+        held = Books(files(held=hold, more=more))
+        held.state = held.state.__class__(held.catalog, held.state.engine, books.state.ledger)
+        after = rendered(held.state, before)
+        path = "clusters/c-its/perception/edge/od-edge-vehicle00.yaml"
+        assert (body(after[path]) != body(before[path])) is changed
+
+
+@pytest.mark.parametrize(
+    ("select", "field"),
+    [
+        ({"applications": ["edge/*"]}, "apps[0].header.id"),
+        ({"appdefs": ["object-*"]}, "apps[0].type"),
+        ({"nodes": ["edge"], "services": ["object-fusion"]}, "apps[0].type"),
+        ({"labels": {"node_id": "edge"}, "applications": ["edge/*"]}, "apps[0].header.id"),
+        ({"nodes": ["ed?e"], "appdefs": ["*"]}, "apps[0].type"),
+        ({"connections": ["vehicle00/*"]}, "connections[0].id"),
+        ({"connections": ["*"], "nodes": ["vehicle00"]}, "connections[0].id"),
+        (
+            {"requesters": ["vehicle0?"], "applications": ["*"]},
+            "apps[0].header.id",
+        ),
+    ],
+    ids=str,
+)
+def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
+    select: dict[str, Any], field: str
+) -> None:
+    books = _one(select=[select], deny=True, expires="2090-01-01T00:00:00Z")
+    assert books.faults(goal([application()], [connection()])) == [
+        f"{field}: is denied by overrides/tested.yaml until 2090-01-01T00:00:00Z: why; ask its "
+        "owner, petra, or leave it out"
+    ]
+
+
+def test_a_node_denied_is_told_at_both_subjects() -> None:
+    books = _one(select=[{"nodes": ["edge"]}], deny=True)
+    told = books.faults(goal([application()], [connection()]))
+    assert [one.split(":")[0] for one in told] == [
+        "apps[0].header.node_id",
+        "connections[0].target_node_id",
+    ]
+
+
+def test_a_label_denied_is_told_at_the_end_that_has_it() -> None:
+    books = _one(select=[{"labels": {"node_id": "vehicle00"}}], deny=True)
+    (told,) = books.faults(goal([application()], [connection()]))
+    assert told.startswith("connections[0].source_node_id: is denied by overrides/tested.yaml")
+
+
+def test_a_demand_that_an_override_breaks_is_told_which() -> None:
+    """A patch may fit the invented demand and not the one that comes."""
+    fields = {"select": [{"services": ["object-detection"]}], "values": {"replicas": {"x": 1}}}
+    books = Books(files(tested=fields))
+    with pytest.raises(InvalidInput) as refusal:
+        books.send(goal([application()]))
+    (found,) = refusal.value.faults
+    assert (found.file, found.field) == ("overrides/tested.yaml", "values.replicas")
+    assert found.message.endswith(
+        "; mend the override or appdefs/object-detection-fusion/charts/object-detection"
+    )
+
+
+def test_a_kept_claim_is_the_owners_and_holds_what_the_last_one_did() -> None:
+    books = _one(select=[{"applications": ["edge/*"]}], keep=True)
+    one = goal([application(ego=[EGO])], id="one")
+    two = goal([application(who=["bob"])], id="two")
+    books.send(one)
+    books.send(two)
+    books.send(one | {"shutdown": True})
+    books.send(two | {"shutdown": True})
+    subject = Subject(SubjectKind.APPLICATION, "edge/object_detection_fusion")
+    (claim,) = books.state.ledger.of(subject)
+    assert (claim.demand, claim.request) == ("override:tested", "override:tested")
+    assert (claim.requesters, claim.lease) == (("petra",), None)
+    assert "ego_data" not in claim.inputs  # type: ignore[union-attr]
+
+
+REGISTRY = """\
+apiVersion: demandops/v1
+kind: Charts
+charts:
+  object-detection: {oci: "oci://registry.example/charts/object-detection", version: %s}
+  object-fusion: {http: "https://charts.example/perception", version: %s}
+"""
+CHARTS = "clusters/c-its/perception/_charts"
+
+
+def test_a_held_release_keeps_its_chart_when_the_registry_moves_on() -> None:
+    old, new = REGISTRY % ("1.0.0", "2.0.0"), REGISTRY % ("1.1.0", "2.1.0")
+    books = Books({"registry/charts.yaml": old})
+    books.send(goal([application()]))
+    before = dict(books.files)
+    hold = files(held={"select": [{"services": ["object-detection"]}], "hold": True})
+    for overrides, kept in ((hold, True), ({}, False)):
+        moved = Books({"registry/charts.yaml": new, **overrides})
+        state = type(moved.state)(moved.catalog, moved.state.engine, books.state.ledger)
+        after = rendered(state, before)
+        assert (f"{CHARTS}/object-detection-1.0.0.yaml" in after) is kept
+        assert f"{CHARTS}/object-detection-1.1.0.yaml" in after
+        release = after["clusters/c-its/perception/edge/od-edge-vehicle00.yaml"]
+        assert ("object-detection-1.0.0" in release) is kept
+
+
+def test_what_a_lease_ends_is_kept_too_and_a_put_that_drops_it_as_well() -> None:
+    demand = {
+        "kind": "Demand",
+        "demand": "leased",
+        "requesters": ["vehicle00"],
+        "lease": "1s",
+        "applications": [
+            {
+                "id": name,
+                "type": "object-detection-fusion",
+                "node": "edge",
+                "inputs": {"ego_data": [{"topic": EGO[0], "source": EGO[1]}]},
+            }
+            for name in ("a", "b")
+        ],
+    }
+    books = _one(select=[{"applications": ["a", "b"]}], keep=True)
+    books.send(demand)
+    books.send(demand | {"applications": demand["applications"][:1]})
+    assert _holders(books) == {"a": ["leased"], "b": ["override:tested"]}
+    over = DemandRequest(id="leased", operation=Operation.EXPIRE, demand="leased")
+    made = decide(books.state, over, NOW + timedelta(minutes=5), books.files.get)
+    books.state = made.state
+    assert _holders(books) == {"a": ["override:tested"], "b": ["override:tested"]}
+    assert made.overrides == ("overrides/tested.yaml",)
+
+
+def _holders(books: Books) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for claim in books.state.ledger:
+        if claim.subject.kind is SubjectKind.APPLICATION:
+            found.setdefault(claim.subject.id, []).append(claim.demand)
+    return found

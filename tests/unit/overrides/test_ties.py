@@ -1,0 +1,205 @@
+"""Ties by chance: what load lets pass can never depend on an order that nobody gave.
+
+Selectors are held against every release that could be, by brute force.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import product
+from typing import Any
+
+from asking import configuration
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from generator.catalog.catalog import Catalog
+from generator.catalog.loading import load
+from generator.catalog.override import Override, OverrideFile, Selector, merged
+from generator.catalog.policy import matches
+from generator.catalog.ties import can_meet, commute, contested, overlap
+from generator.plan import rehearsal
+from generator.plan.matching import Traits, fits
+from generator.plan.overrides import effects_on, with_overrides
+from generator.plan.release import ServiceRelease
+
+TEXTS = ["".join(chars) for size in range(6) for chars in product("ab", repeat=size)]
+pattern = st.text("ab*?", min_size=1, max_size=4)
+
+
+@given(pattern, pattern)
+@example("a*b", "*")
+@example("*a*", "b?b*")
+@example("?", "ab")
+def test_patterns_overlap_just_where_some_text_fits_both(one: str, other: str) -> None:
+    both = any(matches(text, (one,)) and matches(text, (other,)) for text in TEXTS)
+    assert overlap(one, other) is both
+    assert overlap(other, one) is both
+
+
+@lru_cache
+def catalog() -> Catalog:
+    return load(configuration())
+
+
+IDS = ["a", "b", "ab"]
+REQUESTERS = [("a",), ("b",), ("a", "b")]
+NODES = ["edge", "cloud"]
+SHARED, OWN, APPDEF = "object-detection", "object-fusion", "object-detection-fusion"
+
+
+def _releases() -> list[Traits]:
+    """Every release that could be, in a world of few names."""
+    found = []
+    for node, who in product(NODES, REQUESTERS):
+        found += [Traits((node,), who, (id,), (APPDEF,), service=OWN) for id in IDS]
+        found += [
+            Traits((node,), who, ids, (APPDEF,), service=SHARED)
+            for ids in [("a",), ("b",), ("a", "b")]
+        ]
+        found += [Traits((node,), who, connections=(id,)) for id in IDS]
+    return found
+
+
+RELEASES = _releases()
+patterns = st.lists(st.sampled_from(["a", "b", "a*", "*b", "?", "*"]), min_size=1, max_size=2)
+fields = st.fixed_dictionaries(
+    {},
+    optional={
+        "applications": patterns,
+        "appdefs": st.lists(st.sampled_from([APPDEF, "other", "*"]), min_size=1, max_size=1),
+        "services": st.lists(st.sampled_from([SHARED, OWN, "object-*"]), min_size=1, max_size=1),
+        "nodes": st.lists(st.sampled_from(["edge", "cloud", "e*", "*"]), min_size=1, max_size=2),
+        "requesters": patterns,
+        "labels": st.sampled_from([{"node_id": "edge"}, {"node_id": "cloud"}, {"other": "x"}]),
+    },
+) | st.fixed_dictionaries(
+    {"connections": patterns},
+    optional={"nodes": st.just(["edge"]), "requesters": patterns},
+)
+selector = fields.filter(bool).map(Selector.model_validate)
+
+
+@given(st.lists(selector, min_size=1, max_size=2), st.lists(selector, min_size=1, max_size=2))
+@settings(max_examples=300)
+def test_selectors_that_cannot_meet_never_do(one: list[Selector], other: list[Selector]) -> None:
+    if can_meet(one, other, catalog()):
+        return
+    assert not can_meet(other, one, catalog())
+    for traits in RELEASES:
+        hit = [any(fits(s, traits, catalog()) for s in side) for side in (one, other)]
+        assert not all(hit), traits
+
+
+def test_selectors_apart_in_what_a_release_has_one_of_do_not_meet() -> None:
+    apart: list[tuple[dict[str, Any], dict[str, Any]]] = [
+        ({"nodes": ["edge"]}, {"nodes": ["cloud", "v*"]}),
+        ({"services": [SHARED]}, {"services": [OWN]}),
+        ({"services": [OWN]}, {"connections": ["*"]}),
+        ({"labels": {"node_id": "a"}}, {"labels": {"node_id": "b"}}),
+        (
+            {"services": [OWN], "applications": ["a"]},
+            {"services": [OWN], "applications": ["b"]},
+        ),
+        ({"connections": ["a"]}, {"connections": ["b"]}),
+    ]
+    together: list[tuple[dict[str, Any], dict[str, Any]]] = [
+        ({"applications": ["a"]}, {"applications": ["b"]}),  # a shared service has both
+        ({"requesters": ["a"]}, {"requesters": ["b"]}),
+        ({"nodes": ["edge"]}, {"services": [OWN]}),
+    ]
+    for expected, pairs in ((False, apart), (True, together)):
+        for pair in pairs:
+            one, other = (Selector.model_validate(fields) for fields in pair)
+            assert can_meet([one], [other], catalog()) is expected, pair
+
+
+json = st.recursive(
+    st.none() | st.booleans() | st.integers(0, 2) | st.sampled_from("xy"),
+    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.sampled_from("kl"), inner),
+    max_leaves=4,
+)
+patch = st.fixed_dictionaries({}, optional={"k": json, "l": json})
+
+
+@given(patch, patch, patch)
+@settings(max_examples=300)
+def test_patches_that_commute_give_the_same_in_either_order(
+    target: dict[str, Any], one: dict[str, Any], other: dict[str, Any]
+) -> None:
+    both = merged(merged(target, one), other), merged(merged(target, other), one)
+    if commute(one, other):
+        assert repr(_sorted(both[0])) == repr(_sorted(both[1]))
+
+
+def _sorted(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _sorted(value[key]) for key in sorted(value)}
+    return [_sorted(item) for item in value] if isinstance(value, list) else value
+
+
+@given(json, json)
+def test_a_merge_patch_is_that_of_rfc_7386(target: Any, patch: Any) -> None:
+    result = merged(target, patch)
+    if not isinstance(patch, dict):
+        assert result == patch
+        return
+    kept = target if isinstance(target, dict) else {}
+    for key in {*kept, *patch}:
+        if key not in patch:
+            assert result[key] == kept[key]
+        elif patch[key] is None:
+            assert key not in result
+        else:
+            assert result[key] == merged(kept.get(key), patch[key])
+
+
+pins = st.sampled_from([{"tag": "x"}, {"tag": "y"}, {"repository": "z"}])
+effects = st.fixed_dictionaries(
+    {},
+    optional={
+        "values": st.fixed_dictionaries({"k": json}, optional={"l": json}),
+        "replicas": st.integers(1, 2),
+        "node": st.sampled_from(["edge", "cloud"]),
+        "images": st.fixed_dictionaries(
+            {}, optional={"object-detection": pins, "object-fusion": pins}
+        ).filter(bool),
+    },
+).filter(bool) | st.just({"hold": True})
+
+
+@lru_cache
+def _release() -> ServiceRelease:
+    (made,) = rehearsal.releases(catalog()).values()
+    return made[0]
+
+
+@given(effects, effects)
+@settings(max_examples=300)
+def test_what_is_not_contested_is_the_same_in_either_order(
+    one: dict[str, Any], other: dict[str, Any]
+) -> None:
+    both = [_override(name, fields) for name, fields in (("one", one), ("other", other))]
+    if contested(*both):
+        assert contested(both[1], both[0])
+        return
+    first, second = (_shaped(order) for order in (both, both[::-1]))
+    assert first == second
+
+
+def _override(name: str, fields: dict[str, Any]) -> Override:
+    head = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "r", "owner": "o"}
+    file = OverrideFile.model_validate(head | {"select": [{"nodes": ["*"]}]} | fields)
+    return Override.of(name, file)
+
+
+def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
+    release = _release()
+    by = [(one, effects_on(release, one, catalog())) for one in overrides]
+    shaped = with_overrides(release, [pair for pair in by if pair[1]], catalog())
+    assert isinstance(shaped, ServiceRelease)
+    values: Any = {}
+    for _, patch in shaped.shaping.patches:
+        values = merged(values, patch)
+    images = {name: shaped.shaping.image(name, catalog()) for name in release.service.images}
+    return shaped.replicas, shaped.node, shaped.shaping.held, repr(_sorted(values)), images

@@ -1,0 +1,130 @@
+"""When the state repo is looked at: a clock that the test moves, and no chance."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from generator.service.looking import Link, Looks, interval_s
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def looks(clock: Clock, interval: float, *, embedded: bool = False) -> Looks:
+    return Looks(interval, embedded=embedded, steady=clock, jittered=lambda pause: pause)
+
+
+def test_the_first_look_is_due_at_once_and_the_next_after_the_interval() -> None:
+    clock = Clock()
+    made = looks(clock, 30)
+    assert made.begin()
+    made.done(reached=True)
+    assert made.pause() == 30 and not made.begin()
+    clock.now += 30
+    assert made.begin()
+
+
+def test_while_the_remote_is_away_looks_become_seldom_within_bounds() -> None:
+    clock, pauses = Clock(), []
+    made = looks(clock, 10)
+    for _ in range(5):
+        made.done(reached=False)
+        pauses.append(made.pause())
+    assert pauses == [20, 40, 60, 60, 60]
+    made.done(reached=True)
+    assert made.pause() == 10
+
+
+def test_an_interval_above_the_bound_is_kept() -> None:
+    made = looks(Clock(), 600)
+    made.done(reached=False)
+    assert made.pause() == 600
+
+
+def test_what_is_asked_for_many_times_is_one_look_and_one_after_it() -> None:
+    clock = Clock()
+    made = looks(clock, 0)
+    assert made.pause() is None and not made.begin()
+    for _ in range(3):
+        made.nudge()
+    assert made.begin()
+    assert not made.begin()
+    made.nudge()  # while the look is under way: it may have come too late for it
+    made.done(reached=True)
+    assert made.pause() == 0.5, "bursts are not followed one by one"
+    clock.now += 0.5
+    assert made.begin()
+    made.done(reached=True)
+    assert made.pause() is None
+
+
+def test_a_look_that_was_cut_short_is_still_due() -> None:
+    clock = Clock()
+    made = looks(clock, 0)
+    made.nudge()
+    assert made.begin()
+    made.again()
+    assert made.begin()
+
+
+def test_a_repository_on_this_disk_is_looked_at_every_second() -> None:
+    made = looks(Clock(), 30, embedded=True)
+    made.done(reached=True)
+    assert made.pause() == 1
+    off = looks(Clock(), 0, embedded=True)
+    assert off.pause() is None
+
+
+def test_by_chance_looks_come_earlier_and_never_later() -> None:
+    made = Looks(100, steady=Clock())
+    pauses = set()
+    for _ in range(50):
+        made.done(reached=True)
+        pauses.add(made.pause())
+    assert len(pauses) > 10
+    assert all(pause is not None and 80 <= pause <= 100 for pause in pauses)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("30s", 30), ("1h30m", 5400), ("0", 0), ("0s", 0), ("0.2", 0.2)]
+)
+def test_an_interval_is_a_duration_or_seconds(text: str, seconds: float) -> None:
+    assert interval_s(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "-1", "often", "1e9", "30 s", "nan"])
+def test_anything_else_is_no_interval(text: str) -> None:
+    with pytest.raises(ValueError, match="is no duration; write one like 90s"):
+        interval_s(text)
+
+
+def test_away_and_back_are_logged_once_each(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, logger="demandops")
+    link = Link("https://git.example/state.git")
+    link.reached()
+    for _ in range(3):
+        link.lost("cannot be fetched: no route")
+    assert link.is_away and link.contact.trouble == "cannot be fetched: no route"
+    for _ in range(3):
+        link.reached(pushed=True)
+    assert [record.getMessage() for record in caplog.records] == [
+        "cannot be fetched: no route; trying again until it is back",
+        "https://git.example/state.git is back after 0 s",
+    ]
+    assert not link.is_away and link.contact.pushed is not None
+
+
+def test_a_push_that_is_denied_is_remembered_until_one_is_taken() -> None:
+    link = Link("somewhere")
+    link.denied("takes no push: frozen")
+    link.reached()
+    assert link.contact.denied == "takes no push: frozen" and not link.is_away
+    link.reached(pushed=True)
+    assert link.contact.denied == ""

@@ -1,0 +1,24 @@
+"""Where what a demand needs is followed: by Flux's objects, or below an Application of Argo CD."""
+
+from __future__ import annotations
+
+import pytest
+
+from generator import yamlio
+from generator.cluster.health import Named
+from generator.decision import decide
+from generator.service import targets
+from tests.golden.cases import NOW, requests_of, start
+
+
+@pytest.mark.parametrize(
+    ("case", "application"),
+    [("experiment", None), ("argocd-experiment", Named("argocd", "demandops-perception"))],
+)
+def test_a_place_knows_by_which_controller_it_is_kept(case: str, application: Named | None) -> None:
+    state, files = start(case)
+    goal = yamlio.load(requests_of(case)[0].read_text())
+    found = targets.of_state(decide(state, goal, NOW, files.get).state)
+    assert {target.name for release, target in found} == {release.name for release, _ in found}
+    assert {target.place.application for _, target in found} == {application}
+    assert {target.by_helm for _, target in found} == {True, False}
