@@ -18,6 +18,7 @@ from generator.cli.output import (
     warn_of,
 )
 from generator.plan.bookkeeping import bookkeeping
+from generator.plan.difference import EntryChange, difference
 from generator.render.comparison import ReleaseDifference, compare
 from generator.render.paths import CLUSTERS_ROOT
 from generator.staterepo import reader
@@ -25,6 +26,7 @@ from generator.staterepo.reader import Reader
 from generator.staterepo.snapshot import Snapshot
 
 _LISTS = {"start": "started", "change": "changed", "stop": "stopped"}
+_SIGN_OF = {"added": "+", "changed": "~", "removed": "-"}
 
 
 @click.command()
@@ -40,14 +42,17 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
     with reader.opened(state_repo) as repo:
         old, new = (_loaded(repo, revision) for revision in (before, after))
         releases, others = _releases(repo, old, new)
-    was, now = (asdict(bookkeeping(s.state.ledger, s.state.catalog)) for s in (old, new))
-    data = {
-        "services": _changes(was["services"], now["services"]),
-        "connections": _changes(was["connections"], now["connections"]),
-    }
+    books = [bookkeeping(one.state.ledger, one.state.catalog) for one in (old, new)]
+    entries = difference(*books)
     if output == "json":
+        was, now = map(asdict, books)
         print_json(
-            data
+            {
+                kind: _entries(
+                    [one for one in entries if f"{one.kind}s" == kind], was[kind], now[kind]
+                )
+                for kind in ("services", "connections")
+            }
             | {
                 "releases": {
                     word: [_row(one) for one in releases if one.change == change]
@@ -58,7 +63,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
         )
         return
     out = console()
-    for line in list(_lines(data)) or ["no difference in bookkeeping"]:
+    for line in list(_entry_lines(entries)) or ["no difference in bookkeeping"]:
         out.print(line)
     for line in list(_release_lines(releases, others)) or ["no difference in what runs"]:
         out.print(line)
@@ -97,16 +102,16 @@ def _release_lines(releases: Iterable[ReleaseDifference], others: Iterable[str])
     yield from (f"~ file {path}" for path in others)
 
 
-def _changes(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "added": {name: _plain(new[name]) for name in sorted(new.keys() - old.keys())},
-        "removed": {name: _plain(old[name]) for name in sorted(old.keys() - new.keys())},
-        "changed": {
-            name: {"before": _plain(old[name]), "after": _plain(new[name])}
-            for name in sorted(old.keys() & new.keys())
-            if old[name] != new[name]
-        },
-    }
+def _entries(
+    changes: Iterable[EntryChange], old: dict[str, Any], new: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the entries of one kind that differ, whole, as they were and as they are."""
+    found: dict[str, dict[str, Any]] = {"added": {}, "removed": {}, "changed": {}}
+    for one in changes:
+        sides = {"before": old.get(one.name), "after": new.get(one.name)}
+        whole = {"added": sides["after"], "removed": sides["before"], "changed": sides}
+        found[one.change][one.name] = _plain(whole[one.change])
+    return found
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
@@ -115,26 +120,9 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _lines(data: dict[str, Any]) -> Iterator[str]:
-    for kind in ("services", "connections"):
-        word = kind[:-1]
-        for name, entry in data[kind]["added"].items():
-            yield f"+ {word} {name} for {', '.join(entry['requesters'])}"
-        for name, sides in data[kind]["changed"].items():
-            yield f"~ {word} {name}"
-            before, after = set(_facts(sides["before"])), set(_facts(sides["after"]))
-            yield from (f"    - {fact}" for fact in sorted(before - after))
-            yield from (f"    + {fact}" for fact in sorted(after - before))
-        for name, entry in data[kind]["removed"].items():
-            yield f"- {word} {name} for {', '.join(entry['requesters'])}"
-
-
-def _facts(entry: dict[str, Any]) -> Iterable[str]:
-    for requester in entry["requesters"]:
-        yield f"requester {requester}"
-    for role, topics in entry.get("inputs", {}).items():
-        yield from (f"{role} {topic}" for topic in topics)
-    yield from (f"topic {topic}" for topic in entry.get("topics", ()))
-    for key in ("node", "source", "target"):
-        if key in entry:
-            yield f"{key} {entry[key]}"
+def _entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
+    for one in entries:
+        who = "" if one.change == "changed" else f" for {', '.join(one.requesters)}"
+        yield f"{_SIGN_OF[one.change]} {one.kind} {one.name}{who}"
+        yield from (f"    - {fact}" for fact in one.lost)
+        yield from (f"    + {fact}" for fact in one.gained)

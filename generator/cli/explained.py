@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
+from generator.catalog.catalog import Catalog
+from generator.catalog.override import Override
 from generator.demand.claim import Claim, Subject
 from generator.ledger import format as ledger_format
 from generator.plan import explanation
 from generator.plan.release import Release
+from generator.plan.standing import in_force, suspended_by
 from generator.render.changeset import described
 from generator.render.paths import path_of
 from generator.staterepo.history import LogEntry
@@ -21,18 +24,28 @@ _PEOPLES_COMMITS = 5
 def release(snapshot: Snapshot, found: Release) -> dict[str, Any]:
     """Return why a release runs."""
     ledger, catalog = snapshot.state.ledger, snapshot.state.catalog
-    claims = explanation.claims_behind(ledger, found)
+    claims = explanation.claims_behind(in_force(ledger, catalog), found)
     return {
         "runs": True,
         "what": described(None, found, stood=False).what,
         **_where(found),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
-        "claims": [_claim(claim) for claim in claims],
+        "claims": [_claim(claim, catalog) for claim in claims],
         "shaped_by": [
             {"file": one.file, "entry": one.entry or None, "what": one.what}
             for one in explanation.shaped_by(found, catalog)
         ],
-        "overrides": explanation.overrides_of(found, catalog),
+        "overrides": [_override(one, effects) for one, effects in found.shaping.by],
+    }
+
+
+def denied(found: Release, by: Override) -> dict[str, Any]:
+    """Return what keeps a release from running that claims ask for."""
+    return {
+        "runs": False,
+        "what": described(None, found, stood=False).what,
+        **_where(found),
+        "denied_by": _override(by, ("deny",)),
     }
 
 
@@ -42,10 +55,10 @@ def subject(snapshot: Snapshot, found: Subject) -> dict[str, Any]:
     claims = sorted(ledger.of(found), key=lambda claim: claim.booked)
     releases = explanation.releases_of(ledger, catalog, found)
     return {
-        "runs": bool(claims),
+        "runs": any(suspended_by(claim, catalog) is None for claim in claims),
         "what": str(found),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
-        "claims": [_claim(claim) for claim in claims],
+        "claims": [_claim(claim, catalog) for claim in claims],
         "releases": [{"name": one.name, **_where(one), "file": path_of(one)} for one in releases],
     }
 
@@ -70,8 +83,20 @@ def _where(found: Release) -> dict[str, Any]:
     }
 
 
-def _claim(claim: Claim) -> dict[str, Any]:
+def _override(override: Override, effects: Iterable[str]) -> dict[str, Any]:
+    return {
+        "file": override.path,
+        "effects": list(effects),
+        "priority": override.priority,
+        "owner": override.owner,
+        "reason": override.reason,
+        "until": override.end.isoformat() if override.end else None,
+    }
+
+
+def _claim(claim: Claim, catalog: Catalog) -> dict[str, Any]:
     lease = claim.lease
+    suspended, kept = suspended_by(claim, catalog), explanation.kept_by(claim, catalog)
     return {
         "subject": str(claim.subject),
         "demand": claim.demand,
@@ -81,6 +106,8 @@ def _claim(claim: Claim) -> dict[str, Any]:
         "lease": {"seconds": lease.seconds, "until": lease.until.isoformat()} if lease else None,
         "file": ledger_format.path_of(claim.key),
         "release_by": explanation.how_to_release(claim),
+        "kept_by": _override(kept, ("keep",)) if kept else None,
+        "suspended_by": _override(suspended, ("deny",)) if suspended else None,
     }
 
 
@@ -112,6 +139,10 @@ def lines(found: dict[str, Any]) -> Iterator[str]:
             word = "is gone" if found["stopped"] else "stands"
         yield f"{told} {word} at {at}"
         yield f"  file        {found['file']}"
+        if found.get("denied_by"):
+            yield f"  denied by   {_told_override(found['denied_by'])}"
+        if found.get("claims"):
+            yield from _claims(found)
         yield from _history(found)
         return
     yield f"{told} runs at {at}"
@@ -130,8 +161,9 @@ def lines(found: dict[str, Any]) -> Iterator[str]:
         for one in found["shaped_by"]:
             entry = f" {one['entry']}" if one["entry"] else ""
             yield f"  {one['file']}{entry}: {one['what']}"
-    for one in found.get("overrides", ()):
-        yield f"overridden by {one}"
+    if found.get("overrides"):
+        yield "overridden by"
+        yield from (f"  {_told_override(one)}" for one in found["overrides"])
     yield from _history(found)
 
 
@@ -142,7 +174,21 @@ def _claims(found: dict[str, Any]) -> Iterator[str]:
         yield f"  {', '.join(claim['requesters'])} since {since} UTC, for {claim['subject']}"
         yield f"    demand {claim['demand']}, request '{claim['request']}'{_lease(claim)}"
         yield f"    {claim['file']}"
-        yield f"    to release it: {claim['release_by']}, or delete that file by pull request"
+        if claim["suspended_by"]:
+            yield f"    suspended by {_told_override(claim['suspended_by'])}"
+        if claim["kept_by"]:
+            yield f"    kept by {_told_override(claim['kept_by'])}"
+            yield f"    to release it: {claim['release_by']} by pull request"
+        else:
+            yield f"    to release it: {claim['release_by']}, or delete that file by pull request"
+
+
+def _told_override(one: dict[str, Any]) -> str:
+    until = f", until {one['until'][:19].replace('T', ' ')} UTC" if one["until"] else ""
+    return (
+        f"{one['file']}: {', '.join(one['effects'])} (priority {one['priority']}{until}), of "
+        f"{one['owner']}: {one['reason']}"
+    )
 
 
 def _lease(claim: dict[str, Any]) -> str:

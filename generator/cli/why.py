@@ -80,7 +80,7 @@ def why(
         elif asked.subject is not None:
             found |= explained.subject(snapshot, asked.subject)
         else:
-            found |= {"runs": False}
+            found |= {"runs": False, **_denied(snapshot, asked)}
         found["file"] = asked.path
         found |= explained.commits(repo, asked.path, commit, most)
     if output == "json":
@@ -119,6 +119,9 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
     found = []
     release = explanation.find(ledger, catalog, name)
     path = path_of(release) if release else repo.path_called(name, str(snapshot.commit))
+    if path is None:  # one that an override denies may never have run
+        stopped = explanation.denied_called(ledger, catalog, name)
+        path = path_of(stopped[0]) if stopped else None
     if path is not None:
         found.append(_Asked("release", name, path, release))
     for kind in SubjectKind:
@@ -144,6 +147,15 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Asked:
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return _Asked("file", path, path)
     return _Asked("claim" if ledger_format.kind_of(path) else "release", name, path)
+
+
+def _denied(snapshot: Snapshot, asked: _Asked) -> dict[str, Any]:
+    """Return which override keeps a release from running that is asked for, if one does."""
+    if asked.kind != "release":
+        return {}
+    name = asked.path.rsplit("/", 1)[-1].removesuffix(".yaml")
+    stopped = explanation.denied_called(snapshot.state.ledger, snapshot.state.catalog, name)
+    return explained.denied(*stopped) if stopped else {}
 
 
 def _is_held(snapshot: Snapshot, asked: _Asked) -> bool:

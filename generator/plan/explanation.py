@@ -19,10 +19,11 @@ from generator.catalog.catalog import (
     ZENOH_BRIDGE_IMAGE,
     Catalog,
 )
+from generator.catalog.override import OVERRIDES_ROOT, Override
 from generator.catalog.repository import ROOT_FILE
-from generator.demand.claim import ApplicationClaim, Claim, Subject, demand_id
+from generator.demand.claim import KEPT, ApplicationClaim, Claim, Subject, demand_id, is_kept
 from generator.ledger.ledger import Ledger
-from generator.plan.planner import all_keys, keys_of, plan
+from generator.plan.planner import all_keys, denied, keys_of, plan
 from generator.plan.release import Bridge, MqttEnd, Release, ServiceRelease
 
 
@@ -56,7 +57,12 @@ def releases_of(ledger: Ledger, catalog: Catalog, subject: Subject) -> list[Rele
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
-    """Return the claims that ask for a release, the first that was booked first."""
+    """Return the claims that ask for a release, the first that was booked first.
+
+    Args:
+        ledger: the books without suspended claims (:func:`generator.plan.standing.in_force`).
+        release: what runs.
+    """
     claims: Iterable[Claim]
     if isinstance(release, ServiceRelease):
         users = (claim for id in release.applications for claim in ledger.application(id))
@@ -77,6 +83,8 @@ def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
 
 def how_to_release(claim: Claim) -> str:
     """Return how its requesters give a claim up."""
+    if is_kept(claim):
+        return f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(KEPT)}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):
         return f"send request '{claim.request}' again with shutdown: true"
     return f"send operation: release for demand '{claim.demand}'"
@@ -92,9 +100,18 @@ def shaped_by(release: Release, catalog: Catalog) -> list[Shaping]:
     return [*found, Shaping(DOMAINS_FILE, domain.name, f"namespace {domain.namespace}")]
 
 
-def overrides_of(release: Release, catalog: Catalog) -> list[str]:
-    """Return the overrides that shape a release, as people read them."""
-    return []
+def denied_called(ledger: Ledger, catalog: Catalog, name: str) -> tuple[Release, Override] | None:
+    """Return the release of a name that claims need, and the override that denies it."""
+    for key in all_keys(ledger, catalog):
+        found = denied(ledger, catalog, key)
+        if found is not None and found[0].name == name:
+            return found
+    return None
+
+
+def kept_by(claim: Claim, catalog: Catalog) -> Override | None:
+    """Return the override whose own claim this is, or nothing where somebody asks for it."""
+    return catalog.overrides.get(claim.demand.removeprefix(KEPT)) if is_kept(claim) else None
 
 
 def _service(release: Release, catalog: Catalog) -> Iterator[Shaping]:
