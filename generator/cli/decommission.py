@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
 import click
@@ -13,6 +14,7 @@ from generator.cli.output import (
     output_option,
     print_json,
     progress,
+    signing_option,
     state_repo_option,
 )
 from generator.cli.request import show_releases
@@ -31,8 +33,16 @@ from generator.staterepo.snapshot import Snapshot
 @click.option("--node", "kinds", flag_value="node", help="As a node only.")
 @click.option("--requester", "kinds", flag_value="requester", help="As a requester only.")
 @click.option("--dry-run", is_flag=True, help="Show the consequence and release nothing.")
+@signing_option
 @output_option
-def decommission(name: str, state_repo: str, kinds: str | None, dry_run: bool, output: str) -> None:
+def decommission(
+    name: str,
+    state_repo: str,
+    kinds: str | None,
+    dry_run: bool,
+    signing_key: Path | None,
+    output: str,
+) -> None:
     """Release all that a node or a requester holds, for it leaves for good.
 
     Of a node: the applications at it, the inputs from it and the connections that end at it, in
@@ -41,7 +51,10 @@ def decommission(name: str, state_repo: str, kinds: str | None, dry_run: bool, o
     """
     goal = leaving.as_data(name, (kinds,) if kinds else ("node", "requester"), people.operator())
     try:
-        row = _rehearsed(goal, state_repo, output) if dry_run else _done(goal, state_repo)
+        if dry_run:
+            row = _rehearsed(goal, state_repo, output)
+        else:
+            row = _done(goal, state_repo, signing_key)
     except _NothingHeld:
         row = _row(name, "unchanged", None, ())
     if output == "json":
@@ -59,9 +72,9 @@ def _held_by_nobody(error: Refused, name: str, snapshot: Snapshot) -> bool:
     return codes == {"not-held"} and name in snapshot.state.catalog.nodes
 
 
-def _done(goal: dict[str, Any], state_repo: str) -> dict[str, Any]:
+def _done(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any]:
     with progress("reading the ledger") as tell:
-        generator = Generator(state_repo, patient=False, progress=tell)
+        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=tell)
     try:
         receipt = generator.submit(goal).future.result()
         return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)

@@ -9,14 +9,21 @@ import click
 from rich.table import Table
 
 from generator.catalog.override import ImagePin, written
-from generator.cli.output import console, output_option, print_json, progress, state_repo_option
+from generator.cli.output import (
+    REV_HELP,
+    console,
+    output_option,
+    print_json,
+    progress,
+    state_repo_option,
+)
 from generator.plan.survey import Entry, survey
 from generator.staterepo import reader
 
 
 @click.command()
 @state_repo_option
-@click.option("--at", "at", metavar="REV", help="A commit, tag or branch; the newest by default.")
+@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; the newest by default.")
 @output_option
 def overrides(state_repo: str, at: str | None, output: str) -> None:
     """List the overrides: what each does, for which releases and claims, whose it is, how long.

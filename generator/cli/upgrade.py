@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
 import click
@@ -14,10 +15,12 @@ from generator.cli.output import (
     output_option,
     print_json,
     progress,
+    signing_option,
     state_repo_option,
 )
 from generator.render.handover import Step
 from generator.staterepo import upgrade as upgrading
+from generator.staterepo.signing import Signer
 from generator.staterepo.upgrade import Upgrade, Wish
 
 _MOST_PATHS = 50
@@ -41,9 +44,16 @@ _MOST_PATHS = 50
 @click.option(
     "--yes", is_flag=True, help="Do not ask, on a terminal, before the controller changes."
 )
+@signing_option
 @output_option
 def upgrade(
-    state_repo: str, gitops: str | None, url: str | None, dry_run: bool, yes: bool, output: str
+    state_repo: str,
+    gitops: str | None,
+    url: str | None,
+    dry_run: bool,
+    yes: bool,
+    signing_key: Path | None,
+    output: str,
 ) -> None:
     """Render everything anew, in one commit.
 
@@ -55,6 +65,7 @@ def upgrade(
     wish = Wish(gitops, url)
     asks = gitops is not None and not yes and output == "text" and sys.stdin.isatty()
     now = datetime.now(timezone.utc)
+    signer = Signer(signing_key) if signing_key and not dry_run else None
     with progress("reading the ledger") as tell:
         if dry_run or asks:
             made = upgrading.plan(state_repo, wish, now, tell)
@@ -63,7 +74,7 @@ def upgrade(
             if not click.confirm("Is this done?"):
                 raise click.ClickException("nothing was changed; do it first, or say --yes")
         if not dry_run:
-            made = upgrading.upgrade(state_repo, wish, now, tell)
+            made = upgrading.upgrade(state_repo, wish, now, tell, signer)
     if output == "json":
         print_json(_data(made, dry_run))
     else:

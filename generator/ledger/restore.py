@@ -76,6 +76,8 @@ def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
 def _alike(one: Claim | None, other: Claim | None) -> bool:
     if one is None or other is None:
         return one is other
+    if is_kept(one):  # when it was kept is no part of what is asked
+        one = replace(one, booked=other.booked)
     return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
 
 

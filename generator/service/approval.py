@@ -33,6 +33,7 @@ from generator.staterepo import history, writer
 from generator.staterepo.history import Arrival
 from generator.staterepo.proposals import BranchMoved, Heads, branch_of
 from generator.staterepo.repository import PushDenied, StateRepository
+from generator.staterepo.signing import SigningFailed
 from generator.staterepo.snapshot import Snapshot
 
 log = logging.getLogger("demandops")
@@ -217,11 +218,19 @@ class Approvals:
             except BranchMoved as error:
                 log.info("%s; looking again", error)
                 self._changed.append(proposal.branch)
+            except SigningFailed as error:
+                if proposal.record.pushed:  # it stands as it is, and may be merged
+                    log.warning("%s; %s is not laid anew", error, proposal.branch)
+                else:
+                    self._fail(proposal, error)
             except PushDenied as error:
-                self._waiting.answer([(ticket, error) for ticket in proposal.tickets])
-                self._forget(proposal, close=True)
+                self._fail(proposal, error)
         ended = time.monotonic()
         self._looked, self._rested = str(snapshot.commit), ended + _SHARE * (ended - self._began)
+
+    def _fail(self, proposal: Proposal, error: DemandOpsError) -> None:
+        self._waiting.answer([(ticket, error) for ticket in proposal.tickets])
+        self._forget(proposal, close=True)
 
     def _look_at(self, proposal: Proposal, snapshot: Snapshot, heads: Heads) -> None:
         objects = self._repository.objects

@@ -231,9 +231,13 @@ def of_follow(
 def of_ended(
     override: Override,
     releases: tuple[ReleaseChange, ...],
+    kept: Iterable[ClaimKey],
     more: Iterable[tuple[str, str]] = (),
 ) -> str:
-    """Return the message of the commit that ends an override at the time that it names."""
+    """Return the message of the commit that ends an override at the time that it names.
+
+    ``kept`` are the claims of overrides' own that changed with it.
+    """
     body = [
         f"End override {override.name}",
         "",
@@ -244,7 +248,7 @@ def of_ended(
     ]
     trailers = [
         ("Operation", "expire-override"),
-        *of_overrides([override.path]),
+        *of_overrides([override.path, *keeping(kept)]),
         *more,
         ("Render-Version", str(RENDER_VERSION)),
     ]

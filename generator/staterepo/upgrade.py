@@ -33,6 +33,7 @@ from generator.staterepo import history, message, reader
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
+from generator.staterepo.signing import Signer
 from generator.staterepo.snapshot import Progress, Snapshot
 from generator.staterepo.writer import Line
 
@@ -79,7 +80,11 @@ def plan(
 
 
 def upgrade(
-    address: str, wish: Wish, now: datetime, progress: Progress = lambda done, total: None
+    address: str,
+    wish: Wish,
+    now: datetime,
+    progress: Progress = lambda done, total: None,
+    signer: Signer | None = None,
 ) -> Upgrade:
     """Render everything anew and publish it as one commit; nothing where nothing would change.
 
@@ -88,6 +93,7 @@ def upgrade(
         wish: which controller the state repo is for.
         now: the time of the commit.
         progress: told (files read, files in all) while the ledger is read.
+        signer: signs the commit, if given.
 
     Raises:
         InvalidInput: where the state repo is not valid or the wish cannot be fulfilled.
@@ -95,13 +101,14 @@ def upgrade(
     """
     with reader.opened(address) as repo:
         repository = repo.repository
+        repository.signer = signer
         for attempt in range(1, _ATTEMPTS + 1):
             made, line, taken = _planned(repository, wish, now, progress)
             if not made.files:
                 return made
             author = _person(repository.objects, now)
             state = replace(line.head.state, ledger=taken.ledger, catalog=taken.catalog)
-            commit = line.record(made.files, state, _message(made), author, now, taken.keys)
+            commit = line.record(made.files, state, _message(made, taken), author, now, taken.keys)
             if line.publish():
                 return Upgrade(commit, made.old, made.new, made.files)
             time.sleep(_PAUSE_S * attempt * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
@@ -201,7 +208,7 @@ def _person(objects: Repository, now: datetime) -> Signature:
     return Signature(who.name, who.email, int(now.timestamp()), 0)
 
 
-def _message(made: Upgrade) -> str:
+def _message(made: Upgrade, taken: TakenIn) -> str:
     old, new = made.old.repository, made.new.repository
     moved = old.gitops != new.gitops
     title = "Render everything anew"
@@ -224,6 +231,7 @@ def _message(made: Upgrade) -> str:
         f"From-Render-Version: {old.render_version}",
         *([f"From-Gitops: {old.gitops}"] if moved else []),
         f"Gitops: {new.gitops}",
+        *(f"{key}: {path}" for key, path in message.of_overrides(message.keeping(taken.keys))),
         f"Render-Version: {new.render_version}",
     ]
     return "\n".join(lines) + "\n"

@@ -180,7 +180,7 @@ class Line:
         taken = ended(_books(state), override, now)
         state = _with(state, taken)
         change = self.everything(state, taken.files)
-        text = message.of_ended(override, change.releases, _in_force(self.head))
+        text = message.of_ended(override, change.releases, taken.keys, _in_force(self.head))
         made = self._write(change.files, text, message.generator_signature(now), now)
         self.head = self.head.after(made, state, taken.keys)
 

@@ -19,6 +19,7 @@ from generator.staterepo.signing import Signer, SigningFailed
 Run = Callable[..., Any]
 
 SIGNERS = "policy/allowed-signers"
+POLICY = "policy/access-domains.yaml"
 
 
 def keygen(path: Path, passphrase: str = "", kind: str = "ed25519") -> Path:
@@ -62,12 +63,14 @@ def agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     os.kill(int(pid[1]), 15)
 
 
-def git_says(state: Any, allowed: str, tmp_path: Path) -> subprocess.CompletedProcess[str]:
+def git_says(
+    state: Any, allowed: str, tmp_path: Path, commit: str = "main"
+) -> subprocess.CompletedProcess[str]:
     file = tmp_path / "allowed"
     file.write_text(allowed)
     config = ["-c", "gpg.format=ssh", "-c", f"gpg.ssh.allowedSignersFile={file}"]
     return subprocess.run(
-        ["git", "-C", str(state.path), *config, "verify-commit", "main"],
+        ["git", "-C", str(state.path), *config, "verify-commit", commit],
         capture_output=True,
         text=True,
         check=False,
@@ -123,6 +126,65 @@ def test_init_and_rollback_sign_too(
     where = ("--state-repo", state.path, "--signing-key", key)
     assert demandops("rollback", "main~1", "-m", "x", "--drop-newer", *where).code == 0
     assert git_says(state, listed(key), tmp_path).returncode == 0
+
+
+@pytest.mark.parametrize("command", [("decommission", "vehicle00"), ("upgrade",)])
+def test_decommission_and_upgrade_sign_too(
+    command: tuple[str, ...], demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path
+) -> None:
+    assert book("a").code == 0
+    state.commit({next(iter(state.manifests())): None})  # something for the upgrade to render
+    before = state.tip
+    ran = demandops(*command, "--state-repo", state.path, "--signing-key", key)
+    assert (ran.code, ran.err) == (0, "")
+    assert state.tip != before
+    assert git_says(state, listed(key), tmp_path).returncode == 0
+
+
+class TestProposals:
+    """Demands that wait for approval: the branch is the generator's, and so signed."""
+
+    @pytest.fixture(autouse=True)
+    def _strict(self, state: Any) -> None:
+        import yaml
+
+        policy = yaml.safe_load(state.files()[POLICY])
+        policy["domains"][0]["approval"] = "required"
+        state.commit({POLICY: yaml.safe_dump(policy)})
+
+    def branch(self, state: Any) -> str:
+        command = ["git", "-C", str(state.path), "for-each-ref", "--format=%(refname:short)"]
+        asked = [*command, "refs/heads/demand"]
+        return subprocess.run(asked, check=True, capture_output=True, text=True).stdout.strip()
+
+    def test_its_commit_is_signed(self, book: Run, state: Any, key: Path, tmp_path: Path) -> None:
+        assert book("a", "--signing-key", key).code == 0
+        assert git_says(state, listed(key), tmp_path, self.branch(state)).returncode == 0
+
+    def test_a_key_that_is_gone_is_told_to_the_requester(
+        self, state: Any, key: Path, tmp_path: Path, data_home: Path
+    ) -> None:
+        from generator.service import Generator
+
+        generator = Generator(str(state.path), signing_key=key)
+        try:
+            key.rename(tmp_path / "hidden")
+            with pytest.raises(SigningFailed):
+                generator.submit(goal([], [connection("a")])).future.result(30)
+        finally:
+            assert generator.close()
+        assert self.branch(state) == ""
+
+    def test_rolling_back_while_one_waits(
+        self, demandops: Run, book: Run, state: Any, key: Path
+    ) -> None:
+        assert book("a").code == 0
+        waiting, before = self.branch(state), state.tip
+        path = "registry/images.yaml"
+        state.commit({path: state.files()[path].replace("2025-04", "2025-05")})
+        ran = demandops("rollback", before, "-m", "x", "--state-repo", state.path)
+        assert (ran.code, ran.err) == (0, "")
+        assert self.branch(state) == waiting
 
 
 def test_what_people_changed_is_carried_out_by_a_signed_commit(

@@ -1,0 +1,192 @@
+"""`verify` under overrides: it goes from commit to commit, and finds what a whole look finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import staterepo_rig as rig
+import yaml
+from staterepo_rig import Person
+
+from generator.service import Generator, rollback
+from generator.staterepo import reader
+from generator.staterepo.verification import Verdict
+
+FORGED = "Forged\n\nOperation: {}\nDemand-Id: none\n{}Render-Version: 1"
+EDGE = "clusters/c-its/perception/edge"
+
+
+@pytest.fixture
+def person(bare: Path, tmp_path: Path) -> Person:
+    return Person(bare, tmp_path / "person")
+
+
+@pytest.fixture
+def generator(bare: Path) -> Iterator[Generator]:
+    with rig.running(bare) as running:
+        yield running
+
+
+def override(**fields: object) -> str:
+    head = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "x", "owner": "petra"}
+    return yaml.safe_dump(head | fields)
+
+
+def merge(person: Person, **overrides: str | None) -> None:
+    person.change({f"overrides/{name}.yaml": text for name, text in overrides.items()})
+
+
+def file(bare: Path, path: str) -> str:
+    return rig.git(bare, "show", f"main:{path}") + "\n"
+
+
+def verdicts(bare: Path) -> dict[str, Verdict]:
+    """What is said of all of history, the same in both ways."""
+    with reader.opened(str(bare)) as repo:
+        commits = repo.revisions(f"{rig.root(bare)}..")
+        found = repo.verify(commits)
+        assert found == repo.verify(commits, whole=True)
+    return {verdict.commit: verdict for verdict in found}
+
+
+def forged(bare: Path, person: Person, generator: Generator, change: Callable[[], str]) -> Verdict:
+    """Have a commit that is not the generator's among others; return what is said of it."""
+    rig.book(generator, rig.goal(2))
+    made = change()
+    found = verdicts(bare)[made]
+    rig.book(generator, rig.goal(3))
+    return found
+
+
+HOLD = override(select=[{"services": ["object-fusion"]}], hold=True)
+
+
+def test_a_held_file_is_compared_with_the_one_before(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, rig.goal(1))
+    merge(person, frozen=HOLD)
+    rig.book(generator, rig.goal(6), rig.goal(2), rig.leave(2))
+    assert all(verdict.holds for verdict in verdicts(bare).values())
+    path = next(
+        f"{EDGE}/{name}.yaml" for name in rig.books(bare)["services"] if name.startswith("of-")
+    )
+    text = file(bare, path)
+    changed = text.replace("replicas: 1", "replicas: 2")
+    assert changed != text
+    made = forged(
+        bare,
+        person,
+        generator,
+        lambda: person.change({path: changed}, FORGED.format("join", "")),
+    )
+    assert (made.holds, made.differing) == (False, (path,))
+
+
+def test_a_held_file_that_a_person_edited_is_what_the_next_commits_start_from(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, rig.goal(1), rig.goal(3))
+    merge(person, frozen=HOLD)
+    rig.book(generator, rig.goal(2))
+    (path, *_) = [
+        f"{EDGE}/{name}.yaml" for name in rig.books(bare)["services"] if name.startswith("of-")
+    ]
+    person.change({path: file(bare, path).replace("replicas: 1", "replicas: 2")})
+    rig.book(generator, rig.leave(2), rig.goal(4))
+    assert "replicas: 2" in file(bare, path)
+    assert all(verdict.holds for verdict in verdicts(bare).values())
+
+
+@pytest.mark.parametrize(
+    ("operation", "more", "path"),
+    [
+        ("join", "", "ledger/overrides/brief.yaml"),
+        ("follow", "", "ledger/overrides/no-marker.yaml"),
+        ("upgrade", "", "policy/access-domains.yaml"),
+        ("follow", "", "demandops.yaml"),
+        ("follow", "", "README.md"),
+    ],
+)
+def test_what_a_commit_may_not_change(
+    generator: Generator, bare: Path, person: Person, operation: str, more: str, path: str
+) -> None:
+    merge(person, brief=override(select=[{"nodes": ["edge"]}], keep=True))
+    text = "# more\n"
+    if not path.startswith("ledger/"):
+        text = file(bare, path) + text
+    made = forged(
+        bare,
+        person,
+        generator,
+        lambda: person.change({path: text}, FORGED.format(operation, more)),
+    )
+    assert (made.holds, made.touched) == (False, (path,))
+
+
+def test_a_claim_that_is_kept_is_accounted_for_by_its_override(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, rig.goal(1))
+    merge(person, lasting=override(select=[{"applications": ["edge/*"]}], keep=True))
+    rig.book(generator, rig.leave(1))
+    (path,) = rig.claims(bare, "override:lasting")
+    text = file(bare, path)
+    assert all(verdict.holds for verdict in verdicts(bare).values())
+    other = text.replace("petra", "paul")
+    assert other != text
+    message = FORGED.format("follow", "")
+    made = forged(bare, person, generator, lambda: person.change({path: other}, message))
+    assert path in made.touched
+    named = FORGED.format("follow", "Override: overrides/lasting.yaml\n")
+    made = forged(bare, person, generator, lambda: person.change({path: text}, named))
+    assert path not in made.touched
+
+
+def test_rolling_back_leaves_to_overrides_what_they_keep(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    keep = override(select=[{"applications": ["edge/*"]}], keep=True)
+    rig.book(generator, rig.goal(1))
+    asked = rig.tip(bare)
+    merge(person, lasting=keep)
+    rig.book(generator, rig.leave(1))
+    kept = rig.tip(bare)
+    assert len(rig.claims(bare, "override:lasting")) == 1
+
+    def back(to: str) -> str:
+        goal = rollback.goal(to, drop_newer=False, reason="x", who=("A", "a@example.org"))
+        return rig.receipt(generator.submit(goal)).outcome
+
+    assert back(asked) == "restored", "what an override keeps is nobody's newer demand"
+    assert rig.claims(bare, "override:lasting") == [], "it gives way to who asks"
+    rig.book(generator, rig.leave(1))
+    assert back(kept) == "unchanged"
+    merge(person, lasting=None)
+    rig.book(generator, rig.goal(2), rig.leave(2))
+    assert rig.claims(bare, "override:lasting") == []
+    assert back(kept) == "unchanged", "nothing keeps it any more"
+    merge(person, lasting=keep)
+    rig.book(generator, rig.goal(2), rig.leave(2))
+    rolled = rollback.goal(kept, drop_newer=True, reason="x", who=("A", "a@example.org"))
+    assert rig.receipt(generator.submit(rolled)).outcome == "restored"
+    assert len(rig.claims(bare, "override:lasting")) == 2
+    assert all(verdict.holds for verdict in verdicts(bare).values())
+    rig.assert_sound(bare)
+
+
+def test_rolling_back_leaves_the_markers_alone(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, rig.goal(1))
+    before = rig.tip(bare)
+    expired = override(select=[{"nodes": ["edge"]}], keep=True, expires="2020-01-01T00:00:00Z")
+    merge(person, brief=expired)
+    rig.book(generator, rig.leave(1))
+    marker = file(bare, "ledger/overrides/brief.yaml")
+    goal = rollback.goal(before, drop_newer=False, reason="x", who=("A", "a@example.org"))
+    assert rig.receipt(generator.submit(goal)).outcome == "restored"
+    assert file(bare, "ledger/overrides/brief.yaml") == marker
+    rig.assert_sound(bare)
