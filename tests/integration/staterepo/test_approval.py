@@ -584,3 +584,22 @@ def test_a_proposal_passes_the_check_of_pull_requests(
     petra.fetch()
     git(petra.folder, "checkout", "--quiet", f"origin/{branch}")
     assert run(["check", str(petra.folder)]) == 0, capsys.readouterr()
+
+
+def test_one_cancelled_right_before_a_crash_is_taken_away_at_the_restart(
+    bare: Path, petra: Petra
+) -> None:
+    """The withdrawal is on the disk before anything else; its branch is not to be merged."""
+    with serving(bare.parent) as server:
+        address = f"{server.url}/state.git"
+        with rig.running(address) as generator:
+            proposed = Proposed(generator, goal(1), "op-1")
+            assert [proposed.branch] == branches(bare)
+            server.faults.away = True
+            assert generator.withdraw("op-1") is True
+            generator.close(timeout=0)
+        server.faults.away = False
+        assert len(branches(bare)) == 1
+        with rig.running(address):
+            rig.wait_until(lambda: branches(bare) == [], "the branch is deleted")
+    assert rig.claims(bare) == []
