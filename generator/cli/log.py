@@ -64,7 +64,8 @@ class _Time(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--operation",
     metavar="WORD",
-    help="join, shutdown, put, release, renew, expire, follow, rollback, init; or by-hand.",
+    help="join, shutdown, put, release, renew, expire, decommission, follow, expire-override, "
+    "rollback, upgrade, init; or by-hand.",
 )
 @click.option(
     "--since", type=_Time(end=False), metavar="TIME", help=f"Not before: {moments.TIMES}."

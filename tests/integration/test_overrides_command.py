@@ -151,3 +151,61 @@ def test_there_is_a_schema_for_overrides(demandops: Run) -> None:
     schema = json.loads(demandops("schema", "override").out)
     assert set(schema["required"]) == {"apiVersion", "kind", "reason", "owner", "select"}
     assert "name" not in schema["properties"]
+
+
+def test_why_tells_what_overrides_do(demandops: Run, overridden: StateRepo) -> None:
+    def why(name: str, *more: str) -> Any:
+        where = ("--state-repo", overridden.path)
+        return demandops("why", name, *where, *more)
+
+    def asked(name: str) -> Any:
+        return why(name, "--output", "json").json()
+
+    shaped = asked("od-edge-vehicle00")
+    (by,) = shaped["overrides"]
+    assert by == {
+        "file": "overrides/many.yaml",
+        "effects": ["values", "images"],
+        "priority": 3,
+        "owner": "petra",
+        "reason": "why",
+        "until": None,
+    }
+    line = "  overrides/many.yaml: values, images (priority 3), of petra: why"
+    assert line in why("od-edge-vehicle00").out.splitlines()
+    (fusion,) = [
+        name
+        for entry in demandops(
+            "overrides", "--state-repo", overridden.path, "--output", "json"
+        ).json()
+        if entry["name"] == "off"
+        for name in entry["releases"]
+    ]
+    denied = asked(fusion)
+    assert (denied["runs"], denied["denied_by"]["file"]) == (False, "overrides/off.yaml")
+    assert denied["stopped"]["operation"] == "follow"
+    assert (
+        "  denied by   overrides/off.yaml: deny (priority 0), of petra: why"
+        in why(fusion).out.splitlines()
+    )
+    connection = asked("vehicle00/edge")
+    assert connection["runs"] is False
+    (claim,) = connection["claims"]
+    assert claim["suspended_by"]["file"] == "overrides/closed.yaml"
+    assert claim["kept_by"] is None
+    told = why("vehicle00/edge").out.splitlines()
+    assert "    suspended by overrides/closed.yaml: deny (priority 0), of petra: why" in told
+    assert all(one["suspended_by"] is None for one in shaped["claims"])
+
+
+def test_why_of_what_an_override_keeps(
+    demandops: Run, overridden: StateRepo, request_json: Callable[..., Ran]
+) -> None:
+    overridden.commit({"overrides/closed.yaml": None, "overrides/off.yaml": None})
+    assert request_json(perception(), perception(shutdown=True)).code == 0
+    where = ("--state-repo", overridden.path)
+    (claim,) = demandops("why", "od-edge-vehicle00", *where, "--output", "json").json()["claims"]
+    assert (claim["requesters"], claim["kept_by"]["file"]) == (["petra"], "overrides/lasting.yaml")
+    told = demandops("why", "od-edge-vehicle00", *where).out.splitlines()
+    assert "    kept by overrides/lasting.yaml: keep (priority 0), of petra: why" in told
+    assert "    to release it: remove keep from overrides/lasting.yaml by pull request" in told
