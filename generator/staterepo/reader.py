@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from pygit2 import Commit
@@ -15,7 +15,7 @@ from generator.decision import rendered
 from generator.errors import InvalidInput
 from generator.render.changeset import Read
 from generator.settings import GENERATED_ROOTS, RENDER_VERSION
-from generator.staterepo import history, holding, remote, reports
+from generator.staterepo import history, in_force, remote, reports
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.address import is_url
@@ -103,17 +103,16 @@ class Reader:
         """
         commit = snapshots.commit_of(self._repository.objects, self.commit(revision))
         told = self._told_at(commit)
-        if told:
-            return self._in_force_at(commit, told)
+        if told is not None and told.one("In-Force"):
+            return in_force.at(self._repository.objects, commit, told)
         return snapshots.load(self._repository.objects, commit.id, progress)
 
-    def _told_at(self, commit: Commit) -> str:
-        """Return the commit whose configuration the generator told to be in force, if another."""
+    def _told_at(self, commit: Commit) -> LogEntry | None:
+        """Return the generator's newest commit up to one: it says what is in force."""
         base = history.last_generated(self._repository.objects, commit.id)
         if base is None:
-            return ""
-        made = snapshots.commit_of(self._repository.objects, base)
-        return history.entry_of(made).one("In-Force")
+            return None
+        return history.entry_of(snapshots.commit_of(self._repository.objects, base))
 
     def problems(self) -> tuple[reports.Problem, ...]:
         """Return what the generator reports not to be valid at the newest commit."""
@@ -167,7 +166,7 @@ class Reader:
                 f"rendered by version {version}, this is version {RENDER_VERSION}",
             )
         try:
-            snapshot = self._in_force_at(commit, entry.one("In-Force"))
+            snapshot = in_force.at(self._repository.objects, commit, entry)
         except InvalidInput as error:
             why = f"a person's file was not valid then: {error.faults[0]}"
             return Verdict(entry.commit, entry.summary, True, why)
@@ -177,26 +176,6 @@ class Reader:
             return Verdict(entry.commit, entry.summary, False, fault=str(error.faults[0]))
         differing = _differing(wanted, commit)
         return Verdict(entry.commit, entry.summary, not differing, differing=differing)
-
-    def _in_force_at(self, commit: Commit, sound: str) -> Snapshot:
-        """Return what the generator went by at one of its commits.
-
-        ``sound`` is the commit whose configuration was in force, where people had broken theirs.
-        """
-        if not sound:
-            return snapshots.load(self._repository.objects, commit.id)
-        snapshot = snapshots.load(self._repository.objects, sound)
-        advance = snapshots.advance(self._repository.objects, snapshot, commit.id)
-        ledger, ended = advance.snapshot.state.ledger, advance.snapshot.state.catalog.ended
-        catalog = snapshot.state.catalog.with_ended(ended)
-        state = replace(snapshot.state, catalog=catalog, ledger=ledger)
-        return holding.held_back(
-            self._repository.objects,
-            replace(advance.snapshot, state=state),
-            snapshot,
-            advance.subjects,
-            lambda path: None,
-        )[0]
 
 
 def _held_from(commit: Commit, catalog: Catalog) -> dict[str, str]:

@@ -87,6 +87,19 @@ def differences(
             yield path, None
 
 
+def below_root(
+    repo: Repository, before: Tree, after: Tree, root: str
+) -> Iterator[tuple[str, Oid | None]]:
+    """Yield (path, blob id or nothing) of each file that differs at or below a top-level entry."""
+    old, new = child(before, root), child(after, root)
+    if isinstance(new, pygit2.Blob) and (old is None or old.id != new.id):
+        yield root, new.id
+    elif isinstance(old, pygit2.Blob) and not isinstance(new, pygit2.Blob):
+        yield root, None
+    sides = [entry if isinstance(entry, Tree) else None for entry in (old, new)]
+    yield from differences(repo, sides[0], sides[1], f"{root}/")
+
+
 def is_note(path: str) -> bool:
     """Tell what people may put beside generated files: a README is no manifest."""
     return path.rsplit("/", 1)[-1] == "README.md"
