@@ -57,7 +57,7 @@ bench: setup  ## Measure what a commit costs, beside the floor
 	@$(PY) -m tests.benchmarks.commits
 
 load: setup  ## Four generators and a person write at once, 2,000 demands, connections are cut
-	@DEMANDOPS_LOAD_DEMANDS=2000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/staterepo/test_many_writers.py
+	@DEMANDOPS_LOAD_DEMANDS=2000 DEMANDOPS_LOAD_FURTHER=1000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/staterepo/test_many_writers.py tests/integration/staterepo/test_people_in_the_loop.py
 
 wheel: setup  ## Build the wheel into dist/
 	@$(PY) -m build --wheel --outdir dist .

@@ -72,7 +72,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 def _loaded(repo: Reader, revision: str) -> Snapshot:
     with progress("reading the ledger") as tell:
         snapshot = repo.last_valid(repo.commit(revision), tell)
-    warn_of(snapshot.problems)
+    warn_of(repo.problems_of(snapshot))
     return snapshot
 
 

@@ -14,8 +14,6 @@ import click
 from rich.console import Console
 from rich.progress import Progress as Bar
 
-from generator.errors import Fault
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 _WIDE = 200
@@ -57,7 +55,7 @@ def console() -> Console:
     return _console(stderr=False)
 
 
-def warn_of(problems: Iterable[Fault]) -> None:
+def warn_of(problems: Iterable[object]) -> None:
     """Tell files that are not valid, for which their last valid version was taken."""
     for found in problems:
         errors.print(f"warning: {found} (its last valid version is taken)")

@@ -71,7 +71,7 @@ def why(
     with reader.opened(state_repo) as repo:
         with progress("reading the ledger") as tell:
             snapshot = repo.last_valid(repo.commit(at), tell)
-        warn_of(snapshot.problems)
+        warn_of(repo.problems_of(snapshot))
         asked = _understood(repo, snapshot, name, kind)
         commit = str(snapshot.commit)
         found: dict[str, Any] = {"commit": commit, "kind": asked.kind, "name": asked.name}

@@ -73,8 +73,8 @@ def faults(
 ) -> list[Fault]:
     """Return what keeps releases from being planned or rendered, of all of them.
 
-    Each is told to be in a claim's file where it is in no other: in one of ``edited`` if there is
-    one among those that ask for the release.
+    Each is told to be in the claim among those that ask for the release that is in ``edited``, or
+    else where it is, or in any of these claims.
     """
     found: list[Fault] = []
     asking: dict[ReleaseKey, list[str]] = {}
@@ -102,9 +102,10 @@ def _claim_files(ledger: Ledger, catalog: Catalog) -> dict[ReleaseKey, list[str]
 def _located(
     faults: Iterable[Fault], claims: list[str], edited: Collection[str]
 ) -> Iterator[Fault]:
-    place = next((path for path in claims if path in edited), (claims or [""])[0])
+    ours = next((path for path in claims if path in edited), "")
     for found in faults:
-        yield found if found.file else found.within(place)
+        place = ours or found.file or (claims or [""])[0]
+        yield replace(found, file=place)
 
 
 def consequence(

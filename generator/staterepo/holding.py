@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from pygit2 import Commit, Repository
+from pygit2 import Repository
 from pygit2.enums import SortMode
 
 from generator.decision import State, consequence
@@ -19,7 +19,6 @@ from generator.errors import Fault, InvalidInput
 from generator.ledger import format as ledger_format
 from generator.render.changeset import Read
 from generator.staterepo import message
-from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.snapshot import Snapshot
 
@@ -44,26 +43,6 @@ def held_back(
         else:
             good.append(subject)
     return snapshot, good, faults
-
-
-def in_force_at(repo: Repository, commit: Commit, sound: str) -> Snapshot:
-    """Return what the generator went by at one of its commits.
-
-    Args:
-        sound: the commit whose configuration was in force, where people had broken theirs.
-
-    Raises:
-        InvalidInput: where a file of people in it is not valid.
-    """
-    if not sound:
-        return snapshots.load(repo, commit.id)
-    before = snapshots.load(repo, sound)
-    advance = snapshots.advance(repo, before, commit.id)
-    ledger, ended = advance.snapshot.state.ledger, advance.snapshot.state.catalog.ended
-    catalog = before.state.catalog.with_ended(ended)
-    state = replace(before.state, catalog=catalog, ledger=ledger)
-    snapshot = replace(advance.snapshot, state=state)
-    return held_back(repo, snapshot, before, advance.subjects, lambda path: None)[0]
 
 
 def _faults(state: State, before: Snapshot, subject: Subject, read: Read) -> tuple[Fault, ...]:

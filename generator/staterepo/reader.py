@@ -12,12 +12,12 @@ from pygit2 import Commit
 
 from generator import settings
 from generator.catalog.catalog import Catalog
-from generator.errors import InvalidInput, StateRepoError
+from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.ledger.restore import Restoration
 from generator.render.changeset import Read
 from generator.staterepo import (
     history,
-    holding,
+    in_force,
     moments,
     paths,
     remote,
@@ -109,21 +109,25 @@ class Reader:
         """
         commit = snapshots.commit_of(self._repository.objects, self.commit(revision))
         told = self._told_at(commit)
-        if told:
-            return holding.in_force_at(self._repository.objects, commit, told)
+        if told is not None and told.one("In-Force"):
+            return in_force.at(self._repository.objects, commit, told)
         return snapshots.load(self._repository.objects, commit.id, progress)
 
-    def _told_at(self, commit: Commit) -> str:
-        """Return the commit whose configuration the generator told to be in force, if another."""
+    def _told_at(self, commit: Commit) -> LogEntry | None:
+        """Return the generator's newest commit up to one: it says what is in force."""
         base = history.last_generated(self._repository.objects, commit.id)
         if base is None:
-            return ""
-        made = snapshots.commit_of(self._repository.objects, base)
-        return history.entry_of(made).one("In-Force")
+            return None
+        return history.entry_of(snapshots.commit_of(self._repository.objects, base))
 
     def problems(self) -> tuple[reports.Problem, ...]:
         """Return what the generator reports not to be valid at the newest commit."""
         return reports.read(self.file_reader()(reports.PATH))
+
+    def problems_of(self, snapshot: Snapshot) -> tuple[reports.Problem | Fault, ...]:
+        """Return what is not valid at a commit, as reported there or else as it was found."""
+        told = self.file_reader(str(snapshot.commit))(reports.PATH)
+        return reports.read(told) or snapshot.problems
 
     def last_valid(self, revision: str, progress: Progress = lambda done, total: None) -> Snapshot:
         """Load what is in force at a commit, whether or not the generator has been there since.

@@ -6,7 +6,7 @@ last valid version in force and is reported; nothing else stops for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import pygit2
@@ -20,15 +20,20 @@ from generator.catalog.loading import load as load_catalog
 from generator.catalog.repository import ROOT_FILE
 from generator.decision import State, rehearse
 from generator.demand.claim import Claim, ClaimKey, Subject
-from generator.errors import Fault, InvalidInput, StateRepoError
+from generator.errors import Fault, InvalidInput, StateRepoError, fault
 from generator.ledger import format as ledger_format
 from generator.ledger import markers
 from generator.ledger.ledger import Ledger
 from generator.settings import GENERATED_ROOTS, RENDER_VERSION
-from generator.staterepo import message
+from generator.staterepo import configuration, message
 from generator.staterepo import tree as trees
+from generator.staterepo.configuration import Source
 
 Progress = Callable[[int, int], None]
+
+_NO_STATE_REPO = (
+    "this is no state repo, for it has no demandops.yaml; `demandops init DIR` makes one"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +42,8 @@ class Snapshot:
 
     ``keys`` finds the claim behind a ledger file, so that a removed file is understood.
     ``problems`` are files that are not valid and whose last valid version is in force; ``sound`` is
-    the newest commit without any; ``held`` are ledger files that are not in force as they stand.
+    the newest commit without any; ``held`` are ledger files that are not in force as they stand;
+    ``source`` is where the configuration in force is, where it is not the commit's own.
     """
 
     commit: Oid
@@ -46,6 +52,12 @@ class Snapshot:
     problems: tuple[Fault, ...] = ()
     sound: Oid | None = None
     held: tuple[str, ...] = ()
+    source: Source | None = None
+
+    @property
+    def configuration(self) -> Source:
+        """Where the configuration in force is."""
+        return self.source or Source(self.commit)
 
     def after(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
         """Return the snapshot of a commit of our own, whose state is known already."""
@@ -214,9 +226,7 @@ def catalog_at(tree: Tree) -> Catalog:
     """
     files = trees.texts(tree, CONFIG_ROOTS)
     if "demandops.yaml" not in files:
-        raise StateRepoError(
-            "this is no state repo, for it has no demandops.yaml; `demandops init DIR` makes one"
-        )
+        raise StateRepoError(_NO_STATE_REPO)
     return load_catalog(files).with_ended(markers.read(markers_at(tree)))
 
 
@@ -264,15 +274,17 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     refuse_other_rendering(after)
     state, problems = snapshot.state, list[Fault]()
     catalog_changed = _edited_by_hand(repo, snapshot.commit, to)
+    source = snapshot.source
     if any(_id(before, root) != _id(after, root) for root in CONFIG_ROOTS) or snapshot.problems:
-        try:
-            catalog = catalog_at(after)
-            if catalog != state.catalog:
-                rehearse(State.of(catalog, Ledger()))
+        now = configuration.found(
+            repo, (snapshot.configuration, snapshot.sound), to, lambda files: _tried(files, state)
+        )
+        problems += now.faults
+        source = now.source if problems else None
+        if now.catalog is not None:
+            catalog = now.catalog.with_ended(state.catalog.ended)
             catalog_changed = catalog_changed or catalog != state.catalog
             state = State(catalog, State.of(catalog, state.ledger).engine, state.ledger)
-        except (InvalidInput, StateRepoError) as error:
-            problems += _as_faults(error)
     ended = markers.read(markers_at(after))
     if ended != state.catalog.ended:
         state = replace(state, catalog=state.catalog.with_ended(ended))
@@ -304,16 +316,20 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
         keys = keys.insert(path, claim.key)
     state, sound = replace(state, ledger=ledger), snapshot.sound if problems else to
     return Advance(
-        Snapshot(to, state, keys, tuple(problems), sound, tuple(held)),
+        Snapshot(to, state, keys, tuple(problems), sound, tuple(held), source),
         tuple(dict.fromkeys(subjects)),
         catalog_changed,
     )
 
 
-def _as_faults(error: InvalidInput | StateRepoError) -> list[Fault]:
-    if isinstance(error, InvalidInput):
-        return list(error.faults)
-    return [Fault("invalid", "", str(error))]
+def _tried(files: Mapping[str, str], state: State) -> Catalog:
+    """Return the catalog of a commit, tried on invented demands where it is another than before."""
+    if ROOT_FILE not in files:
+        raise InvalidInput([fault("", _NO_STATE_REPO).within(ROOT_FILE)])
+    catalog = load_catalog(files)
+    if catalog.with_ended(state.catalog.ended) != state.catalog:
+        rehearse(State.of(catalog, Ledger()))
+    return catalog
 
 
 def _subtree(tree: Tree, name: str) -> Tree | None:

@@ -28,7 +28,7 @@ from generator.plan.traced import TracedPlan
 from generator.render import gitops, marking
 from generator.render.paths import path_of
 from generator.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
-from generator.staterepo import accounting, holding
+from generator.staterepo import accounting, in_force
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.history import LogEntry, entry_of
@@ -179,7 +179,7 @@ class _Row:
 
     def _loaded(self, commit: Commit, entry: LogEntry) -> State:
         try:
-            return holding.in_force_at(self._repo, commit, entry.one("In-Force")).state
+            return in_force.at(self._repo, commit, entry).state
         except InvalidInput as error:
             raise _Unreadable(error.faults[0]) from None
 

@@ -28,7 +28,7 @@ from generator.plan import keeping
 from generator.plan.following import TakenIn, differing, ended, files_of, taken_in
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
-from generator.staterepo import history, holding, message, people, reports, signing
+from generator.staterepo import history, holding, in_force, message, people, reports, signing
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
@@ -66,7 +66,7 @@ class Line:
         Args:
             proposal: the branch that it awaits approval on; nothing where it needs none.
         """
-        more = [*self._settled, *_in_force(self.head)]
+        more = [*self._settled, *in_force.trailers(self.head)]
         if proposal:
             more.append((message.PROPOSAL, proposal))
         text = message.of_decision(decision, operation, received, more)
@@ -123,6 +123,7 @@ class Line:
                     replace(snapshot, state=state), before, good
                 )
                 state, whole = snapshot.state, False
+                snapshot = replace(snapshot, source=before.configuration)
                 problems += found
         if not whole:
             state, change, keys = self._carried_out(state, before, good, (problems, now))
@@ -143,7 +144,7 @@ class Line:
                 [
                     *message.of_overrides(overrides),
                     *people.trailers(causes),
-                    *_in_force(self.head),
+                    *in_force.trailers(self.head),
                 ],
             )
             made = self._write(files, text, people.author(causes, now), now)
@@ -180,7 +181,8 @@ class Line:
         taken = ended(_books(state), override, now)
         state = _with(state, taken)
         change = self.everything(state, taken.files)
-        text = message.of_ended(override, change.releases, taken.keys, _in_force(self.head))
+        more = in_force.trailers(self.head)
+        text = message.of_ended(override, change.releases, taken.keys, more)
         made = self._write(change.files, text, message.generator_signature(now), now)
         self.head = self.head.after(made, state, taken.keys)
 
@@ -296,11 +298,6 @@ def _with(state: State, taken: TakenIn) -> State:
     return replace(state, ledger=taken.ledger, catalog=taken.catalog)
 
 
-def _in_force(snapshot: Snapshot) -> list[tuple[str, str]]:
-    """Return the trailer that names whose configuration is in force, where it is another's."""
-    return [("In-Force", str(snapshot.sound))] if snapshot.problems and snapshot.sound else []
-
-
 def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
     """Load the books at the generator's last commit.
 
@@ -315,5 +312,8 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
     snapshots.refuse_other_rendering(snapshots.commit_of(repository.objects, tip).tree)
     base = history.last_generated(repository.objects, tip)
     base = base or tip
-    told = history.entry_of(snapshots.commit_of(repository.objects, base)).one("In-Force")
-    return snapshots.load_last_valid(repository.objects, told or base, progress)
+    made = snapshots.commit_of(repository.objects, base)
+    told = history.entry_of(made)
+    if told.one("In-Force"):
+        return in_force.at(repository.objects, made, told)
+    return snapshots.load_last_valid(repository.objects, base, progress)

@@ -308,13 +308,16 @@ def test_all_faults_of_claims_configuration_and_hand_edits_are_told_together(
     assert len(data["overrides"]) == 1
 
 
-def test_a_node_in_use_that_is_taken_away_is_told_for_each_claim(
+def test_a_node_in_use_that_is_taken_away_is_told_with_how_to_give_it_up(
     branch: Path, found: Callable[..., dict[str, Any]]
 ) -> None:
     edit(branch / "inventory" / "nodes.yaml", ("- id: vehicle00\n", "- id: vehicle99\n"))
-    faults = found()["faults"]
-    (connection,) = claims(branch, "connection: vehicle00/edge")
-    assert connection.relative_to(branch).as_posix() in {one["file"] for one in faults}
+    told = [(one["file"], one["message"]) for one in found()["faults"]]
+    assert (
+        "inventory/nodes.yaml",
+        "'vehicle00' is in use, but not in inventory/nodes.yaml; restore it, or give up what it "
+        "holds: demandops decommission vehicle00",
+    ) in told
 
 
 def test_configuration_shows_in_which_fields_releases_change(

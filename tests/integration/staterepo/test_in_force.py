@@ -1,0 +1,166 @@
+"""What is in force while something of people's is not valid: the rest of what they merge.
+
+A broken file holds back itself and what came in the same commit, not what others merge. A restart
+finds the same, and every commit verifies by what its trailers say.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import staterepo_rig as rig
+import yaml
+from staterepo_rig import Person, goal, leave
+
+NODES, IMAGES = "inventory/nodes.yaml", "registry/images.yaml"
+DETECTION = "clusters/c-its/perception/edge/od-edge-station00.yaml"
+TWO = """\
+apiVersion: demandops/v1
+kind: Override
+reason: Two for each point cloud
+owner: petra
+select: [{services: [object-detection], nodes: [edge]}]
+replicas: 2
+"""
+BROKEN = TWO.replace("replicas: 2", "replicas: many").replace("object-detection", "object-fusion")
+
+
+@pytest.fixture
+def person(bare: Path, tmp_path: Path) -> Person:
+    return Person(bare, tmp_path / "person")
+
+
+def text(bare: Path, path: str) -> str:
+    return rig.git(bare, "show", f"main:{path}", check=False)
+
+
+def replicas(bare: Path) -> Any:
+    return yaml.safe_load(text(bare, DETECTION))["spec"]["values"]["replicas"]
+
+
+def tag(bare: Path) -> Any:
+    return yaml.safe_load(text(bare, DETECTION))["spec"]["values"]["image"]["tag"]
+
+
+def tagged(bare: Path, new: str) -> str:
+    """The registry with another tag of the detection's image."""
+    images = yaml.safe_load(text(bare, IMAGES))
+    images["kind"] = "Images"
+    images["images"]["object-detection"]["tag"] = new
+    return yaml.safe_dump(images)
+
+
+def trailers(bare: Path) -> list[tuple[str, str]]:
+    return list(rig.commits(bare)[-1].trailers)
+
+
+def test_another_file_is_taken_in_while_one_is_broken(bare: Path, person: Person) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        person.change({"overrides/broken.yaml": BROKEN})
+        rig.book(generator, goal(2))
+        person.change({IMAGES: tagged(bare, "v2")})
+        rig.book(generator, goal(3))
+        assert tag(bare) == "v2"
+        assert ("Stands-In", "overrides/broken.yaml none") in trailers(bare)
+        person.change({"overrides/broken.yaml": None})
+        rig.book(generator, goal(4))
+        assert "Stands-In" not in dict(trailers(bare))
+        assert tag(bare) == "v2"
+    rig.assert_sound(bare)
+
+
+def test_what_came_with_a_broken_file_waits_with_it(bare: Path, person: Person) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        person.change({"overrides/broken.yaml": BROKEN, IMAGES: tagged(bare, "v2")})
+        person.change({"overrides/two.yaml": TWO})
+        rig.book(generator, goal(2))
+        assert (tag(bare), replicas(bare)) == ("2025-04", 2)
+        person.change({"overrides/broken.yaml": BROKEN.replace("many", "3")})
+        rig.book(generator, goal(3))
+        assert (tag(bare), replicas(bare)) == ("v2", 2)
+    rig.assert_sound(bare)
+
+
+def test_of_a_file_that_breaks_later_the_version_before_stays(bare: Path, person: Person) -> None:
+    """Not the one from before the first break: what was in force meanwhile was merged."""
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        person.change({"overrides/broken.yaml": BROKEN})
+        rig.book(generator, goal(2))
+        person.change({IMAGES: tagged(bare, "v2")})
+        rig.book(generator, goal(3))
+        person.change({IMAGES: tagged(bare, "v3").replace("kind: Images", "kind: Imags")})
+        rig.book(generator, goal(4))
+        assert tag(bare) == "v2"
+    with rig.running(bare) as generator:
+        rig.book(generator, leave(1), goal(5))
+        assert tag(bare) == "v2"
+        person.change({IMAGES: tagged(bare, "v4")})
+        rig.book(generator, goal(6))
+        assert tag(bare) == "v4"
+        assert "overrides/broken.yaml" in text(bare, ".demandops/reports/problems.yaml")
+    rig.assert_sound(bare)
+
+
+@pytest.mark.parametrize("restart", [False, True], ids=["going on", "after a restart"])
+def test_a_broken_claim_holds_back_no_configuration(
+    bare: Path, person: Person, restart: bool
+) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1), goal(2))
+        (claim,) = [path for path in rig.claims(bare, "user2") if "applications" in path]
+        person.change({claim: "kind: nonsense\n"})
+        rig.book(generator, goal(3))
+        if not restart:
+            person.change({"overrides/two.yaml": TWO})
+            rig.book(generator, goal(4))
+    if restart:
+        person.change({"overrides/two.yaml": TWO})
+        with rig.running(bare) as generator:
+            rig.book(generator, goal(4))
+    assert replicas(bare) == 2
+    rig.assert_sound(bare)
+
+
+def test_a_node_in_use_that_is_taken_away_stays_while_something_is_broken(
+    bare: Path, person: Person
+) -> None:
+    """What cannot be planned is held back as a whole; the broken file's stand-in stays."""
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        person.change({"overrides/broken.yaml": BROKEN})
+        person.change({"overrides/two.yaml": TWO})
+        rig.book(generator, goal(2))
+        nodes = text(bare, NODES) + "\n"
+        start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
+        person.change({NODES: nodes[:start] + nodes[end:]})
+        rig.book(generator, goal(3))
+        assert replicas(bare) == 2
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(6))  # still at vehicle02
+        assert replicas(bare) == 2
+        rig.book(generator, leave(1), goal(7))
+    assert "vehicle01" in text(bare, ".demandops/reports/problems.yaml") or not rig.claims(
+        bare, "vehicle01"
+    )
+    rig.assert_sound(bare)
+
+
+def test_half_of_an_application_definition_is_not_taken_in(bare: Path, person: Person) -> None:
+    appdef = "appdefs/object-detection-fusion/appdef.yaml"
+    values = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        before = text(bare, DETECTION)
+        person.change(
+            {values: text(bare, values).replace("replicas: {{ replicas }}", "replicas: 7")}
+        )
+        person.change({appdef: "kind: nonsense\n", "overrides/two.yaml": TWO})
+        rig.book(generator, goal(2))
+        assert text(bare, DETECTION) == before
+        assert yaml.safe_load(text(bare, ".demandops/reports/problems.yaml"))
+    rig.assert_sound(bare)
