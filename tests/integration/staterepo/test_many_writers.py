@@ -19,7 +19,7 @@ import staterepo_rig as rig
 from staterepo_rig import Drivers, Goal
 
 GENERATORS = 4
-DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "120"))
+DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "64"))
 SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
 LANES = 8
 """Requesters that wait for an answer before they send again, at each generator."""

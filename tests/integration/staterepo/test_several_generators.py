@@ -12,7 +12,7 @@ from staterepo_rig import Drivers, demand, goal, leave
 
 from generator.service import Generator, Receipt, Ticket
 
-EACH = 60
+EACH = 32
 
 
 def _demands(who: int) -> list[tuple[str, rig.Goal]]:
