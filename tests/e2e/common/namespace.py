@@ -101,13 +101,16 @@ class Namespace:
         self._wait_same(self.inventory, wanted, timeout)
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
-        """Wait until no release's object has changed for a while; returns the versions."""
+        """Wait until no release's object has changed for a while; returns the versions.
+
+        A Deployment's status follows its pods at the controller's leisure: that is waited for.
+        """
         seen, since = self.versions(), time.monotonic()
 
         def quiet() -> bool:
             nonlocal seen, since
             now = self.versions()
-            if now != seen:
+            if now != seen or not self._all_counted():
                 seen, since = now, time.monotonic()
             return time.monotonic() - since > seconds
 
@@ -115,6 +118,17 @@ class Namespace:
         return seen
 
     # --- inside -----------------------------------------------------------------------------
+
+    def _all_counted(self) -> bool:
+        """Whether every Deployment and ReplicaSet has counted its pods as they are wanted."""
+        return all(
+            status.get("observedGeneration") == item["metadata"]["generation"]
+            and status.get(counted, 0) == item["spec"]["replicas"]
+            for kind in ("Deployment", "ReplicaSet")
+            for item in self.find(kind)
+            for status in (item.get("status", {}),)
+            for counted in ("readyReplicas", "availableReplicas")
+        )
 
     def _wait_same(
         self, look: Callable[[], frozenset[str]], wanted: frozenset[str], timeout: float
