@@ -9,16 +9,21 @@ from __future__ import annotations
 
 import logging
 import time
+import uuid
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 
 from generator.demand.claim import Claim
+from generator.demand.request import DemandRequest, Operation
 from generator.ledger.ledger import Ledger
+from generator.service.ticket import Ticket
 
 log = logging.getLogger("demandops")
 
 _STEP = timedelta(seconds=30)
 _SHORTEST_S = 1.0
+LONGEST_WAIT_S = 60.0
+"""Between two looks at the leases: a clock may be set meanwhile."""
 
 
 def _wall() -> datetime:
@@ -72,3 +77,36 @@ class LeaseClock:
             return True
         term = timedelta(seconds=claim.lease.seconds + claim.lease.slack)
         return now > self._stepped + term
+
+
+class Expiries:
+    """Hands in the releases of what ran out; nobody waits for their receipts."""
+
+    def __init__(self) -> None:
+        self._clock = LeaseClock()
+        self._tried: dict[str, datetime] = {}
+
+    def pause(self, ledger: Ledger, longest: float) -> float:
+        """Return the seconds until the next look is due."""
+        return self._clock.pause(ledger, longest)
+
+    def tickets(self, ledger: Ledger) -> list[Ticket]:
+        """Return a ticket for each demand whose lease ran out.
+
+        One that cannot be released (its files do not render) is tried again after a while.
+        """
+        now, claims = self._clock.ended(ledger)
+        since = now - timedelta(seconds=LONGEST_WAIT_S)
+        over = dict.fromkeys(claim.demand for claim in claims)
+        tried = self._tried  # what is over no more was released or renewed
+        self._tried = {d: when for d, when in tried.items() if when > since and d in over}
+        demands = [demand for demand in over if demand not in self._tried]
+        self._tried |= dict.fromkeys(demands, now)
+        requests = [
+            DemandRequest(id=demand, operation=Operation.EXPIRE, demand=demand)
+            for demand in demands
+        ]
+        return [
+            Ticket(str(uuid.uuid4()), request, now, lambda stage, text: None)
+            for request in requests
+        ]

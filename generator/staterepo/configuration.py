@@ -1,4 +1,4 @@
-"""The configuration in force where people's is not valid: file by file, as it last was.
+"""People's configuration at a commit, and what of it is in force where it is not valid.
 
 A broken file holds back itself and what came with it: the other files of the commits that touched
 it, for half of a commit is not what anybody merged, and the rest of its application definition. All
@@ -13,9 +13,18 @@ from dataclasses import dataclass, field
 from pygit2 import Blob, Commit, Oid, Repository, Tree
 from pygit2.enums import SortMode
 
+from generator import yamlio
 from generator.catalog.catalog import CONFIG_ROOTS, Catalog
-from generator.errors import Fault, InvalidInput
+from generator.catalog.loading import load as load_catalog
+from generator.catalog.repository import ROOT_FILE
+from generator.errors import Fault, InvalidInput, StateRepoError
+from generator.ledger import markers
+from generator.settings import RENDER_VERSION
 from generator.staterepo import tree as trees
+
+NO_STATE_REPO = (
+    "this is no state repo, for it has no demandops.yaml; `demandops init DIR` makes one"
+)
 
 StandIns = Mapping[str, Oid | None]
 """Path → the blob that is in force in its place; nothing where no such file is."""
@@ -49,6 +58,69 @@ class Found:
     catalog: Catalog | None
     source: Source
     faults: tuple[Fault, ...]
+
+
+def catalog_at(tree: Tree) -> Catalog:
+    """Return the catalog of one tree.
+
+    Raises:
+        StateRepoError: where it is no state repo.
+        InvalidInput: with every fault of every file.
+    """
+    files = trees.texts(tree, CONFIG_ROOTS)
+    if ROOT_FILE not in files:
+        raise StateRepoError(NO_STATE_REPO)
+    return load_catalog(files).with_ended(markers.read(markers_at(tree)))
+
+
+def markers_at(tree: Tree) -> dict[str, str]:
+    """Return path → text of the files that say which overrides ended."""
+    return trees.texts(tree, (markers.MARKERS_ROOT,))
+
+
+def refuse_other_rendering(tree: Tree) -> None:
+    """Raise where a generator of another version writes the repo: two would undo each other's work.
+
+    Raises:
+        StateRepoError: saying which version it is and what to do.
+    """
+    try:
+        data = yamlio.load(trees.read_text(tree, ROOT_FILE) or "")
+    except InvalidInput:
+        return
+    version = data.get("renderVersion") if isinstance(data, dict) else None
+    if not isinstance(version, int) or version == RENDER_VERSION:
+        return
+    remedy = "update the generator"
+    if version < RENDER_VERSION:
+        remedy = "stop older generators, then have all rendered anew by `demandops upgrade`"
+    raise StateRepoError(
+        f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
+        f"{RENDER_VERSION}; {remedy}"
+    )
+
+
+def last_valid_catalog(commit: Commit, fault: InvalidInput) -> Catalog:
+    """Return the catalog of the newest commit before one that is not valid, and was.
+
+    Raises:
+        InvalidInput: ``fault``, where there never was one.
+    """
+    seen = {_config_ids(commit.tree)}
+    while commit.parents:
+        commit = commit.parents[0]
+        if _config_ids(commit.tree) in seen:
+            continue
+        seen.add(_config_ids(commit.tree))
+        try:
+            return catalog_at(commit.tree)
+        except (InvalidInput, StateRepoError):
+            continue
+    raise fault
+
+
+def _config_ids(tree: Tree) -> tuple[str, ...]:
+    return tuple(str(trees.id_of(tree, root)) for root in CONFIG_ROOTS)
 
 
 def found(

@@ -16,7 +16,7 @@ from generator.catalog.loading import load as load_catalog
 from generator.decision import State
 from generator.errors import Fault
 from generator.ledger import markers
-from generator.staterepo import holding
+from generator.staterepo import configuration, holding
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo.configuration import Source
 from generator.staterepo.history import LogEntry
@@ -55,7 +55,7 @@ def at(repo: Repository, commit: Commit, told: LogEntry) -> Snapshot:
     source = _source(told)
     advance = snapshots.advance(repo, sound, commit.id)
     catalog = load_catalog(source.texts(repo))
-    catalog = catalog.with_ended(markers.read(snapshots.markers_at(commit.tree)))
+    catalog = catalog.with_ended(markers.read(configuration.markers_at(commit.tree)))
     state = State.of(catalog, advance.snapshot.state.ledger)
     snapshot, _, _ = holding.held_back(
         repo,

@@ -16,6 +16,7 @@ from generator.errors import Fault, InvalidInput, StateRepoError
 from generator.ledger.restore import Restoration
 from generator.render.changeset import Read
 from generator.staterepo import (
+    configuration,
     history,
     in_force,
     moments,
@@ -76,7 +77,7 @@ class Reader:
             StateRepoError: saying which version it is and what to do.
         """
         tip = snapshots.commit_of(self._repository.objects, self._tip)
-        snapshots.refuse_other_rendering(tip.tree)
+        configuration.refuse_other_rendering(tip.tree)
 
     def commit(self, revision: str | None = None) -> str:
         """Return the id of a commit, by a revision or a time; the newest where none is given.
@@ -153,7 +154,9 @@ class Reader:
         Raises:
             InvalidInput, StateRepoError: where it holds no valid one.
         """
-        return snapshots.catalog_at(snapshots.commit_of(self._repository.objects, self._tip).tree)
+        return configuration.catalog_at(
+            snapshots.commit_of(self._repository.objects, self._tip).tree
+        )
 
     def proposals(self) -> list[Waiting]:
         """Return the demands that await approval, by branch.

@@ -14,7 +14,6 @@ from pygit2 import Commit, Oid, Repository, Tree
 from pygit2.enums import SortMode
 from rpds import HashTrieMap
 
-from generator import yamlio
 from generator.catalog.catalog import CONFIG_ROOTS, Catalog
 from generator.catalog.loading import load as load_catalog
 from generator.catalog.repository import ROOT_FILE
@@ -24,16 +23,12 @@ from generator.errors import Fault, InvalidInput, StateRepoError, fault
 from generator.ledger import format as ledger_format
 from generator.ledger import markers
 from generator.ledger.ledger import Ledger
-from generator.settings import GENERATED_ROOTS, RENDER_VERSION
+from generator.settings import GENERATED_ROOTS
 from generator.staterepo import configuration, message
 from generator.staterepo import tree as trees
 from generator.staterepo.configuration import Source
 
 Progress = Callable[[int, int], None]
-
-_NO_STATE_REPO = (
-    "this is no state repo, for it has no demandops.yaml; `demandops init DIR` makes one"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +112,7 @@ def load(
         StateRepoError: where the commit holds no state repo.
     """
     commit = commit_of(repo, revision)
-    catalog = catalog_at(commit.tree)
+    catalog = configuration.catalog_at(commit.tree)
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
     if faults:
         raise InvalidInput(faults)
@@ -135,11 +130,11 @@ def load_last_valid(
     commit = commit_of(repo, revision)
     problems: list[Fault] = []
     try:
-        catalog = catalog_at(commit.tree)
+        catalog = configuration.catalog_at(commit.tree)
     except InvalidInput as error:
         problems += error.faults
-        catalog = _last_valid_catalog(repo, commit, error)
-        catalog = catalog.with_ended(markers.read(markers_at(commit.tree)))
+        catalog = configuration.last_valid_catalog(commit, error)
+        catalog = catalog.with_ended(markers.read(configuration.markers_at(commit.tree)))
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
     for path in dict.fromkeys(found.file for found in faults):
         claim = _last_valid_claim(commit, path)
@@ -149,46 +144,6 @@ def load_last_valid(
     sound = None if problems else commit.id
     held = tuple(dict.fromkeys(found.file for found in faults))
     return Snapshot(commit.id, State.of(catalog, ledger), keys, tuple(problems), sound, held)
-
-
-def refuse_other_rendering(tree: Tree) -> None:
-    """Raise where a generator of another version writes the repo: two would undo each other's work.
-
-    Raises:
-        StateRepoError: saying which version it is and what to do.
-    """
-    try:
-        data = yamlio.load(trees.read_text(tree, ROOT_FILE) or "")
-    except InvalidInput:
-        return
-    version = data.get("renderVersion") if isinstance(data, dict) else None
-    if not isinstance(version, int) or version == RENDER_VERSION:
-        return
-    remedy = "update the generator"
-    if version < RENDER_VERSION:
-        remedy = "stop older generators, then have all rendered anew by `demandops upgrade`"
-    raise StateRepoError(
-        f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
-        f"{RENDER_VERSION}; {remedy}"
-    )
-
-
-def _last_valid_catalog(repo: Repository, commit: Commit, fault: InvalidInput) -> Catalog:
-    seen = {_config_ids(commit.tree)}
-    while commit.parents:
-        commit = commit.parents[0]
-        if _config_ids(commit.tree) in seen:
-            continue
-        seen.add(_config_ids(commit.tree))
-        try:
-            return catalog_at(commit.tree)
-        except (InvalidInput, StateRepoError):
-            continue
-    raise fault
-
-
-def _config_ids(tree: Tree) -> tuple[str, ...]:
-    return tuple(str(_id(tree, root)) for root in CONFIG_ROOTS)
 
 
 def _last_valid_claim(commit: Commit, path: str) -> Claim | None:
@@ -211,28 +166,9 @@ def _edited_by_hand(repo: Repository, before: Oid, to: Oid) -> bool:
     for commit in walker:
         if message.is_generators(commit.message) or not commit.parents:
             continue
-        old, new = commit.parents[0].tree, commit.tree
-        if any(_id(old, root) != _id(new, root) for root in GENERATED_ROOTS):
+        if _differ(commit.parents[0].tree, commit.tree, GENERATED_ROOTS):
             return True
     return False
-
-
-def catalog_at(tree: Tree) -> Catalog:
-    """Return the catalog of one tree.
-
-    Raises:
-        StateRepoError: where it is no state repo.
-        InvalidInput: with every fault of every file.
-    """
-    files = trees.texts(tree, CONFIG_ROOTS)
-    if "demandops.yaml" not in files:
-        raise StateRepoError(_NO_STATE_REPO)
-    return load_catalog(files).with_ended(markers.read(markers_at(tree)))
-
-
-def markers_at(tree: Tree) -> dict[str, str]:
-    """Return path → text of the files that say which overrides ended."""
-    return trees.texts(tree, (markers.MARKERS_ROOT,))
 
 
 def _ledger_at(
@@ -271,11 +207,14 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     What is not valid there is left as it was before, and told in the new snapshot's problems.
     """
     before, after = commit_of(repo, snapshot.commit).tree, commit_of(repo, to).tree
-    refuse_other_rendering(after)
+    configuration.refuse_other_rendering(after)
     state, problems = snapshot.state, list[Fault]()
     catalog_changed = _edited_by_hand(repo, snapshot.commit, to)
     source = snapshot.source
-    if any(_id(before, root) != _id(after, root) for root in CONFIG_ROOTS) or snapshot.problems:
+    if (
+        any(trees.id_of(before, root) != trees.id_of(after, root) for root in CONFIG_ROOTS)
+        or snapshot.problems
+    ):
         now = configuration.found(
             repo, (snapshot.configuration, snapshot.sound), to, lambda files: _tried(files, state)
         )
@@ -285,7 +224,7 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             catalog = now.catalog.with_ended(state.catalog.ended)
             catalog_changed = catalog_changed or catalog != state.catalog
             state = State(catalog, State.of(catalog, state.ledger).engine, state.ledger)
-    ended = markers.read(markers_at(after))
+    ended = markers.read(configuration.markers_at(after))
     if ended != state.catalog.ended:
         state = replace(state, catalog=state.catalog.with_ended(ended))
         catalog_changed = True
@@ -322,10 +261,14 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     )
 
 
+def _differ(one: Tree, other: Tree, roots: Iterable[str]) -> bool:
+    return any(trees.id_of(one, root) != trees.id_of(other, root) for root in roots)
+
+
 def _tried(files: Mapping[str, str], state: State) -> Catalog:
     """Return the catalog of a commit, tried on invented demands where it is another than before."""
     if ROOT_FILE not in files:
-        raise InvalidInput([fault("", _NO_STATE_REPO).within(ROOT_FILE)])
+        raise InvalidInput([fault("", configuration.NO_STATE_REPO).within(ROOT_FILE)])
     catalog = load_catalog(files)
     if catalog.with_ended(state.catalog.ended) != state.catalog:
         rehearse(State.of(catalog, Ledger()))
@@ -335,8 +278,3 @@ def _tried(files: Mapping[str, str], state: State) -> Catalog:
 def _subtree(tree: Tree, name: str) -> Tree | None:
     entry = trees.child(tree, name)
     return entry if isinstance(entry, Tree) else None
-
-
-def _id(tree: Tree, name: str) -> Oid | None:
-    entry = trees.child(tree, name)
-    return entry.id if entry is not None else None

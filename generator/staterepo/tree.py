@@ -28,6 +28,12 @@ def blob(tree: Tree, path: str) -> Oid | None:
     return entry.id if isinstance(entry, pygit2.Blob) else None
 
 
+def id_of(tree: Tree, name: str) -> Oid | None:
+    """Return the id of an entry of a tree, a file or a folder, or nothing."""
+    entry = child(tree, name)
+    return entry.id if entry is not None else None
+
+
 def child(tree: Tree, name: str) -> pygit2.Object | None:
     """Return the entry ``name`` of a tree, or nothing."""
     try:

@@ -29,7 +29,7 @@ from generator.plan.release import ServiceRelease
 from generator.render.consequence import releases_of
 from generator.render.handover import Handover, handover
 from generator.settings import RENDER_VERSION
-from generator.staterepo import history, message, reader
+from generator.staterepo import configuration, history, message, reader
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
@@ -129,7 +129,7 @@ def _planned(
     files = trees.texts(tree, CONFIG_ROOTS)
     before = files[ROOT_FILE]
     files[ROOT_FILE] = _root(before, old, wish)
-    marked = snapshots.markers_at(tree)
+    marked = configuration.markers_at(tree)
     catalog = load(files).with_ended(markers.read(marked))
     state = State.of(catalog, snapshot.state.ledger)
     taken = _taken_in(repository, snapshot, state, marked, now)

@@ -28,7 +28,16 @@ from generator.plan import keeping
 from generator.plan.following import TakenIn, differing, ended, files_of, taken_in
 from generator.render.changeset import Change, Changeset, ReleaseChange
 from generator.settings import GENERATED_ROOTS
-from generator.staterepo import history, holding, in_force, message, people, reports, signing
+from generator.staterepo import (
+    configuration,
+    history,
+    holding,
+    in_force,
+    message,
+    people,
+    reports,
+    signing,
+)
 from generator.staterepo import snapshot as snapshots
 from generator.staterepo import tree as trees
 from generator.staterepo.repository import StateRepository
@@ -166,7 +175,7 @@ class Line:
         self, state: State, before: Snapshot, subjects: Iterable[Subject], now: datetime
     ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
         """Render everything for a configuration that changed."""
-        marked = snapshots.markers_at(self._tree)
+        marked = configuration.markers_at(self._tree)
         taken = taken_in(_books(before.state), _books(state), subjects, marked, now)
         state = _with(state, taken)
         return state, self.everything(state, taken.files), taken.keys
@@ -309,7 +318,7 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
         StateRepoError: where this is no state repo.
     """
     tip = repository.tip()
-    snapshots.refuse_other_rendering(snapshots.commit_of(repository.objects, tip).tree)
+    configuration.refuse_other_rendering(snapshots.commit_of(repository.objects, tip).tree)
     base = history.last_generated(repository.objects, tip)
     base = base or tip
     made = snapshots.commit_of(repository.objects, base)

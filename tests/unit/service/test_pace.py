@@ -1,0 +1,42 @@
+"""Waits between tries: bounded, begun anew, and lines no longer than can be pushed in time."""
+
+from __future__ import annotations
+
+from generator.service.pace import FIRST_PAUSE_S, LONGEST_AWAY_S, LONGEST_TURN_S, Pace
+
+
+def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
+    pace = Pace(200)
+    away = [pace.away() for _ in range(20)]
+    assert max(away) <= LONGEST_AWAY_S
+    assert min(away[-5:]) >= LONGEST_AWAY_S / 2
+    turns = [pace.overtaken(10, 0.1, 1.0) for _ in range(20)]
+    assert max(turns) <= LONGEST_TURN_S
+    assert min(turns[-5:]) >= LONGEST_TURN_S / 2
+
+
+def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew() -> None:
+    pace = Pace(200)
+    for _ in range(10):
+        pace.away()
+    pace.overtaken(10, 0.1, 1.0)
+    assert pace.away() <= FIRST_PAUSE_S
+    for _ in range(10):
+        pace.overtaken(10, 0.1, 1.0)
+    pace.published()
+    assert pace.overtaken(10, 0.1, 1.0) <= FIRST_PAUSE_S
+
+
+def test_a_line_is_as_long_as_can_be_judged_while_it_is_pushed() -> None:
+    pace = Pace(200)
+    assert pace.share == 200
+    pace.overtaken(100, judging_s=0.1, pushing_s=0.2)
+    assert pace.share == 100
+    pace.overtaken(100, judging_s=1.0, pushing_s=0.2)
+    assert pace.share == 20
+    pace.overtaken(2, judging_s=100.0, pushing_s=0.2)
+    assert pace.share == 1
+    pace.overtaken(1, judging_s=0.0, pushing_s=0.2)
+    assert pace.share == 1
+    pace.published()
+    assert pace.share == 200
