@@ -211,10 +211,7 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     state, problems = snapshot.state, list[Fault]()
     catalog_changed = _edited_by_hand(repo, snapshot.commit, to)
     source = snapshot.source
-    if (
-        any(trees.id_of(before, root) != trees.id_of(after, root) for root in CONFIG_ROOTS)
-        or snapshot.problems
-    ):
+    if snapshot.problems or _differ(before, after, CONFIG_ROOTS):
         now = configuration.found(
             repo, (snapshot.configuration, snapshot.sound), to, lambda files: _tried(files, state)
         )
