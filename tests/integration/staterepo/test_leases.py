@@ -214,7 +214,7 @@ def test_an_idle_generator_releases_what_another_process_booked(
     bare: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As ``demandops request`` beside ``demandops serve``."""
-    monkeypatch.setattr(settling, "_LONGEST_WAIT_S", 0.2)  # between two looks; a minute else
+    monkeypatch.setattr(settling, "LONGEST_WAIT_S", 0.2)  # between two looks; a minute else
     with rig.running(bare) as idle:
         with rig.running(bare) as other:
             rig.book(other, put("d", 1))
