@@ -1,9 +1,9 @@
 """Decommissioning: what remains of the claims when a node or a requester leaves for good.
 
 With a node goes what cannot be without it: the applications at it, the inputs that come from it,
-the connections that end at it; in whosever name. With a requester goes its name only: a claim
-stands in the name of all its requesters, so it keeps standing in those of the others, and goes
-where there are none.
+the connections that end at it; in whosever name. With a requester go the claims in its name, as by
+a shutdown: a claim stands in the name of all its requesters together, and what is left in those of
+the others alone nobody would ever give up.
 """
 
 from __future__ import annotations
@@ -55,13 +55,9 @@ def needs(claim: Claim, node: str) -> bool:
 
 
 def _left_of(claim: Claim, leaving: Leaving, now: datetime) -> Claim | None:
-    left: Claim | None = claim
-    if "node" in leaving.kinds and needs(claim, leaving.name):
-        left = _without_node(claim, leaving.name, now)
-    if left is None or "requester" not in leaving.kinds or leaving.name not in left.requesters:
-        return left
-    others = tuple(who for who in left.requesters if who != leaving.name)
-    return replace(left, requesters=others) if others else None
+    if "requester" in leaving.kinds and leaving.name in claim.requesters:
+        return None
+    return _without_node(claim, leaving.name, now) if needs(claim, leaving.name) else claim
 
 
 def _without_node(claim: Claim, node: str, now: datetime) -> Claim | None:

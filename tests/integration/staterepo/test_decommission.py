@@ -122,7 +122,7 @@ def test_where_no_other_broker_would_do_it_is_refused_whole(bare: Path, demandop
     assert rig.tip(bare) == tip
 
 
-def test_a_requester_is_taken_out_and_what_only_it_held_goes(
+def test_with_a_requester_goes_all_that_is_claimed_in_its_name(
     bare: Path, demandops: Command
 ) -> None:
     alone = goal(2)
@@ -137,8 +137,8 @@ def test_a_requester_is_taken_out_and_what_only_it_held_goes(
     assert (code, told["name"], told["outcome"]) == (0, "user1", "released")
     assert told["commit"] == rig.tip(bare)
     assert {(c["kind"], c["id"]): c["left"] for c in told["claims"]} == {
-        ("application", "edge/fusion-1"): ["station00"],
-        ("connection", "vehicle01/edge"): ["station00"],
+        ("application", "edge/fusion-1"): None,
+        ("connection", "vehicle01/edge"): None,
         ("application", "edge/fusion-2"): None,
         ("connection", "vehicle02/edge"): None,
     }
@@ -147,23 +147,26 @@ def test_a_requester_is_taken_out_and_what_only_it_held_goes(
     assert ("Requester", "user1") in commit.trailers
     assert rig.git(bare, "rev-parse", "main:clusters") != before
     with rig.running(bare) as generator:
-        assert of(generator, "edge/fusion-1") == ["station00"]
+        assert of(generator, "edge/fusion-1") == []
         assert of(generator, "edge/fusion-2") == []
-        rig.book(generator, goal(1))  # it is back: the same demand stands in both names again
-        assert "station00 user1" in of(generator, "edge/fusion-1")
+        rig.book(generator, goal(1))  # it is back
+        assert of(generator, "edge/fusion-1") == ["station00 user1"]
         rig.book(generator, leave(1))
     rig.assert_sound(bare)
 
 
 def test_as_a_requester_only_a_node_keeps_what_is_at_it(bare: Path, demandops: Command) -> None:
+    others = goal(2)
+    for subject in (others["apps"][0]["object_detection_fusion_app"], others["connections"][0]):
+        subject["requester_ids"] = ["user2"]
     with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
+        rig.book(generator, goal(1), others)
     assert demandops("decommission", "station00", "--requester", "--state-repo", bare)[0] == 0
     with rig.running(bare) as generator:
-        assert of(generator, "edge/fusion-1") == ["user1"]
+        assert of(generator, "edge/fusion-1") == []
         topics = [
             topic.topic
-            for claim in generator.snapshot.state.ledger.application("edge/fusion-1")
+            for claim in generator.snapshot.state.ledger.application("edge/fusion-2")
             for _, topic in claim.all_inputs()
         ]
     assert "/stations/station00/pointcloud" in topics
