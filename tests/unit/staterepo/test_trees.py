@@ -93,7 +93,7 @@ def lay(repo: pygit2.Repository, files: Files) -> pygit2.Tree:
     return tree
 
 
-RELAXED = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+RELAXED = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @given(data=st.data())
