@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
-from generator import decision
-from generator.decision import State
-from generator.render.changeset import Changeset, Read
+from demandops import decision
+from demandops.decision import State
+from demandops.render.changes.changeset import Changeset, Read
 
 
 def document(demand: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,9 +14,8 @@ import rclpy
 import yaml
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
+from demandops_ros.messages import from_data
 from rclpy.action import ActionClient
-
-from ros_bridge.convert import from_data
 
 _WAIT_S = 20.0
 _STATUS = {GoalStatus.STATUS_SUCCEEDED: "succeeded", GoalStatus.STATUS_CANCELED: "cancelled"}

@@ -33,7 +33,7 @@ out = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 
 def demandops(*args: str) -> str:
     """Run the command line and return what it prints."""
-    command = [sys.executable, "-m", "generator.cli.main", *args]
+    command = [sys.executable, "-m", "demandops.cli.main", *args]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
@@ -121,7 +121,7 @@ def main() -> int:
     os.environ["ROS_LOG_DIR"] = str(BUILD / "ros-log")
     out.print(demandops("init", str(STATE_REPO), "--bare").splitlines()[0])
     log = BUILD / "node.log"
-    command = [sys.executable, "-m", "generator.cli.main", "serve", "--state-repo", str(STATE_REPO)]
+    command = [sys.executable, "-m", "demandops.cli.main", "serve", "--state-repo", str(STATE_REPO)]
     with log.open("w") as sink:
         node = subprocess.Popen(command, stdout=sink, stderr=subprocess.STDOUT)
         try:

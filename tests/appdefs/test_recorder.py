@@ -27,16 +27,16 @@ from asking import (
     goal,
     skeleton,
 )
-
-from generator.cli.main import run
-from generator.demand.request import ApplicationDemand, DemandRequest, InputTopic, Operation
-from generator.errors import Refused
-from generator.ledger import ledger as booking
-from generator.ledger.ledger import Ledger
-from generator.plan.planner import all_keys, plan
-from generator.plan.release import ServiceRelease
-from generator.staterepo import layout
-from generator.staterepo import tree as trees
+from demandops.cli.main import run
+from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
+from demandops.errors import Refused
+from demandops.ledger import apply as booking
+from demandops.ledger.apply import Ledger
+from demandops.plan.planner import plan
+from demandops.plan.release import ServiceRelease
+from demandops.plan.release_keys import all_keys
+from demandops.staterepo import new_repo
+from demandops.staterepo.git import tree as trees
 
 HERE = Path(__file__).parent
 RECORDER, MONITOR = 2, 3
@@ -81,7 +81,7 @@ def monitor(id: str = "cloud/monitor", **more: Any) -> dict[str, Any]:
 
 def test_it_is_demanded_with_yaml_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     state = tmp_path / "state.git"
-    layout.init(state, NOW, bare=True, gitops="flux")
+    new_repo.init(state, NOW, bare=True, gitops="flux")
     repo = pygit2.Repository(str(state))
     tip = repo[repo.references["refs/heads/main"].target]
     who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
@@ -305,8 +305,8 @@ class TestParameters:
 
     @staticmethod
     def planned(books: Books, ledger: Ledger, service: str = "recorder") -> dict[str, object]:
-        for key in all_keys(ledger, books.catalog):
-            release = plan(ledger, books.catalog, key)
+        for key in all_keys(ledger, books.config):
+            release = plan(ledger, books.config, key)
             if isinstance(release, ServiceRelease) and key.service == service:  # type: ignore[union-attr]
                 return dict(release.parameters)
         raise AssertionError(f"no {service} is planned")
@@ -396,9 +396,9 @@ class TestParameters:
 
     def test_parameters_are_in_the_values(self, books: Books) -> None:
         ledger = self.book(Ledger(), "a", rate=7, title="{{ x }}\n: 'y'", labels=["yes", "1e3"])
-        from generator.decision import State, rendered
+        from demandops.decision import State, rendered
 
-        files = rendered(State(books.catalog, books.state.engine, ledger))
+        files = rendered(State(books.config, books.state.engine, ledger))
         (text,) = (text for path, text in files.items() if "/rec-" in path)
         values = yaml.safe_load(text)["spec"]["values"]
         assert values["rate"] == 7

@@ -15,9 +15,9 @@ from functools import partial
 from pathlib import Path
 
 import pygit2
+from demandops.service import Generator
+from demandops.staterepo import reader
 
-from generator.service import Generator
-from generator.staterepo import reader
 from tests.benchmarks import fleet
 
 RELEASES = 1_000

@@ -21,13 +21,13 @@ from pathlib import Path
 
 import git
 import pygit2
+from demandops.service import Generator
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history import commit_message
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from generator.service import Generator
-from generator.staterepo import message
-from generator.staterepo import tree as trees
 from tests.benchmarks import fleet
 
 SIZES = (100, 10_000)
@@ -55,7 +55,7 @@ class Floor:
         """Write blobs, trees, commit and branch; return the seconds."""
         start = time.perf_counter()
         tree = trees.write(self._repo, self._repo[base.id].peel(pygit2.Commit).tree, files)
-        who = message.generator_signature(datetime.now(timezone.utc))
+        who = commit_message.generator_signature(datetime.now(timezone.utc))
         made = self._repo.create_commit(None, who, who, text, tree, [base.id])
         self._repo.references.create("refs/bench/floor", made, force=True)
         return time.perf_counter() - start

@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import pygit2
-
-from generator import yamlio
-from generator.catalog.catalog import CONFIG_ROOTS
-from generator.catalog.loading import load
-from generator.decision import State, admit, rendered
-from generator.ledger import format as ledger_format
-from generator.ledger.ledger import Ledger, apply
-from generator.settings import GENERATED_ROOTS
-from generator.staterepo import layout, message
-from generator.staterepo import tree as trees
+from demandops import strict_yaml
+from demandops.config.config import CONFIG_ROOTS
+from demandops.config.load import load
+from demandops.decision import State, admit, rendered
+from demandops.ledger import claim_file as ledger_format
+from demandops.ledger.apply import Ledger, apply
+from demandops.settings import GENERATED_ROOTS
+from demandops.staterepo import new_repo
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history import commit_message
 
 VEHICLES_PER_EDGE = 10
 RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
@@ -85,7 +85,7 @@ def _nodes(edges: int, edges_per_cluster: int) -> str:
         nodes.append({"id": edge, "type": "edge", "cluster": region})
         names = [f"v{number:05d}x{i}" for i in range(VEHICLES_PER_EDGE)] + [f"{SPARE}{number:05d}"]
         nodes += [{"id": name, "type": "vehicle", "cluster": region} for name in names]
-    return yamlio.dump({"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": nodes})
+    return strict_yaml.dump({"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": nodes})
 
 
 def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
@@ -93,38 +93,38 @@ def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
     edges = max(1, round(releases / RELEASES_PER_EDGE))
     files = {
         path: text
-        for path, text in layout.files().items()
+        for path, text in new_repo.files().items()
         if path.split("/")[0] not in GENERATED_ROOTS  # they are of the skeleton's one cluster
     }
     files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster)
     regions = sorted({_region(number, edges_per_cluster) for number in range(edges)})
-    files["inventory/clusters.yaml"] = yamlio.dump(
+    files["inventory/clusters.yaml"] = strict_yaml.dump(
         {
             "apiVersion": "demandops/v1",
             "kind": "Clusters",
             "clusters": [{"name": region} for region in regions],
         }
     )
-    files["inventory/brokers.yaml"] = yamlio.dump(
+    files["inventory/brokers.yaml"] = strict_yaml.dump(
         {
             "apiVersion": "demandops/v1",
             "kind": "Brokers",
             "brokers": [{"node": "cloud", "host": "broker", "port": 1883}],
         }
     )
-    catalog = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
-    state, now = State.of(catalog, Ledger()), datetime.now(timezone.utc)
+    config = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
+    state, now = State.of(config, Ledger()), datetime.now(timezone.utc)
     ledger = Ledger()
     for number in range(edges):
         for place in range(VEHICLES_PER_EDGE):
             request = admit(state, goal(edge_id(number), f"v{number:05d}x{place}"))
             ledger, _ = apply(ledger, request, now)
     files |= {ledger_format.path_of(claim.key): ledger_format.write(claim) for claim in ledger}
-    files |= rendered(State(catalog, state.engine, ledger))
+    files |= rendered(State(config, state.engine, ledger))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
     tree = trees.write(repo, None, files)
-    who = message.generator_signature(now)
+    who = commit_message.generator_signature(now)
     text = "A fleet\n\nOperation: init\nRender-Version: 1\n"
     repo.create_commit("refs/heads/main", who, who, text, tree, [])
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)

@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
 
-from generator import yamlio
-from generator.catalog.catalog import CONFIG_ROOTS
-from generator.catalog.loading import load
-from generator.decision import State, decide, rendered
-from generator.ledger.ledger import Ledger
-from generator.staterepo import layout
+from demandops import strict_yaml
+from demandops.config.config import CONFIG_ROOTS
+from demandops.config.load import load
+from demandops.decision import State, decide, rendered
+from demandops.ledger.apply import Ledger
+from demandops.staterepo import new_repo
 
 HERE = Path(__file__).parent
 EXPERIMENT = HERE.parent.parent / "examples" / "experiment"
@@ -43,12 +43,12 @@ def requests_of(case: str) -> list[Path]:
 
 def start(case: str) -> tuple[State, dict[str, str]]:
     """Return the state before the first request, and the generated files."""
-    files = layout.files()
+    files = new_repo.files()
     overlay = HERE / case / "state-repo"
     for path in sorted(overlay.rglob("*.yaml")):
         files[path.relative_to(overlay).as_posix()] = path.read_text()
-    catalog = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
-    state = State.of(catalog, Ledger())
+    config = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
+    state = State.of(config, Ledger())
     return state, rendered(state)
 
 
@@ -56,7 +56,7 @@ def play(case: str) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield (request name, all generated files) after each request."""
     state, world = start(case)
     for file in requests_of(case):
-        decision = decide(state, yamlio.load(file.read_text()), NOW, world.get)
+        decision = decide(state, strict_yaml.load(file.read_text()), NOW, world.get)
         state = decision.state
         for path, text in decision.files.items():
             if text is None:

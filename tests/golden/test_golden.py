@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 
 import pytest
+from demandops.decision import rendered
 
-from generator.decision import rendered
 from tests.golden.cases import CASES, EXPERIMENT, HERE, play, requests_of, start
 
 sys.path.insert(0, str(EXPERIMENT))

@@ -51,7 +51,7 @@ def demandops(
     data_home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Run:
     """Return a function that runs a command in this process, as ``demandops`` would."""
-    from generator.cli.main import run
+    from demandops.cli.main import run
 
     def call(*args: str | Path, stdin: str = "") -> Ran:
         capsys.readouterr()
@@ -68,11 +68,10 @@ def demandops(
 def laid_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bare state repo as ``demandops init`` makes it; copy it, never write to it."""
     from asking import NOW
-
-    from generator.staterepo import layout
+    from demandops.staterepo import new_repo
 
     folder = tmp_path_factory.mktemp("laid-down") / "state.git"
-    layout.init(folder, NOW, bare=True, gitops="flux")
+    new_repo.init(folder, NOW, bare=True, gitops="flux")
     return folder
 
 
@@ -115,7 +114,7 @@ class StateRepo:
 
     def commit(self, changed: dict[str, str | None], text: str = "By hand\n") -> str:
         """Commit as a person would, and return the commit."""
-        from generator.staterepo import tree as trees
+        from demandops.staterepo.git import tree as trees
 
         repo = pygit2.Repository(str(self.path))
         tree = trees.write(repo, repo[self.tip].peel(pygit2.Tree), changed)

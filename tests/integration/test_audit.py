@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 from asking import APP, application, connection, goal, perception
-
-from generator.cli.main import run as run_command
-from generator.ledger.format import read
+from demandops.cli.main import run as run_command
+from demandops.ledger.claim_file import read
 
 Run = Callable[..., Any]
 

@@ -707,7 +707,7 @@ class TestYamlAttacks:
         file = tmp_path / "request.yaml"
         opening = bracket[0] if bracket == "[]" else "{a: "
         file.write_text("apps: " + opening * 40_000 + bracket[1] * 40_000)
-        command = [sys.executable, "-m", "generator.cli.main", "request", str(file)]
+        command = [sys.executable, "-m", "demandops.cli.main", "request", str(file)]
         ran = subprocess.run(
             [*command, "--state-repo", str(state.path)],
             capture_output=True, text=True, timeout=60, check=False,
@@ -757,7 +757,7 @@ class TestYamlAttacks:
         assert ran.err == f"error: {tmp_path}: cannot be read: Is a directory\n"
 
     def test_binary_on_standard_input_is_told(self, state: Any, data_home: Path) -> None:
-        command = [sys.executable, "-m", "generator.cli.main", "request", "-"]
+        command = [sys.executable, "-m", "demandops.cli.main", "request", "-"]
         ran = subprocess.run(
             [*command, "--state-repo", str(state.path)],
             input=bytes(range(256)), capture_output=True, check=False,

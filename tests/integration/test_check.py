@@ -9,8 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from generator.cli.main import run
+from demandops.cli.main import run
 
 CHART = "appdefs/object-detection-fusion/charts/object-fusion"
 

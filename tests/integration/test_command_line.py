@@ -17,9 +17,8 @@ import pygit2
 import pytest
 import yaml
 from asking import APP, CLOUD, FAST, Goal, application, connection, goal, perception
-
-from generator import __version__
-from generator.cli import views
+from demandops import __version__
+from demandops.cli.views import bookkeeping
 
 EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("*.yaml"))
 SHA = re.compile(r"[0-9a-f]{40}")
@@ -815,7 +814,7 @@ class TestUsage:
         def broken(*args: object) -> None:
             raise RuntimeError("boom")
 
-        monkeypatch.setattr(views, "derive", broken)
+        monkeypatch.setattr(bookkeeping, "derive", broken)
         ran = demandops("bookkeeping", "--state-repo", state.path)
         assert (ran.code, ran.out) == (3, "")
         assert ran.err == (
@@ -824,7 +823,7 @@ class TestUsage:
         )
 
     def test_the_process_ends_with_the_code(self, state: Any, data_home: Path) -> None:
-        command = [sys.executable, "-m", "generator.cli.main", "request", "-", "--output", "json"]
+        command = [sys.executable, "-m", "demandops.cli.main", "request", "-", "--output", "json"]
         ran = subprocess.run(
             [*command, "--state-repo", str(state.path)],
             input=text(perception(id="1"), goal(id="2")),

@@ -12,16 +12,15 @@ import jsonschema_rs
 import pytest
 import yaml
 from click.testing import CliRunner
-
-from generator.catalog.catalog import CONFIG_ROOTS
-from generator.catalog.loading import load
-from generator.cli.main import cli
-from generator.decision import State, decide, explain, rendered
-from generator.errors import Refused
-from generator.ledger.ledger import Ledger
-from generator.plan.bookkeeping import as_data, bookkeeping
-from generator.render.check import check_files
-from generator.staterepo import layout
+from demandops.cli.main import cli
+from demandops.config.config import CONFIG_ROOTS
+from demandops.config.load import load
+from demandops.decision import State, decide, explain, rendered
+from demandops.errors import Refused
+from demandops.ledger.apply import Ledger
+from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.render.output_check import check_files
+from demandops.staterepo import new_repo
 
 DOCS = Path(__file__).parents[2] / "docs"
 NOW = datetime(2026, 5, 4, 12, 0, tzinfo=timezone.utc)
@@ -41,7 +40,7 @@ def block(name: str, start: str) -> str:
 
 
 def state(**files: str) -> State:
-    found = layout.files() | files
+    found = new_repo.files() | files
     config = {path: text for path, text in found.items() if path.split("/")[0] in CONFIG_ROOTS}
     return State.of(load(config), Ledger())
 
@@ -57,7 +56,7 @@ def decided(on: State, goal: object) -> Any:
 
 def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> None:
     decision = decided(state(), demand())
-    books = as_data(bookkeeping(decision.state.ledger, decision.state.catalog), "")
+    books = as_data(bookkeeping(decision.state.ledger, decision.state.config), "")
     assert {entry["service"] for entry in books["services"].values()} == {
         "object-detection",
         "object-fusion",
@@ -110,7 +109,7 @@ def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
 
 
 def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:
-    runner, files = CliRunner(), layout.files()
+    runner, files = CliRunner(), new_repo.files()
     listed = dict(
         line.split(maxsplit=1) for line in runner.invoke(cli, ["schema"]).output.splitlines()
     )

@@ -13,10 +13,9 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-
-from generator.errors import InvalidInput
-from generator.service import webhook
-from generator.service.webhook import Webhook, read_secret
+from demandops.errors import InvalidInput
+from demandops.service import push_listener
+from demandops.service.push_listener import Webhook, read_secret
 
 SECRET = b"s3cret-of-the-hook"
 BODY = b'{"ref": "refs/heads/main"}'
@@ -148,7 +147,7 @@ def test_a_body_without_bounds_is_not_read(
 def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
     signed: Webhook, heard: Heard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(webhook, "_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(push_listener, "_TIMEOUT_S", 0.3)
     slow = [_connected(signed) for _ in range(40)]
     for raw in slow:
         raw.sendall(b"POST /push HTTP/1.1\r\nContent-Length: 100\r\n\r\nx")

@@ -18,13 +18,12 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops import __version__
+from demandops.cli.main import run
+from demandops.cli.repo.pull_request_comment import MARK
+from demandops.staterepo import new_repo
 
-from generator import __version__
-from generator.cli.main import run
-from generator.cli.markdown import MARK
-from generator.staterepo import layout
-
-GITHUB, GITLAB = layout.PIPELINES
+GITHUB, GITLAB = new_repo.PIPELINES
 ROOT = str(Path(__file__).parents[2])
 BASH = shutil.which("bash") or "bash"
 
@@ -67,7 +66,7 @@ def test_a_pipeline_is_valid_by_its_schema(laid_down: Path, path: str, options: 
     assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.parametrize("path", layout.PIPELINES, ids=["github", "gitlab"])
+@pytest.mark.parametrize("path", new_repo.PIPELINES, ids=["github", "gitlab"])
 def test_a_pipeline_installs_the_version_that_laid_it_down(laid_down: Path, path: str) -> None:
     assert re.findall(r"demandops==(\S+)", (laid_down / path).read_text()) == [__version__]
 
@@ -95,7 +94,7 @@ def environment(tmp_path: Path, **more: str) -> dict[str, str]:
 def put_demandops(at: Path) -> None:
     """Put this program where the pipeline installs it."""
     at.parent.mkdir(parents=True)
-    at.write_text(f'#!{BASH}\nexec "{sys.executable}" -m generator.cli.main "$@"\n')
+    at.write_text(f'#!{BASH}\nexec "{sys.executable}" -m demandops.cli.main "$@"\n')
     at.chmod(at.stat().st_mode | stat.S_IXUSR)
 
 

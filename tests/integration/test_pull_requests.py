@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 import yaml
-
-from generator.cli import markdown
-from generator.cli.main import run
-from generator.staterepo import checkout as checking
+from demandops.cli.main import run
+from demandops.cli.repo import pull_request_comment
+from demandops.staterepo.pull_request import merge_check as checking
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "experiment"
 GOLDEN = Path(__file__).with_name("pull-request.md")
@@ -192,7 +191,7 @@ def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, che
 def test_a_suggested_override_is_one_that_can_be_merged(
     branch: Path, found: Callable[..., dict[str, Any]]
 ) -> None:
-    override = pytest.importorskip("generator.catalog.override")
+    override = pytest.importorskip("demandops.config.override")
     edit(branch / FUSION, ("replicas: 1", "replicas: 3"), ("domainId: 0", "domainId: 7"))
     edit(branch / CLIENT, ("mqtt_client:kilted", "mqtt_client:jazzy"))
     (branch / DETECTION).unlink()
@@ -529,8 +528,8 @@ def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Che
     edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
     code, out, _ = check("--output", "markdown")
     assert code == 0
-    assert len(out) <= markdown.LONGEST == 60_000
-    assert out.startswith(f"{markdown.MARK}\n## DemandOps: valid")
+    assert len(out) <= pull_request_comment.LONGEST == 60_000
+    assert out.startswith(f"{pull_request_comment.MARK}\n## DemandOps: valid")
     assert "Releases: 3 to change." in out
     assert out.endswith(
         "\n3 parts of this report left out, for a comment has a longest length; `demandops check` "

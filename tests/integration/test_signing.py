@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 from asking import connection, goal
-
-from generator.staterepo.signing import Signer, SigningFailed
+from demandops.staterepo.git.signing import Signer, SigningFailed
 
 Run = Callable[..., Any]
 
@@ -164,7 +163,7 @@ class TestProposals:
     def test_a_key_that_is_gone_is_told_to_the_requester(
         self, state: Any, key: Path, tmp_path: Path, data_home: Path
     ) -> None:
-        from generator.service import Generator
+        from demandops.service import Generator
 
         generator = Generator(str(state.path), signing_key=key)
         try:
@@ -263,7 +262,7 @@ class TestKeysThatCannotSign:
 def test_a_key_that_is_gone_later_is_told_to_the_requester(
     state: Any, key: Path, tmp_path: Path, data_home: Path
 ) -> None:
-    from generator.service import Generator
+    from demandops.service import Generator
 
     generator = Generator(str(state.path), signing_key=key)
     try:

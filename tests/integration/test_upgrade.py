@@ -20,10 +20,10 @@ import pygit2
 import pytest
 import yaml
 from asking import perception
-
-from generator.errors import StateRepoError
-from generator.service import Generator
-from generator.staterepo import cloned, upgrade
+from demandops.errors import StateRepoError
+from demandops.service import Generator
+from demandops.staterepo import upgrade
+from demandops.staterepo.git import clone
 
 Run = Callable[..., Any]
 StateRepo = Any
@@ -58,7 +58,7 @@ def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
     for path, old, new in (
-        ("generator/settings.py", "RENDER_VERSION = 1\n", "RENDER_VERSION = 2\n"),
+        ("generator/demandops/settings.py", "RENDER_VERSION = 1\n", "RENDER_VERSION = 2\n"),
         ("templates/flux/release.yaml.j2", "timeout: 5m", "timeout: 6m"),
     ):
         text = (folder / path).read_text()
@@ -72,7 +72,7 @@ def newer(newer_program: Path, state: StateRepo, data_home: Path) -> Run:
     """Run a command of the newer program on the state repo."""
 
     def call(*args: str, stdin: str = "") -> Ran:
-        command = [sys.executable, "-m", "generator.cli.main", *args]
+        command = [sys.executable, "-m", "demandops.cli.main", *args]
         options = ["--state-repo", str(state.path)] if args[0] != "init" else []
         done = subprocess.run(
             [*command, *options],
@@ -222,7 +222,7 @@ def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(
     state: StateRepo, data_home: Path, answer: str, code: int
 ) -> None:
     before = state.tip
-    command = [sys.executable, "-m", "generator.cli.main", "upgrade", "--gitops", "argocd"]
+    command = [sys.executable, "-m", "demandops.cli.main", "upgrade", "--gitops", "argocd"]
     ours, theirs = pty.openpty()
     os.write(ours, f"{answer}\n".encode())
     done = subprocess.run(
@@ -327,14 +327,14 @@ def test_a_url_is_pushed_to_and_tried_again_when_somebody_was_first(
     demandops: Run, state: StateRepo, book: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert book().code == 0
-    push, others = cloned.ClonedRepository.publish, []
+    push, others = clone.ClonedRepository.publish, []
 
     def after_somebody_else(self: Any, expected: Any, commit: Any) -> bool:
         if not others:
             others.append(state.commit({"README.md": "Ours.\n"}))
         return push(self, expected, commit)
 
-    monkeypatch.setattr(cloned.ClonedRepository, "publish", after_somebody_else)
+    monkeypatch.setattr(clone.ClonedRepository, "publish", after_somebody_else)
     url = f"file://{state.path}"
     ran = demandops("upgrade", "--state-repo", url, "--gitops", "argocd", "--output", "json")
     assert ran.json()["commit"] == state.tip

@@ -69,7 +69,7 @@ def test_a_demand_is_rendered_from_the_installed_wheel(wheel: Path, tmp_path: Pa
     request = ROOT / "examples" / "experiment" / "1-vehicle00-joins.yaml"
 
     def demandops(*args: str) -> str:
-        command = [str(tmp_path / "env" / "bin" / "python"), "-m", "generator.cli.main", *args]
+        command = [str(tmp_path / "env" / "bin" / "python"), "-m", "demandops.cli.main", *args]
         environment = {"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
         done = subprocess.run(
             command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False

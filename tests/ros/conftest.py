@@ -18,12 +18,12 @@ import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
+from demandops_ros.messages import from_data
+from demandops_ros.node import DEEP
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from unique_identifier_msgs.msg import UUID
 
-from ros_bridge.convert import from_data
-from ros_bridge.node import DEEP
 from tests.ros_domain import reserved
 
 ACTION = "/event_detector_operator_plugin/operator_plugin/deployment_request"
@@ -55,7 +55,7 @@ class Served:
         command = [
             sys.executable,
             "-m",
-            "generator.cli.main",
+            "demandops.cli.main",
             *args,
             "--state-repo",
             self.state_repo,
@@ -78,7 +78,7 @@ Serve = Callable[..., Served]
 
 def new_state_repo(path: Path) -> Path:
     """Lay down a bare state repo."""
-    command = [sys.executable, "-m", "generator.cli.main", "init", str(path), "--bare"]
+    command = [sys.executable, "-m", "demandops.cli.main", "init", str(path), "--bare"]
     subprocess.run(command, check=True, capture_output=True)
     return path
 
@@ -99,7 +99,7 @@ def serve(tmp_path: Path, ros_domain: int) -> Iterator[Serve]:
         if state_repo is None:
             state_repo = str(new_state_repo(tmp_path / "state.git"))
         log = tmp_path / f"node-{len(started)}.log"
-        command = [sys.executable, "-m", "generator.cli.main", "serve", "--state-repo", state_repo]
+        command = [sys.executable, "-m", "demandops.cli.main", "serve", "--state-repo", state_repo]
         with log.open("w") as sink:
             process = subprocess.Popen(
                 [*command, *args], env=environment, stdout=sink, stderr=subprocess.STDOUT, text=True

@@ -15,15 +15,15 @@ import pygit2
 import pytest
 import rclpy
 import yaml
+from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
+from demandops.staterepo.git import tree as trees
 from demandops_interfaces.action import Demand
 from demandops_interfaces.msg import Bookkeeping
+from demandops_ros.client import DemandClient, DemandError
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
-from generator.settings import DEFAULT_DEMAND_ACTION_NAME
-from generator.staterepo import tree as trees
-from ros_bridge.client import DemandClient, DemandError
 from tests.ros.conftest import Serve, new_state_repo
 
 APPDEFS = Path(__file__).parent.parent / "appdefs"
@@ -212,7 +212,7 @@ def test_the_bookkeeping_is_published_and_latched(
 
 
 def command(*args: str) -> list[str]:
-    return [sys.executable, "-m", "generator.cli.main", "demand", *args]
+    return [sys.executable, "-m", "demandops.cli.main", "demand", *args]
 
 
 def test_the_command_line_sends_holds_and_gives_up(serve: Serve, tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ from typing import Any
 
 import pygit2
 import pytest
+from demandops.staterepo.git import tree as trees
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from generator.staterepo import tree as trees
 from tests.ros.conftest import Client, Serve, new_state_repo
 from tests.ros.test_node import connection
 

@@ -14,21 +14,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
+from demandops.config.config import CONFIG_ROOTS
+from demandops.config.file_model import Frozen, parse_file
+from demandops.config.load import load
+from demandops.config.policy import seconds_of
+from demandops.decision import Decision, State, decide, rendered
+from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.errors import Fault, Refused
+from demandops.ledger import claim_file as ledger_format
+from demandops.ledger.apply import Ledger
+from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.service.timing.lease_expiry import LeaseClock
+from demandops.service.timing.rate_limit import RateLimit
+from demandops.staterepo import new_repo
 from pydantic import Field, model_validator
-
-from generator.catalog.catalog import CONFIG_ROOTS
-from generator.catalog.loading import load
-from generator.catalog.model import Frozen, parse_file
-from generator.catalog.policy import seconds_of
-from generator.decision import Decision, State, decide, rendered
-from generator.demand.request import DemandRequest, Operation
-from generator.errors import Fault, Refused
-from generator.ledger import format as ledger_format
-from generator.ledger.ledger import Ledger
-from generator.plan.bookkeeping import as_data, bookkeeping
-from generator.service.expiry import LeaseClock
-from generator.service.throttle import Throttle
-from generator.staterepo import layout
 
 HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"
@@ -132,7 +131,7 @@ def scenarios() -> dict[str, Path]:
 
 @lru_cache(maxsize=1)
 def _skeleton() -> Mapping[str, str]:
-    return layout.files()
+    return new_repo.files()
 
 
 def _laid_over(below: Any, above: Any) -> Any:
@@ -211,7 +210,7 @@ class World:
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
         self._lease_clock = LeaseClock(self.clocks.wall, self.clocks.steady)
-        self._throttle = Throttle()
+        self._throttle = RateLimit()
 
     def decide(self, goal: object) -> Decision:
         """Decide a goal; nothing changes."""
@@ -222,9 +221,7 @@ class World:
             goal,
             now,
             self.files.get,
-            throttle=lambda request, catalog: self._throttle.faults(
-                request, catalog, operation, now
-            ),
+            throttle=lambda request, config: self._throttle.faults(request, config, operation, now),
         )
 
     def take(self, goal: object) -> Decision | Refused:
@@ -258,7 +255,7 @@ class World:
 
     def books(self) -> dict[str, dict[str, Any]]:
         """Return the bookkeeping as ``demandops bookkeeping`` prints it, without its commit."""
-        data = as_data(bookkeeping(self.state.ledger, self.state.catalog), "")
+        data = as_data(bookkeeping(self.state.ledger, self.state.config), "")
         return {"services": data["services"], "connections": data["connections"]}
 
     def runs(self) -> dict[str, list[str]]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from demandops.config.load import load
+from demandops.errors import InvalidInput
 
-from generator.catalog.loading import load
-from generator.errors import InvalidInput
 from tests.scenarios import running
 
 FILES = running.scenarios()

@@ -10,9 +10,9 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
+from demandops.cluster import access, reconcile_trigger
+from demandops.errors import InvalidInput
 
-from generator.cluster import access, wake
-from generator.errors import InvalidInput
 from tests.golden.cases import start
 
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
@@ -84,8 +84,10 @@ def receiver() -> Iterator[tuple[str, list[str]]]:
 def test_a_receiver_is_called_after_a_push(receiver: tuple[str, list[str]]) -> None:
     url, heard = receiver
     state, _ = start("experiment")
-    waker = wake.Wake(changed=unknown, clusters={"c-its": access.Reached(receiver=url)})
-    waker(state.catalog)
+    waker = reconcile_trigger.ReconcileTrigger(
+        changed=unknown, clusters={"c-its": access.ClusterAccess(receiver=url)}
+    )
+    waker(state.config)
     waker.close()
     assert set(heard) == {"/hook/abc"}
 
@@ -146,8 +148,10 @@ def test_the_object_that_fetches_is_annotated(
 ) -> None:
     kubeconfig, heard = api
     state, _ = start(case)
-    waker = wake.Wake(changed=unknown, clusters={"c-its": access.Reached(kubeconfig=kubeconfig)})
-    waker(state.catalog)
+    waker = reconcile_trigger.ReconcileTrigger(
+        changed=unknown, clusters={"c-its": access.ClusterAccess(kubeconfig=kubeconfig)}
+    )
+    waker(state.config)
     waker.close()
     assert {asked for asked, _ in heard} == {path}
     assert annotation in heard[0][1]
@@ -155,7 +159,9 @@ def test_the_object_that_fetches_is_annotated(
 
 def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:
     url, heard = receiver
-    wake.Wake(changed=unknown, clusters={"c-its": access.Reached(receiver=url)}).close()
+    reconcile_trigger.ReconcileTrigger(
+        changed=unknown, clusters={"c-its": access.ClusterAccess(receiver=url)}
+    ).close()
     assert heard == []
 
 
@@ -164,11 +170,11 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
 ) -> None:
     url, heard = receiver
     state, _ = start("experiment")
-    away = access.Reached(receiver="http://127.0.0.1:1/hook/secret")
-    waker = wake.Wake(
-        changed=unknown, clusters={"away": away, "here": access.Reached(receiver=url)}
+    away = access.ClusterAccess(receiver="http://127.0.0.1:1/hook/secret")
+    waker = reconcile_trigger.ReconcileTrigger(
+        changed=unknown, clusters={"away": away, "here": access.ClusterAccess(receiver=url)}
     )
-    waker(state.catalog)
+    waker(state.config)
     waker.close()
     assert heard
     assert "cluster 'away' was not woken (URLError)" in caplog.text
@@ -179,9 +185,11 @@ def test_a_cluster_that_did_not_answer_is_tried_again(receiver: tuple[str, list[
     """The receiver answers with a failure at first."""
     url, heard = receiver
     state, _ = start("experiment")
-    waker = wake.Wake(changed=unknown, clusters={"c-its": access.Reached(receiver=f"{url}?fail=1")})
+    waker = reconcile_trigger.ReconcileTrigger(
+        changed=unknown, clusters={"c-its": access.ClusterAccess(receiver=f"{url}?fail=1")}
+    )
     try:
-        waker(state.catalog)
+        waker(state.config)
         end = time.monotonic() + 30
         while len(heard) < 2:
             assert time.monotonic() < end, "it is not woken again"

@@ -6,9 +6,9 @@ import urllib.error
 from collections.abc import Callable, Iterator
 
 import pytest
+from demandops.cluster import controller_webhook
+from demandops_ros.client import DemandClient
 
-from generator.cluster import webhook
-from ros_bridge.client import DemandClient
 from tests.e2e.common.access import access_file, documented_roles, limited
 from tests.e2e.common.answers import TIMEOUT_S, fusion, restarted, with_chart
 from tests.e2e.common.namespace import name_of
@@ -106,9 +106,9 @@ def test_a_chart_edited_in_its_folder_is_what_healthy_is_of(
 def test_a_call_with_another_signature_or_none_is_refused(
     world: World, rig: Rig, secret: bytes | None
 ) -> None:
-    call = webhook.to_argocd(rig.git_url(world.name), "", world.tip(), None)
+    call = controller_webhook.to_argocd(rig.git_url(world.name), "", world.tip(), None)
     url = f"{rig.url(SERVER)}/api/webhook"
     with pytest.raises(urllib.error.HTTPError) as caught:
-        webhook.send(url, call, secret, 5)
+        controller_webhook.send(url, call, secret, 5)
     assert caught.value.code == 400
-    webhook.send(url, call, WEBHOOK_SECRET.encode(), 5)
+    controller_webhook.send(url, call, WEBHOOK_SECRET.encode(), 5)

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import pytest
+from demandops_ros.client import DemandClient, DemandError
 
-from ros_bridge.client import DemandClient, DemandError
 from tests.e2e.common.namespace import Namespace, fusion_inputs, name_of
 from tests.e2e.common.staterepo import Generator, demandops
 from tests.e2e.rig.cluster import Rig

@@ -14,12 +14,11 @@ from typing import Any
 import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
+from demandops.settings import DEFAULT_ACTION_NAME
+from demandops_ros.messages import from_data
+from demandops_ros.node import DEEP
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
-
-from generator.settings import DEFAULT_ACTION_NAME
-from ros_bridge.convert import from_data
-from ros_bridge.node import DEEP
 
 Goal = dict[str, Any]
 

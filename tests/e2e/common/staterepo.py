@@ -33,7 +33,7 @@ class Generator:
         self.log = folder / "generator.log"
         self._client = client
         self._folder = folder
-        self._command = ["-m", "generator.cli.main", "serve", "--state-repo", state_repo]
+        self._command = ["-m", "demandops.cli.main", "serve", "--state-repo", state_repo]
         self._environment = environment(folder) | {"ROS_DOMAIN_ID": str(ros_domain)}
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -127,7 +127,7 @@ class StateRepo:
 
 def demandops(folder: Path, *arguments: str) -> str:
     """Run the command line with its data in `folder`."""
-    command = [sys.executable, "-m", "generator.cli.main", *arguments]
+    command = [sys.executable, "-m", "demandops.cli.main", *arguments]
     done = subprocess.run(
         command,
         env=environment(folder),

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from demandops.config.config import CONFIG_ROOTS
+from demandops.config.load import load
+from demandops.decision import State
+from demandops.ledger.apply import Ledger
+from demandops.staterepo import new_repo
 
-from generator.catalog.catalog import CONFIG_ROOTS
-from generator.catalog.loading import load
-from generator.decision import State
-from generator.ledger.ledger import Ledger
-from generator.staterepo import layout
 from tests import demanding
 from tests.integration.mqtt.conftest import PASSWORD, USER, Broker, Client, Pod
 
@@ -45,9 +45,9 @@ Ends = dict[str, Pod]
 @pytest.fixture
 def manifests(broker: Broker) -> dict[str, str]:
     """Return the manifests of both ends by side."""
-    files = layout.files() | {"inventory/brokers.yaml": broker.inventory()}
-    catalog = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
-    _, made = demanding.decide(State.of(catalog, Ledger()), DEMAND, NOW, files.get)
+    files = new_repo.files() | {"inventory/brokers.yaml": broker.inventory()}
+    config = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
+    _, made = demanding.decide(State.of(config, Ledger()), DEMAND, NOW, files.get)
     return {
         side: text
         for path, text in made.files.items()

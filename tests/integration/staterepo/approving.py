@@ -8,9 +8,8 @@ from typing import Any
 
 import staterepo_rig as rig
 import yaml
+from demandops.service import Generator, Ticket
 from staterepo_rig import git
-
-from generator.service import Generator, Ticket
 
 POLICY = "policy/access-domains.yaml"
 

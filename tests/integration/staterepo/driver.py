@@ -19,12 +19,12 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
-from generator.service import Generator, Receipt
-from generator.staterepo.cloned import ClonedRepository
-from generator.staterepo.embedded import EmbeddedRepository
-from generator.staterepo.outbox import Outbox
-from generator.staterepo.proposals import Branches
-from generator.staterepo.writer import Line
+from demandops.service import Generator, Receipt
+from demandops.staterepo.git.bare import BareRepository
+from demandops.staterepo.git.clone import ClonedRepository
+from demandops.staterepo.write.commit_line import CommitLine
+from demandops.staterepo.write.journal import Journal
+from demandops.staterepo.write.proposal_branch import Branches
 
 Demand = dict[str, Any]
 
@@ -76,17 +76,17 @@ def arm(where: str) -> None:
     point, _, times = where.partition(":")
     at = _At(int(times or 1))
     if point == "journaled":
-        _after(Outbox, "append", at)
+        _after(Journal, "append", at)
     elif point == "committed":
-        _after(Line, "commit", at)
+        _after(CommitLine, "commit", at)
     elif point == "publishing":
         _before(ClonedRepository, "publish", at)
-        _before(EmbeddedRepository, "publish", at)
+        _before(BareRepository, "publish", at)
     elif point == "published":
         _after(ClonedRepository, "publish", at)
-        _after(EmbeddedRepository, "publish", at)
+        _after(BareRepository, "publish", at)
     elif point == "unanswered":
-        _after(Outbox, "done", at)
+        _after(Journal, "done", at)
     elif point == "proposing":
         _before(Branches, "put", at)
     elif point == "proposed":

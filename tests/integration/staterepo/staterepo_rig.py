@@ -22,15 +22,14 @@ from pathlib import Path
 from typing import Any
 
 import pygit2
-
-from generator.catalog.catalog import CONFIG_ROOTS
-from generator.catalog.loading import load
-from generator.decision import State, decide
-from generator.ledger.ledger import Ledger
-from generator.plan.bookkeeping import as_data, bookkeeping
-from generator.service import Generator, Receipt, Ticket
-from generator.staterepo import layout, reader
-from generator.staterepo import snapshot as snapshots
+from demandops.config.config import CONFIG_ROOTS
+from demandops.config.load import load
+from demandops.decision import State, decide
+from demandops.ledger.apply import Ledger
+from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.service import Generator, Receipt, Ticket
+from demandops.staterepo import new_repo, reader
+from demandops.staterepo.load import snapshot as snapshots
 
 Goal = dict[str, Any]
 Books = dict[str, Any]
@@ -55,7 +54,7 @@ _CHECKOUT = Path(__file__).parents[3]
 
 
 def init(path: Path) -> Path:
-    layout.init(path, NOW, bare=True, gitops="flux")
+    new_repo.init(path, NOW, bare=True, gitops="flux")
     return path
 
 
@@ -114,9 +113,9 @@ def impossible() -> Goal:
 
 @lru_cache(maxsize=1)
 def _fresh() -> State:
-    files = layout.files()
-    catalog = load({path: files[path] for path in files if path.split("/")[0] in CONFIG_ROOTS})
-    return State.of(catalog, Ledger())
+    files = new_repo.files()
+    config = load({path: files[path] for path in files if path.split("/")[0] in CONFIG_ROOTS})
+    return State.of(config, Ledger())
 
 
 def books_after(goals: Iterable[Goal]) -> Books:
@@ -124,7 +123,7 @@ def books_after(goals: Iterable[Goal]) -> Books:
     state = _fresh()
     for made in goals:
         state = decide(state, made, NOW, lambda path: None).state
-    return as_data(bookkeeping(state.ledger, state.catalog), "")
+    return as_data(bookkeeping(state.ledger, state.config), "")
 
 
 # ---- generators ----
@@ -413,7 +412,7 @@ def operations(repo: Path) -> list[str]:
 
 def books(repo: Path, revision: str = "main") -> Books:
     state = snapshots.load(pygit2.Repository(str(repo)), revision).state
-    return as_data(bookkeeping(state.ledger, state.catalog), "")
+    return as_data(bookkeeping(state.ledger, state.config), "")
 
 
 def claims(repo: Path, needle: str = "") -> list[str]:

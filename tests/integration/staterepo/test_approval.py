@@ -15,18 +15,18 @@ import pytest
 import staterepo_rig as rig
 import yaml
 from approving import Petra, Proposed, branches
+from demandops.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
+from demandops.service import Ticket
+from demandops.service.approvals import approvals
 from git_over_http import serving
 from staterepo_rig import git, goal, leave
-
-from generator.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
-from generator.service import Ticket, approval
 
 
 @pytest.fixture(autouse=True)
 def _eager(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have branches looked at often."""
-    monkeypatch.setattr(approval, "ASK_EMBEDDED_S", 0.05)
-    monkeypatch.setattr(approval, "ASK_REMOTE_S", 0.1)
+    monkeypatch.setattr(approvals, "ASK_EMBEDDED_S", 0.05)
+    monkeypatch.setattr(approvals, "ASK_REMOTE_S", 0.1)
 
 
 @pytest.fixture
@@ -95,10 +95,9 @@ def test_however_it_is_merged_the_demand_is_booked_and_the_files_fit(
 def assert_rendered(bare: Path) -> None:
     """What stands below clusters/ is what the books and the configuration give."""
     import pygit2
-
-    from generator.decision import rendered
-    from generator.staterepo import snapshot as snapshots
-    from generator.staterepo import tree as trees
+    from demandops.decision import rendered
+    from demandops.staterepo.git import tree as trees
+    from demandops.staterepo.load import snapshot as snapshots
 
     repo = pygit2.Repository(str(bare))
     state = snapshots.load(repo, "main").state
@@ -568,7 +567,7 @@ def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Petra) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1))
         branch = proposed.branch
-        generator.watch(lambda catalog: heard.set())
+        generator.watch(lambda config: heard.set())
         petra.merge(branch, "--ff-only")
         assert proposed.outcome() == "booked"
         assert heard.wait(rig.PATIENCE_S)
@@ -577,7 +576,7 @@ def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Petra) -> None:
 def test_a_proposal_passes_the_check_of_pull_requests(
     bare: Path, petra: Petra, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from generator.cli.main import run
+    from demandops.cli.main import run
 
     with rig.running(bare) as generator:
         branch = Proposed(generator, put("d", 1, 600)).branch

@@ -18,10 +18,9 @@ from urllib.parse import parse_qs, urlparse
 import pytest
 import staterepo_rig as rig
 from approving import Petra, Proposed, branches
+from demandops.errors import TurnedDown, Withdrawn
+from demandops.service.approvals import approvals, forge_worker
 from staterepo_rig import git, goal
-
-from generator.errors import TurnedDown, Withdrawn
-from generator.service import approval, desk
 
 TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
 
@@ -88,9 +87,9 @@ def hub() -> Iterator[Hub]:
 
 @pytest.fixture
 def petra(hub: Hub, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Petra:
-    monkeypatch.setattr(approval, "ASK_EMBEDDED_S", 0.05)
-    monkeypatch.setattr(approval, "ASK_REMOTE_S", 0.1)
-    monkeypatch.setattr(desk, "POLL_S", 0.05)
+    monkeypatch.setattr(approvals, "ASK_EMBEDDED_S", 0.05)
+    monkeypatch.setattr(approvals, "ASK_REMOTE_S", 0.1)
+    monkeypatch.setattr(forge_worker, "POLL_S", 0.05)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     (tmp_path / "token").write_text(TOKEN)
     monkeypatch.setenv("DEMANDOPS_FORGE_TOKEN_FILE", str(tmp_path / "token"))

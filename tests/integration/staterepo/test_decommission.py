@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 import staterepo_rig as rig
+from demandops.cli.main import run
+from demandops.service import Generator
 from staterepo_rig import Person, goal, leave
-
-from generator.cli.main import run
-from generator.service import Generator
 
 NODES = "inventory/nodes.yaml"
 
@@ -70,7 +69,7 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
         made = person.change({NODES: nodes[:start] + nodes[end:]}, "vehicle01 is sold")
         assert demandops("check", tmp_path / "person")[0] == 0
         rig.wait_until(
-            lambda: "vehicle01" not in generator.snapshot.state.catalog.nodes, "it is taken in"
+            lambda: "vehicle01" not in generator.snapshot.state.config.nodes, "it is taken in"
         )
         assert generator.condition.problems == ()
         assert rig.git(bare, "ls-tree", "main", ".demandops") == ""
@@ -209,12 +208,12 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     url: str, bare: Path, demandops: Command
 ) -> None:
     """As for any demand: it is in the outbox, and the next start carries it out."""
-    from generator.demand import leaving
+    from demandops.demand import decommission_goal
 
     generator = Generator(url)
     rig.book(generator, goal(1))
     away = bare.rename(bare.with_name("away.git"))
-    generator.submit(leaving.as_data("vehicle01", ("node",), ""), "op-leave")
+    generator.submit(decommission_goal.as_data("vehicle01", ("node",), ""), "op-leave")
     assert generator.close(timeout=0.3) is False
     away.rename(bare)
     assert rig.restart(url) is True

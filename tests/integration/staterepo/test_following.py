@@ -16,15 +16,14 @@ from pathlib import Path
 import pytest
 import staterepo_rig as rig
 import yaml
+from demandops import settings
+from demandops.cli.main import run
+from demandops.errors import QueueFull, Withdrawn
+from demandops.service import Generator
+from demandops.staterepo.load import problem_report
+from demandops.staterepo.write.journal import Journal
 from git_over_http import Server, serving
 from staterepo_rig import Person, Stages, goal, leave
-
-from generator import settings
-from generator.cli.main import run
-from generator.errors import QueueFull, Withdrawn
-from generator.service import Generator
-from generator.staterepo import reports
-from generator.staterepo.outbox import Outbox
 
 NODES, CLUSTERS = "inventory/nodes.yaml", "inventory/clusters.yaml"
 BROKERS, CHARTS = "inventory/brokers.yaml", "registry/charts.yaml"
@@ -83,7 +82,7 @@ def followed(bare: Path, made: str) -> rig.Commit:
 
 
 def problems(bare: Path) -> list[dict[str, str]]:
-    text = rig.git(bare, "show", f"main:{reports.PATH}", check=False)
+    text = rig.git(bare, "show", f"main:{problem_report.PATH}", check=False)
     data = yaml.safe_load(text) if "problems:" in text else {"problems": []}
     return list(data["problems"])
 
@@ -217,9 +216,9 @@ def test_a_broken_change_is_reported_with_its_commit_until_it_is_mended(
         assert all(problem["file"].startswith(where) for problem in told), told
         rig.wait_until(lambda: generator.condition.problems, "diagnostics tell it")
         assert rig.git(bare, "rev-parse", "main:clusters") == standing
-        report = rig.git(bare, "rev-parse", f"main:{reports.PATH}")
+        report = rig.git(bare, "rev-parse", f"main:{problem_report.PATH}")
         rig.book(generator, goal(3), goal(6), leave(3))
-        assert rig.git(bare, "rev-parse", f"main:{reports.PATH}") == report, "demands go on"
+        assert rig.git(bare, "rev-parse", f"main:{problem_report.PATH}") == report, "demands go on"
         assert [c.one("Operation") for c in rig.commits(bare)][-3:] == ["join", "join", "shutdown"]
         logged = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
         assert len(logged) == len(set(logged)) == len(told)
@@ -250,11 +249,11 @@ def test_a_report_that_a_person_removes_or_edits_is_put_right(bare: Path, person
         rig.book(generator, goal(1))
         made = person.change(_node_on_no_cluster(bare), "A merge gone wrong")
         followed(bare, made)
-        report = file_of(bare, reports.PATH)
-        followed(bare, person.change({reports.PATH: None}, "No reports, please"))
-        assert file_of(bare, reports.PATH) == report
-        followed(bare, person.change({reports.PATH: "problems: [{file: x}, 3]\n"}, "Mine"))
-        assert file_of(bare, reports.PATH) == report
+        report = file_of(bare, problem_report.PATH)
+        followed(bare, person.change({problem_report.PATH: None}, "No reports, please"))
+        assert file_of(bare, problem_report.PATH) == report
+        followed(bare, person.change({problem_report.PATH: "problems: [{file: x}, 3]\n"}, "Mine"))
+        assert file_of(bare, problem_report.PATH) == report
     rig.assert_sound(bare)
 
 
@@ -284,7 +283,7 @@ def test_two_generators_follow_a_change_once(
         commit = followed(bare, person.change(_move_broker(bare)))
         for generator in (one, two):
             rig.wait_until(
-                lambda: generator.condition.commit == commit.id,  # noqa: B023 - waited for here
+                lambda generator=generator: generator.condition.commit == commit.id,
                 "both have taken it in",
             )
     assert newest(bare).id == commit.id
@@ -407,7 +406,7 @@ def test_all_that_waits_while_the_remote_is_away_survives_a_kill(
     away.rename(bare)
     assert rig.restart(url) is True
     assert rig.books(bare) == rig.books_after(map(goal, range(3)))
-    assert Outbox(journal).pending == {}
+    assert Journal(journal).pending == {}
 
 
 def _kept(journal: Path) -> list[str]:

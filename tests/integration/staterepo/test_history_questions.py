@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 import staterepo_rig as rig
+from demandops.staterepo import reader
+from demandops.staterepo.git import connect
 from staterepo_rig import Person
-
-from generator.staterepo import reader, remote
 
 CHART = "appdefs/object-detection-fusion/charts/object-fusion"
 
@@ -42,7 +42,7 @@ def test_a_folder_is_unchanged_where_its_content_is(bare: Path, line: list[str])
 
 
 def test_the_paths_that_differ_are_told(bare: Path, tmp_path: Path, line: list[str]) -> None:
-    repository = remote.connect(str(bare), tmp_path / "data")
+    repository = connect.connect(str(bare), tmp_path / "data")
     assert repository.changed(line[0], line[2]) == [f"{CHART}/notes.txt", "notes.txt"]
     assert repository.changed(line[2], line[2]) == []
     assert repository.changed("", line[2]) is None

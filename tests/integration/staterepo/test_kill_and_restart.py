@@ -10,9 +10,8 @@ from random import Random
 
 import pytest
 import staterepo_rig as rig
+from demandops.service import Generator
 from staterepo_rig import Drivers, Run, Told, demand, goal, leave
-
-from generator.service import Generator
 
 KILLS = 15
 LANES = 4

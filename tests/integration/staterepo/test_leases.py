@@ -16,14 +16,13 @@ from typing import Any
 import pygit2
 import pytest
 import staterepo_rig as rig
+from demandops import settings
+from demandops.demand.claim import Claim
+from demandops.errors import Refused
+from demandops.service import Generator, worker
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.write import journal
 from staterepo_rig import Person
-
-from generator import settings
-from generator.demand.claim import Claim
-from generator.errors import Refused
-from generator.service import Generator, settling
-from generator.staterepo import outbox
-from generator.staterepo import tree as trees
 
 DOMAINS = "policy/access-domains.yaml"
 POLICY = """\
@@ -112,8 +111,8 @@ def ends(generator: Generator, demand: str) -> datetime:
 
 def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:
     """Have a demand wait that a generator took in and could not settle before it was killed."""
-    slot = outbox.Slot(settings.data_home(str(repo)))
-    slot.outbox.append([outbox.Entry(operation, goal, received.isoformat(), rig.tip(repo))])
+    slot = journal.Slot(settings.data_home(str(repo)))
+    slot.outbox.append([journal.JournalEntry(operation, goal, received.isoformat(), rig.tip(repo))])
     slot.close()
 
 
@@ -214,7 +213,7 @@ def test_an_idle_generator_releases_what_another_process_booked(
     bare: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As ``demandops request`` beside ``demandops serve``."""
-    monkeypatch.setattr(settling, "LONGEST_WAIT_S", 0.2)  # between two looks; a minute else
+    monkeypatch.setattr(worker, "LONGEST_WAIT_S", 0.2)  # between two looks; a minute else
     with rig.running(bare) as idle:
         with rig.running(bare) as other:
             rig.book(other, put("d", 1))

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import pytest
 import staterepo_rig as rig
+from demandops.errors import InvalidInput, Refused
+from demandops.service import Generator
 from staterepo_rig import Person, goal, leave
-
-from generator.errors import InvalidInput, Refused
-from generator.service import Generator
 
 NODES = "inventory/nodes.yaml"
 BROKERS = "inventory/brokers.yaml"

@@ -14,10 +14,9 @@ from typing import Any
 import pytest
 import staterepo_rig as rig
 import yaml
+from demandops.errors import InvalidInput, Refused
+from demandops.service import Generator
 from staterepo_rig import Person
-
-from generator.errors import InvalidInput, Refused
-from generator.service import Generator
 
 EDGE = "clusters/c-its/perception/edge"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"

@@ -14,10 +14,9 @@ from pathlib import Path
 import pytest
 import staterepo_rig as rig
 import yaml
+from demandops.demand.claim import KEPT
+from demandops.errors import DemandOpsError
 from staterepo_rig import Person
-
-from generator.demand.claim import KEPT
-from generator.errors import DemandOpsError
 
 STEPS = 25
 

@@ -15,9 +15,8 @@ from typing import Any
 import pytest
 import staterepo_rig as rig
 import yaml
+from demandops.service import Generator
 from staterepo_rig import Person
-
-from generator.service import Generator
 
 FURTHER = int(os.environ.get("DEMANDOPS_LOAD_FURTHER", "60"))
 INTERVAL_S = 0.5

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 import staterepo_rig as rig
+from demandops.errors import QueueFull, Refused, ShuttingDown, StateRepoError, Withdrawn
+from demandops.service import Generator
 from staterepo_rig import Gate, Stages, goal, leave
-
-from generator.errors import QueueFull, Refused, ShuttingDown, StateRepoError, Withdrawn
-from generator.service import Generator
 
 
 @contextmanager

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 import staterepo_rig as rig
-
-from generator.errors import Refused
-from generator.service import Generator, rollback
+from demandops.errors import Refused
+from demandops.service import Generator, rollback_goal
 
 
 def goal_of(to: str, *, drop_newer: bool) -> dict[str, object]:
     who = ("A person", "person@example.org")
-    return rollback.goal(to, drop_newer=drop_newer, reason="a test", who=who)
+    return rollback_goal.goal(to, drop_newer=drop_newer, reason="a test", who=who)
 
 
 def test_it_is_judged_on_what_others_booked_meanwhile(address: str, bare: Path) -> None:

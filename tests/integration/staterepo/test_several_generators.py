@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 import staterepo_rig as rig
+from demandops.service import Generator, Receipt, Ticket
 from staterepo_rig import Drivers, demand, goal, leave
-
-from generator.service import Generator, Receipt, Ticket
 
 EACH = 32
 

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 import staterepo_rig as rig
+from demandops.errors import StateRepoError
+from demandops.service import Generator
 from git_over_http import Server, serving
 from staterepo_rig import Gate, goal, leave
-
-from generator.errors import StateRepoError
-from generator.service import Generator
 
 
 @pytest.fixture

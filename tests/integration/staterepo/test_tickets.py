@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 import staterepo_rig as rig
+from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
+from demandops.service import Generator, Ticket
 from staterepo_rig import Drivers, Gate, Stages, demand, goal
-
-from generator.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
-from generator.service import Generator, Ticket
 
 # ---- taking back ----
 

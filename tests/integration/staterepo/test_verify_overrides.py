@@ -8,11 +8,10 @@ from pathlib import Path
 import pytest
 import staterepo_rig as rig
 import yaml
+from demandops.service import Generator, rollback_goal
+from demandops.staterepo import reader
+from demandops.staterepo.audit.verification import Verdict
 from staterepo_rig import Person
-
-from generator.service import Generator, rollback
-from generator.staterepo import reader
-from generator.staterepo.verification import Verdict
 
 FORGED = "Forged\n\nOperation: {}\nDemand-Id: none\n{}Render-Version: 1"
 EDGE = "clusters/c-its/perception/edge"
@@ -157,7 +156,7 @@ def test_rolling_back_leaves_to_overrides_what_they_keep(
     assert len(rig.claims(bare, "override:lasting")) == 1
 
     def back(to: str) -> str:
-        goal = rollback.goal(to, drop_newer=False, reason="x", who=("A", "a@example.org"))
+        goal = rollback_goal.goal(to, drop_newer=False, reason="x", who=("A", "a@example.org"))
         return rig.receipt(generator.submit(goal)).outcome
 
     assert back(asked) == "restored", "what an override keeps is nobody's newer demand"
@@ -170,7 +169,7 @@ def test_rolling_back_leaves_to_overrides_what_they_keep(
     assert back(kept) == "unchanged", "nothing keeps it any more"
     merge(person, lasting=keep)
     rig.book(generator, rig.goal(2), rig.leave(2))
-    rolled = rollback.goal(kept, drop_newer=True, reason="x", who=("A", "a@example.org"))
+    rolled = rollback_goal.goal(kept, drop_newer=True, reason="x", who=("A", "a@example.org"))
     assert rig.receipt(generator.submit(rolled)).outcome == "restored"
     assert len(rig.claims(bare, "override:lasting")) == 2
     assert all(verdict.holds for verdict in verdicts(bare).values())
@@ -186,7 +185,7 @@ def test_rolling_back_leaves_the_markers_alone(
     merge(person, brief=expired)
     rig.book(generator, rig.leave(1))
     marker = file(bare, "ledger/overrides/brief.yaml")
-    goal = rollback.goal(before, drop_newer=False, reason="x", who=("A", "a@example.org"))
+    goal = rollback_goal.goal(before, drop_newer=False, reason="x", who=("A", "a@example.org"))
     assert rig.receipt(generator.submit(goal)).outcome == "restored"
     assert file(bare, "ledger/overrides/brief.yaml") == marker
     rig.assert_sound(bare)

@@ -9,11 +9,10 @@ from typing import Any
 import pytest
 import yaml
 from asking import FAST, configuration, skeleton
-
-from generator.catalog.loading import load
-from generator.decision import State, rehearse
-from generator.errors import InvalidInput
-from generator.ledger.ledger import Ledger
+from demandops.config.load import load
+from demandops.decision import State, rehearse
+from demandops.errors import InvalidInput
+from demandops.ledger.apply import Ledger
 
 FILES = sorted(
     path

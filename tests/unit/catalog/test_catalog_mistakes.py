@@ -11,10 +11,9 @@ from collections.abc import Mapping
 
 import pytest
 from asking import brokers, configuration, edited, skeleton
-
-from generator.catalog.loading import load
-from generator.errors import InvalidInput
-from generator.staterepo import layout
+from demandops.config.load import load
+from demandops.errors import InvalidInput
+from demandops.staterepo import new_repo
 
 ROOT = "demandops.yaml"
 CLUSTERS = "inventory/clusters.yaml"
@@ -471,15 +470,15 @@ class TestArgoCd:
 
     @staticmethod
     def root(**section: object) -> dict[str, str | None]:
-        text = layout.files("argocd")[ROOT]
+        text = new_repo.files("argocd")[ROOT]
         url = "  url: https://git.example/fleet/state-repo.git\n"
         assert url in text
         return {ROOT: text.replace(url, f"  {json.dumps(section)}\n")}
 
     def test_a_url_is_enough(self) -> None:
-        catalog = load(configuration(self.root(url="https://git.example/state.git")))
-        assert catalog.repository.argocd
-        assert catalog.repository.argocd.namespace == "argocd"
+        config = load(configuration(self.root(url="https://git.example/state.git")))
+        assert config.repository.argocd
+        assert config.repository.argocd.namespace == "argocd"
 
     def test_the_other_controllers_section_may_stay(self) -> None:
         text = skeleton()[ROOT] + "argocd:\n  url: https://git.example/state.git\n"

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 from asking import Books, configuration, perception, skeleton
-
-from generator.catalog.loading import load
-from generator.decision import State, rehearse
-from generator.errors import InvalidInput
-from generator.ledger.ledger import Ledger
+from demandops.config.load import load
+from demandops.decision import State, rehearse
+from demandops.errors import InvalidInput
+from demandops.ledger.apply import Ledger
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"

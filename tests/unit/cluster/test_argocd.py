@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from demandops.cluster.health import Health, Named, Place, Target, Watched, reading
 
-from generator.cluster.health import Health, Named, Place, Target, Watched, reading
 from tests.unit.cluster.commits import Letters
 from tests.unit.cluster.test_flux import condition, deployment
 

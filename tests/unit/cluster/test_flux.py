@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from demandops.cluster.health import Health, Place, Target, reading, worst
 
-from generator.cluster.health import Health, Place, Target, reading, worst
 from tests.unit.cluster.commits import Letters
 
 COMMITS = Letters()

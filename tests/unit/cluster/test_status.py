@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from generator.cluster.access import Reached
-from generator.cluster.health import Place, Target
-from generator.cluster.status import Status
+from demandops.cluster.access import ClusterAccess
+from demandops.cluster.health import Place, Target
+from demandops.cluster.rollout_status import RolloutStatus
+
 from tests.unit.cluster.commits import Letters
 
 KUBECONFIG = """
@@ -23,7 +24,7 @@ current-context: x
 def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: Path) -> None:
     file = tmp_path / "kubeconfig"
     file.write_text(KUBECONFIG)
-    status = Status({"away": Reached(kubeconfig=file)}, Letters())
+    status = RolloutStatus({"away": ClusterAccess(kubeconfig=file)}, Letters())
     try:
         target = Target(Place("away", "d", "ns"), "r", by_helm=True)
         start = time.monotonic()
@@ -38,7 +39,7 @@ def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: P
 
 
 def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
-    status = Status({"w": Reached(receiver="https://h/hook")}, Letters())
+    status = RolloutStatus({"w": ClusterAccess(receiver="https://h/hook")}, Letters())
     try:
         assert status.reaches([Place("w", "d", "n"), Place("x", "d", "n")]) == (
             "no access to cluster w, x"
@@ -51,7 +52,7 @@ def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
 def test_closing_answers_what_is_still_followed(tmp_path: Path) -> None:
     file = tmp_path / "kubeconfig"
     file.write_text(KUBECONFIG)
-    status = Status({"away": Reached(kubeconfig=file)}, Letters())
+    status = RolloutStatus({"away": ClusterAccess(kubeconfig=file)}, Letters())
     target = Target(Place("away", "d", "ns"), "r", by_helm=True)
     followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
     status.close()

@@ -10,10 +10,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-
-from generator.cluster.access import Reached
-from generator.cluster.health import Watched
-from generator.cluster.store import ClusterStore
+from demandops.cluster.access import ClusterAccess
+from demandops.cluster.health import Watched
+from demandops.cluster.object_cache import ObjectCache
 
 OVER = Watched("Application", "argocd", "demandops-perception")
 CHILDREN = Watched("Application", "perception")
@@ -24,7 +23,7 @@ DEPLOYMENTS = Watched("Deployment", "perception")
 class Api:
     """An API server with one Application in each namespace, and what it was asked."""
 
-    reached: Reached
+    reached: ClusterAccess
     asked: list[str] = field(default_factory=list)
     refused: str = "nothing"
 
@@ -62,15 +61,15 @@ def api(tmp_path: Path) -> Iterator[Api]:
     }
     kubeconfig = tmp_path / "kubeconfig"
     kubeconfig.write_text(json.dumps(config))
-    found.append(Api(Reached(kubeconfig=kubeconfig)))
+    found.append(Api(ClusterAccess(kubeconfig=kubeconfig)))
     yield found[0]
     server.shutdown()
     thread.join()
     server.server_close()
 
 
-def store(api: Api) -> ClusterStore:
-    return ClusterStore("c-its", api.reached, lambda: None)
+def store(api: Api) -> ObjectCache:
+    return ObjectCache("c-its", api.reached, lambda: None)
 
 
 def test_one_object_is_asked_for_by_its_name(api: Api) -> None:
@@ -101,7 +100,7 @@ def test_a_cluster_that_is_away_is_asked_once(api: Api, tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
     text = Path(str(api.reached.kubeconfig)).read_text()
     nowhere.write_text(text.replace(text.split("127.0.0.1:")[1].split('"')[0], "1"))
-    read = ClusterStore("away", Reached(kubeconfig=nowhere), lambda: None)
+    read = ObjectCache("away", ClusterAccess(kubeconfig=nowhere), lambda: None)
     read.read([OVER, CHILDREN])
     assert read.unread([OVER]).startswith("MaxRetryError")
     assert read.unread([CHILDREN]) == read.unread([OVER])

@@ -13,10 +13,10 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
+from demandops.cluster import access, controller_webhook
+from demandops.cluster.reconcile_trigger import ReconcileTrigger
+from demandops.errors import InvalidInput
 
-from generator.cluster import access, webhook
-from generator.cluster.wake import Wake
-from generator.errors import InvalidInput
 from tests.golden.cases import start
 
 SECRET = "It's a Secret to Everybody"  # noqa: S105 - of an example
@@ -74,18 +74,18 @@ def by_openssl(body: bytes) -> str:
 def test_the_signature_is_the_one_that_github_documents() -> None:
     """Both controllers verify by GitHub's scheme; this is its own example."""
     documented = "757107ea0eb2509fc211221cce984b8a37570b6d7586c22c46f4379c8b043e17"
-    assert webhook.signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
+    assert controller_webhook.signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
 
 
-def woken(case: str, reached: access.Reached, changed: list[str] | None = None) -> None:
+def woken(case: str, reached: access.ClusterAccess, changed: list[str] | None = None) -> None:
     state, _ = start(case)
-    waker = Wake({"c-its": reached}, lambda since: ("b" * 40, changed))
-    waker(state.catalog)
+    waker = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
+    waker(state.config)
     waker.close()
 
 
 def test_a_receiver_of_flux_is_called_with_a_signature(hook: Heard, secret_file: Path) -> None:
-    woken("experiment", access.Reached(receiver=hook.url, secret_file=secret_file))
+    woken("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     headers, body = hook.calls[0]
     assert headers["X-Signature"] == by_openssl(body)
 
@@ -97,7 +97,7 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Heard, secret_file: 
         "clusters/other/perception/edge/b.yaml",
         "ledger/applications/aa/b/c.yaml",
     ]
-    reached = access.Reached(webhook=hook.url, secret_file=secret_file)
+    reached = access.ClusterAccess(webhook=hook.url, secret_file=secret_file)
     woken("argocd-experiment", reached, changed)
     headers, body = hook.calls[0]
     assert headers["X-Hub-Signature-256"] == by_openssl(body)
@@ -116,7 +116,7 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Heard, secret_file: 
 def test_where_nothing_is_known_of_what_changed_argo_cd_looks_at_all(
     hook: Heard, secret_file: Path
 ) -> None:
-    woken("argocd-experiment", access.Reached(webhook=hook.url, secret_file=secret_file))
+    woken("argocd-experiment", access.ClusterAccess(webhook=hook.url, secret_file=secret_file))
     assert json.loads(hook.calls[0][1])["commits"] == []
 
 
@@ -130,15 +130,15 @@ def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
         return f"{len(asked)}", []
 
     state, _ = start("argocd-experiment")
-    reached = access.Reached(webhook=hook.url, secret_file=secret_file)
-    waker = Wake({"c-its": reached}, changed)
+    reached = access.ClusterAccess(webhook=hook.url, secret_file=secret_file)
+    waker = ReconcileTrigger({"c-its": reached}, changed)
     try:
         hook.status = 503
-        waker(state.catalog)
+        waker(state.config)
         wait_for(lambda: len(hook.calls) >= 1)
         hook.status = 200
         wait_for(lambda: len(hook.calls) >= 2)
-        waker(state.catalog)
+        waker(state.config)
         wait_for(lambda: len(hook.calls) >= 3)
     finally:
         waker.close()
@@ -157,7 +157,7 @@ def test_what_is_not_taken_is_told_and_no_redirection_followed(
     hook: Heard, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
 ) -> None:
     hook.status = status
-    woken("experiment", access.Reached(receiver=hook.url, secret_file=secret_file))
+    woken("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
     assert len(hook.calls) in (1, 2)  # the second, as it is closed
     assert SECRET not in caplog.text and "/hook" not in caplog.text
@@ -170,7 +170,7 @@ def test_what_is_not_taken_is_told_and_no_redirection_followed(
 def test_the_other_controller_s_webhook_is_not_called(
     hook: Heard, caplog: pytest.LogCaptureFixture, case: str, other: str, needs: str
 ) -> None:
-    woken(case, access.Reached.model_validate({other: hook.url}))
+    woken(case, access.ClusterAccess.model_validate({other: hook.url}))
     assert hook.calls == []
     assert f"(it has neither a kubeconfig nor a {needs})" in caplog.text
 
@@ -185,12 +185,12 @@ def test_the_other_controller_s_webhook_is_not_called(
     ],
 )
 def test_a_repository_is_named_by_the_page_that_a_forge_would_name(repo: str, page: str) -> None:
-    assert webhook.web_address(repo) == page
+    assert controller_webhook.web_address(repo) == page
 
 
 def test_a_repository_without_a_host_cannot_be_named() -> None:
-    with pytest.raises(access.NoWay, match="names no host"):
-        webhook.web_address("file:///srv/fleet.git")
+    with pytest.raises(access.NoAccess, match="names no host"):
+        controller_webhook.web_address("file:///srv/fleet.git")
 
 
 @pytest.mark.parametrize(

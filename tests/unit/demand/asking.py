@@ -13,14 +13,13 @@ from typing import Any
 
 import pytest
 import yaml
-
-from generator.catalog.catalog import CONFIG_ROOTS, Catalog
-from generator.catalog.loading import load
-from generator.decision import Decision, State, decide, rendered
-from generator.errors import Refused
-from generator.ledger.ledger import Ledger
-from generator.plan.bookkeeping import as_data, bookkeeping
-from generator.staterepo import layout
+from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.load import load
+from demandops.decision import Decision, State, decide, rendered
+from demandops.errors import Refused
+from demandops.ledger.apply import Ledger
+from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.staterepo import new_repo
 
 Goal = dict[str, Any]
 Item = dict[str, Any]
@@ -47,7 +46,7 @@ ROS_NAMES = (
 @lru_cache(maxsize=1)
 def skeleton() -> Mapping[str, str]:
     """Return every file of a state repo as ``demandops init`` lays it down."""
-    return layout.files()
+    return new_repo.files()
 
 
 def configuration(changed: Mapping[str, str | None] | None = None) -> dict[str, str]:
@@ -169,9 +168,9 @@ class Books:
         return twin
 
     @property
-    def catalog(self) -> Catalog:
+    def config(self) -> Config:
         """What can be run."""
-        return self.state.catalog
+        return self.state.config
 
     def send(self, goal: object) -> Decision:
         """Decide a goal and keep what comes of it; raises what ``decide`` raises."""
@@ -194,7 +193,7 @@ class Books:
 
     def books(self) -> dict[str, Any]:
         """Return the bookkeeping as plain data, without its commit."""
-        data = as_data(bookkeeping(self.state.ledger, self.state.catalog), "")
+        data = as_data(bookkeeping(self.state.ledger, self.state.config), "")
         return {"services": data["services"], "connections": data["connections"]}
 
     def rendered(self) -> dict[str, str]:

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import yaml
 from asking import NOW, Books, configuration, connection, goal, skeleton
+from demandops.config.load import load
+from demandops.decision import State
+from demandops.demand.demand_request import ConnectionType
+from demandops.errors import Refused
+from demandops.ledger.apply import Ledger
 
-from generator.catalog.loading import load
-from generator.decision import State
-from generator.demand.request import ConnectionType
-from generator.errors import Refused
-from generator.ledger.ledger import Ledger
 from tests import demanding
 
 IMAGES = "registry/images.yaml"

@@ -8,13 +8,12 @@ from unicodedata import category
 
 import yaml
 from asking import APP, CLOUD, FAST, NOW, Books, application, connection, goal
+from demandops.decision import Decision, decide
+from demandops.demand import deployment_request_goal
+from demandops.errors import Fault, InvalidInput, Refused
+from demandops.staterepo.history import commit_message
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
-
-from generator.decision import Decision, decide
-from generator.demand import wire
-from generator.errors import Fault, InvalidInput, Refused
-from generator.staterepo import message
 
 FEW = settings(
     max_examples=100,
@@ -34,10 +33,11 @@ SCALAR: st.SearchStrategy[Any] = (
 UNSEEN = {"Cc", "Cs", "Zl", "Zp"}
 """What moves a terminal's cursor, or breaks a line for some programs only."""
 
-KEY = st.sampled_from(
-    [*wire.WireGoal.model_fields, *wire.WireApplication.model_fields, *wire.WireBody.model_fields,
-     *wire.WireConnection.model_fields, *wire.WireHeader.model_fields, *wire.WireTopic.model_fields]
-) | TEXT  # fmt: skip
+_GOAL_MODELS = [
+    getattr(deployment_request_goal, f"Wire{part}")
+    for part in ("Goal", "Application", "Body", "Connection", "Header", "Topic")
+]
+KEY = st.sampled_from([name for model in _GOAL_MODELS for name in model.model_fields]) | TEXT
 
 
 def _nested(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
@@ -81,8 +81,8 @@ def test_whatever_comes_is_refused_with_a_reason(data: Any) -> None:
 @example({"apps": [{"\ud800": 1}]})
 @given(ANYTHING)
 def test_the_form_is_judged_alike_with_and_without_a_catalog(data: Any) -> None:
-    request, faults = wire.parse(data, lambda number: None)
-    assert set(wire.form_faults(data)) <= set(faults)
+    request, faults = deployment_request_goal.parse(data, lambda number: None)
+    assert set(deployment_request_goal.form_faults(data)) <= set(faults)
     assert request is not None or faults
 
 
@@ -148,7 +148,7 @@ def test_any_id_is_refused_or_booked_rendered_committed_and_released(
         return
     for text in books.rendered().values():
         assert all(isinstance(item, dict) for item in yaml.load_all(text, Loader=FAST))
-    assert message.author(decision, NOW).name
-    assert f"\nRequester: {who}\n" in message.of_decision(decision, "operation", NOW)
+    assert commit_message.author(decision, NOW).name
+    assert f"\nRequester: {who}\n" in commit_message.of_decision(decision, "operation", NOW)
     books.send(asked | {"shutdown": True})
     assert books.rendered() == {}

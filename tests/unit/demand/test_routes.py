@@ -6,9 +6,8 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
-
-from generator.demand import carriers
-from generator.demand.route import Route, RouteOptions, differences, faults, parse, united
+from demandops.demand import transport_choice
+from demandops.demand.route import Route, RouteOptions, differences, faults, parse, united
 
 OPTIONS: dict[str, object] = {
     "type": "std_msgs/msg/String",
@@ -48,7 +47,7 @@ def test_options_and_routes_have_the_same_fields_and_defaults() -> None:
 
 
 def test_every_option_does_something_in_some_client() -> None:
-    honoured = set().union(*carriers.HONOURED.values())
+    honoured = set().union(*transport_choice.HONOURED.values())
     assert honoured == RouteOptions.model_fields.keys() - {"type", "reverse"}
 
 

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import yaml
 from asking import APP, Books, application, connection, edited, goal, perception, skeleton
-
-from generator.demand.lease import UNSTARTED
+from demandops.demand.lease import UNSTARTED
 
 POLICY = "policy/access-domains.yaml"
 DOMAIN = "access domain 'perception'"
@@ -118,10 +117,9 @@ def test_dropping_renewing_and_releasing_need_none() -> None:
 
 def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     from asking import NOW
-
-    from generator.decision import decide
-    from generator.demand.approval import proposed
-    from generator.ledger import format as ledger_format
+    from demandops.decision import decide
+    from demandops.demand.approval_rule import proposed
+    from demandops.ledger import claim_file as ledger_format
 
     books = Books(policy(approval="required"))
     decision = decide(books.state, put(lease=60), NOW, books.files.get)
@@ -149,7 +147,7 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     ],
 )
 def test_another_word_is_a_fault(config: dict[str, str], field: str) -> None:
-    from generator.errors import InvalidInput
+    from demandops.errors import InvalidInput
 
     with pytest.raises(InvalidInput) as error:
         Books(config)

@@ -10,12 +10,11 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from demandops.config.load import load
+from demandops.config.repo_settings import Proposals
+from demandops.errors import InvalidInput
+from demandops.forge import Forge, ForgeError, PullRequest, forge_for
 from replaying import TOKEN, Replay, replaying
-
-from generator.catalog.loading import load
-from generator.catalog.repository import Proposals
-from generator.errors import InvalidInput
-from generator.forge import Forge, ForgeError, PullRequest, forge_for
 
 BRANCH = "demand/one-0123456789ab"
 LINKS = {
@@ -199,9 +198,9 @@ def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
     ],
 )
 def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> None:
-    from generator.staterepo import layout
+    from demandops.staterepo import new_repo
 
-    files = layout.files()
+    files = new_repo.files()
     config = {
         path: text
         for path, text in files.items()

@@ -7,15 +7,14 @@ from datetime import datetime, timedelta, timezone
 from functools import lru_cache
 from typing import Any
 
+from demandops.config.config import CONFIG_ROOTS
+from demandops.config.load import load
+from demandops.decision import Decision, State, decide
+from demandops.errors import Refused
+from demandops.ledger.apply import Ledger
+from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.staterepo import new_repo
 from model.books import Goal, in_model_words, object_lists
-
-from generator.catalog.catalog import CONFIG_ROOTS
-from generator.catalog.loading import load
-from generator.decision import Decision, State, decide
-from generator.errors import Refused
-from generator.ledger.ledger import Ledger
-from generator.plan.bookkeeping import as_data, bookkeeping
-from generator.staterepo import layout
 
 NOW = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
 
@@ -23,7 +22,7 @@ NOW = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
 @lru_cache
 def skeleton() -> tuple[State, Mapping[str, str]]:
     """Return what `demandops init` lays down: the state, and every file."""
-    files = layout.files()
+    files = new_repo.files()
     config = {path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS}
     return State.of(load(config), Ledger()), files
 
@@ -77,7 +76,7 @@ class Repo:
 
     def view(self) -> dict[str, Any]:
         """Return the bookkeeping, in the model's words."""
-        data = as_data(bookkeeping(self.state.ledger, self.state.catalog), "")
+        data = as_data(bookkeeping(self.state.ledger, self.state.config), "")
         return in_model_words(data, object_lists(self.below("clusters").values()))
 
 

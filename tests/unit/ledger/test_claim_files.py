@@ -5,11 +5,7 @@ from __future__ import annotations
 from datetime import datetime, timedelta, timezone
 from types import MappingProxyType
 
-from hypothesis import given
-from hypothesis import strategies as st
-from trying import examples
-
-from generator.demand.claim import (
+from demandops.demand.claim import (
     ApplicationClaim,
     Claim,
     ClaimKey,
@@ -18,10 +14,13 @@ from generator.demand.claim import (
     SubjectKind,
     demand_id,
 )
-from generator.demand.request import ConnectionType, InputTopic, id_problem
-from generator.demand.route import Route, united
-from generator.ledger import format as ledger_format
-from generator.ledger.ledger import Ledger
+from demandops.demand.demand_request import ConnectionType, InputTopic, id_problem
+from demandops.demand.route import Route, united
+from demandops.ledger import claim_file as ledger_format
+from demandops.ledger.apply import Ledger
+from hypothesis import given
+from hypothesis import strategies as st
+from trying import examples
 
 TRICKY = [
     *("null", "~", "yes", "on", "1", "1e3", "0x1f", "1_000", "12:30:45", "2026-01-31", ".inf"),

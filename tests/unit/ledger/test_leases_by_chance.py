@@ -11,20 +11,20 @@ from random import Random
 from types import MappingProxyType
 from typing import Any
 
+from demandops.config.load import load
+from demandops.decision import Decision, State
+from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim
+from demandops.demand.demand_request import ConnectionType, InputTopic
+from demandops.demand.lease import LONGEST_S, Lease
+from demandops.demand.route import Route, united
+from demandops.identifiers import id_problem
+from demandops.ledger import claim_file as ledger_format
+from demandops.ledger.apply import Ledger
 from hypothesis import given, note
 from hypothesis import strategies as st
 from model.leases import BY_MESSAGE, Goal, Promises, Subject
 from trying import chances, examples
 
-from generator.catalog.identifiers import id_problem
-from generator.catalog.loading import load
-from generator.decision import Decision, State
-from generator.demand.claim import ApplicationClaim, Claim, ConnectionClaim
-from generator.demand.lease import LONGEST_S, Lease
-from generator.demand.request import ConnectionType, InputTopic
-from generator.demand.route import Route, united
-from generator.ledger import format as ledger_format
-from generator.ledger.ledger import Ledger
 from tests.scenarios import running
 
 SLACK_S = 30

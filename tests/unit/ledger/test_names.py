@@ -8,16 +8,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import MappingProxyType
 
+from demandops.config.inventory import Node
+from demandops.decision import Decision
+from demandops.demand.demand_request import id_problem
+from demandops.plan import naming
 from hypothesis import given
 from hypothesis import strategies as st
 from inmemory import Repo
 from model.goals import goal
 from trying import examples, told
-
-from generator.catalog.inventory import Node
-from generator.decision import Decision
-from generator.demand.request import id_problem
-from generator.plan import naming
 
 DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
 ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -238,8 +237,8 @@ def usual_cloud(nodes: list[str], node: str) -> str:
 def with_nodes(nodes: list[str]) -> Repo:
     """Return a new repo whose inventory lists further nodes, with any ids."""
     repo = Repo()
-    catalog = repo.state.catalog
-    (domain,) = catalog.domains.values()
+    config = repo.state.config
+    (domain,) = config.domains.values()
     more = {
         id_: Node(
             id=id_,
@@ -250,12 +249,12 @@ def with_nodes(nodes: list[str]) -> Repo:
         )
         for id_ in nodes
     }
-    catalog = replace(
-        catalog,
-        nodes=MappingProxyType({**catalog.nodes, **more}),
-        domain_of=MappingProxyType({**catalog.domain_of, **dict.fromkeys(more, domain)}),
+    config = replace(
+        config,
+        nodes=MappingProxyType({**config.nodes, **more}),
+        domain_of=MappingProxyType({**config.domain_of, **dict.fromkeys(more, domain)}),
     )
-    repo.state = replace(repo.state, catalog=catalog)
+    repo.state = replace(repo.state, config=config)
     return repo
 
 

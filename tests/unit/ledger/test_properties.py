@@ -10,6 +10,11 @@ from datetime import timedelta
 from random import Random
 
 import pytest
+from demandops.decision import Decision, State, rendered
+from demandops.demand.claim import ApplicationClaim, Claim
+from demandops.errors import Refused
+from demandops.ledger import claim_file as ledger_format
+from demandops.ledger.apply import Ledger
 from hypothesis import assume, given, note
 from hypothesis import strategies as st
 from inmemory import NOW, Repo, outcome
@@ -27,12 +32,6 @@ from model.goals import (
     summary,
 )
 from trying import TIMES, chances, examples, told
-
-from generator.decision import Decision, State, rendered
-from generator.demand.claim import ApplicationClaim, Claim
-from generator.errors import Refused
-from generator.ledger import format as ledger_format
-from generator.ledger.ledger import Ledger
 
 
 def demand_in(claim: Claim) -> tuple[str, str, Demand]:
@@ -316,7 +315,7 @@ def test_rendering_step_by_step_gives_what_rendering_at_once_gives(
         repo.take(request)
         at_once = rendered(repo.state)
         assert repo.below(*{path.split("/")[0] for path in at_once}) == at_once
-        fresh = State.of(repo.state.catalog, ledger_in(repo))
+        fresh = State.of(repo.state.config, ledger_in(repo))
         assert fresh.ledger == repo.state.ledger
     assert rendered(fresh) == at_once
 

@@ -9,17 +9,16 @@ from random import Random
 from typing import Any
 
 import pytest
+from demandops.config.config import Config
+from demandops.decision import Decision, State, decide
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import Operation
+from demandops.demand.lease import Lease
+from demandops.errors import Refused
+from demandops.ledger.apply import Ledger
+from demandops.ledger.restoration import Restoration
 from inmemory import NOW, Repo
 from model.goals import Maker
-
-from generator.catalog.catalog import Catalog
-from generator.decision import Decision, State, decide
-from generator.demand.claim import Claim
-from generator.demand.lease import Lease
-from generator.demand.request import Operation
-from generator.errors import Refused
-from generator.ledger.ledger import Ledger
-from generator.ledger.restore import Restoration
 
 LATER = NOW + timedelta(hours=3)
 
@@ -115,8 +114,8 @@ def test_what_the_configuration_no_longer_has_is_refused() -> None:
     then = repo.state.ledger
     application = next(c for c in then if c.subject.kind.value == "applications")
     ledger = then.replace(application.key, None)
-    catalog = _without_node(repo.state.catalog, application.node)  # type: ignore[union-attr]
-    state = State(catalog, repo.state.engine, ledger)
+    config = _without_node(repo.state.config, application.node)  # type: ignore[union-attr]
+    state = State(config, repo.state.engine, ledger)
     with pytest.raises(Refused) as told:
         decide(state, back_to(then), LATER, repo.files.get)
     found = [one for one in told.value.faults if one.field == "node"]
@@ -125,6 +124,6 @@ def test_what_the_configuration_no_longer_has_is_refused() -> None:
     assert found[0].file.startswith("ledger/applications/")
 
 
-def _without_node(catalog: Catalog, node: str) -> Catalog:
-    nodes = {name: known for name, known in catalog.nodes.items() if name != node}
-    return replace(catalog, nodes=nodes)
+def _without_node(config: Config, node: str) -> Config:
+    nodes = {name: known for name, known in config.nodes.items() if name != node}
+    return replace(config, nodes=nodes)

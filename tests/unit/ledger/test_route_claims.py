@@ -9,13 +9,17 @@ from typing import Any
 
 import pytest
 import yaml
-
-from generator.demand.claim import ConnectionClaim, demand_id
-from generator.demand.request import ConnectionDemand, ConnectionType, DemandRequest, Operation
-from generator.demand.route import Route, united
-from generator.errors import InvalidInput, Refused
-from generator.ledger import format as ledger_format
-from generator.ledger.ledger import Ledger, apply
+from demandops.demand.claim import ConnectionClaim, demand_id
+from demandops.demand.demand_request import (
+    ConnectionDemand,
+    ConnectionType,
+    DemandRequest,
+    Operation,
+)
+from demandops.demand.route import Route, united
+from demandops.errors import InvalidInput, Refused
+from demandops.ledger import claim_file as ledger_format
+from demandops.ledger.apply import Ledger, apply
 
 NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
 STRING = "std_msgs/msg/String"

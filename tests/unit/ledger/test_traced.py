@@ -5,30 +5,30 @@ from __future__ import annotations
 from random import Random
 
 import pytest
+from demandops.config.config import Config
+from demandops.decision import Decision
+from demandops.ledger.apply import ClaimChange, Ledger
+from demandops.plan.incremental_plan import IncrementalPlan
+from demandops.plan.planner import plan
+from demandops.plan.release import Release
+from demandops.plan.release_keys import ReleaseKey, all_keys
 from hypothesis import given
 from hypothesis import strategies as st
 from inmemory import Repo
 from model.goals import Maker
 from trying import TIMES, chances, examples, told
 
-from generator.catalog.catalog import Catalog
-from generator.decision import Decision
-from generator.ledger.ledger import ClaimChange, Ledger
-from generator.plan.planner import ReleaseKey, all_keys, plan
-from generator.plan.release import Release
-from generator.plan.traced import TracedPlan
 
-
-def afresh(ledger: Ledger, catalog: Catalog) -> dict[ReleaseKey, Release]:
-    plans = {key: plan(ledger, catalog, key) for key in all_keys(ledger, catalog)}
+def afresh(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release]:
+    plans = {key: plan(ledger, config, key) for key in all_keys(ledger, config)}
     return {key: release for key, release in plans.items() if release}
 
 
 class Following:
     """What somebody holds who hears only of changes."""
 
-    def __init__(self, catalog: Catalog) -> None:
-        self._plan = TracedPlan(catalog)
+    def __init__(self, config: Config) -> None:
+        self._plan = IncrementalPlan(config)
         self.releases: dict[ReleaseKey, Release] = {}
 
     def take(self, ledger: Ledger, changes: tuple[ClaimChange, ...]) -> int:
@@ -44,18 +44,18 @@ class Following:
 @given(chances, st.integers(1, 14))
 def test_what_is_brought_forward_is_what_is_made_afresh(random: Random, length: int) -> None:
     repo = Repo()
-    following = Following(repo.state.catalog)
+    following = Following(repo.state.config)
     for request in told(Maker(random).sequence(length)):
         taken = repo.take(request)
         if isinstance(taken, Decision):
             following.take(repo.state.ledger, taken.changes.claims)
-            assert following.releases == afresh(repo.state.ledger, repo.state.catalog)
+            assert following.releases == afresh(repo.state.ledger, repo.state.config)
 
 
 @pytest.mark.parametrize("seed", range(2 * TIMES))
 def test_several_changes_at_once(seed: int) -> None:
     repo, random = Repo(), Random(seed)
-    following = Following(repo.state.catalog)
+    following = Following(repo.state.config)
     changes: list[ClaimChange] = []
     for request in Maker(random).sequence(80):
         taken = repo.take(request)
@@ -64,20 +64,20 @@ def test_several_changes_at_once(seed: int) -> None:
         if random.random() < 0.2:
             following.take(repo.state.ledger, tuple(changes))
             changes.clear()
-            assert following.releases == afresh(repo.state.ledger, repo.state.catalog)
+            assert following.releases == afresh(repo.state.ledger, repo.state.config)
 
 
 def test_what_reads_nothing_that_changed_is_left_alone() -> None:
     repo = Repo()
     maker = Maker(Random(1), calm=True)
-    following = Following(repo.state.catalog)
+    following = Following(repo.state.config)
     for request in maker.sequence(20):
         repo.take(request)
     ledger = repo.state.ledger
     everything = following.take(ledger, ())
-    assert everything == len(all_keys(ledger, repo.state.catalog)) > 4
+    assert everything == len(all_keys(ledger, repo.state.config)) > 4
     claim = next(claim for claim in ledger if claim.subject.kind.value == "connections")
     without = ledger.replace(claim.key, None)
     assert 0 < following.take(without, (ClaimChange(claim, None),)) < everything
-    assert following.releases == afresh(without, repo.state.catalog)
+    assert following.releases == afresh(without, repo.state.config)
     assert following.take(without, ()) == 0

@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 import yaml
 from asking import configuration
-
-from generator.catalog.loading import load
-from generator.errors import InvalidInput
+from demandops.config.load import load
+from demandops.errors import InvalidInput
 
 SOUND: dict[str, Any] = {
     "apiVersion": "demandops/v1",
@@ -194,12 +193,12 @@ def test_a_file_that_is_no_override_is_told(path: str) -> None:
 
 
 def test_notes_are_passed_over_and_a_sound_override_is_taken() -> None:
-    catalog = load(
+    config = load(
         configuration(
             {"overrides/README.md": "hello", "overrides/.gitkeep": "", "overrides/a.yaml": text()}
         )
     )
-    assert [one.path for one in catalog.in_force] == ["overrides/a.yaml"]
+    assert [one.path for one in config.in_force] == ["overrides/a.yaml"]
 
 
 def test_a_node_in_no_access_domain_takes_nothing() -> None:

@@ -10,18 +10,17 @@ from itertools import product
 from typing import Any
 
 from asking import configuration
+from demandops.config.config import Config
+from demandops.config.load import load
+from demandops.config.override import Override, OverrideFile, Selector, merged
+from demandops.config.override_conflict import can_meet, commute, contested, overlap
+from demandops.config.policy import matches
+from demandops.plan.checks import trial_demands
+from demandops.plan.overrides.effects import effects_on, with_overrides
+from demandops.plan.overrides.selectors import Traits, fits
+from demandops.plan.release import ServiceRelease
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-
-from generator.catalog.catalog import Catalog
-from generator.catalog.loading import load
-from generator.catalog.override import Override, OverrideFile, Selector, merged
-from generator.catalog.policy import matches
-from generator.catalog.ties import can_meet, commute, contested, overlap
-from generator.plan import rehearsal
-from generator.plan.matching import Traits, fits
-from generator.plan.overrides import effects_on, with_overrides
-from generator.plan.release import ServiceRelease
 
 TEXTS = ["".join(chars) for size in range(6) for chars in product("ab", repeat=size)]
 pattern = st.text("ab*?", min_size=1, max_size=4)
@@ -38,7 +37,7 @@ def test_patterns_overlap_just_where_some_text_fits_both(one: str, other: str) -
 
 
 @lru_cache
-def catalog() -> Catalog:
+def config() -> Config:
     return load(configuration())
 
 
@@ -83,11 +82,11 @@ selector = fields.filter(bool).map(Selector.model_validate)
 @given(st.lists(selector, min_size=1, max_size=2), st.lists(selector, min_size=1, max_size=2))
 @settings(max_examples=300)
 def test_selectors_that_cannot_meet_never_do(one: list[Selector], other: list[Selector]) -> None:
-    if can_meet(one, other, catalog()):
+    if can_meet(one, other, config()):
         return
-    assert not can_meet(other, one, catalog())
+    assert not can_meet(other, one, config())
     for traits in RELEASES:
-        hit = [any(fits(s, traits, catalog()) for s in side) for side in (one, other)]
+        hit = [any(fits(s, traits, config()) for s in side) for side in (one, other)]
         assert not all(hit), traits
 
 
@@ -111,7 +110,7 @@ def test_selectors_apart_in_what_a_release_has_one_of_do_not_meet() -> None:
     for expected, pairs in ((False, apart), (True, together)):
         for pair in pairs:
             one, other = (Selector.model_validate(fields) for fields in pair)
-            assert can_meet([one], [other], catalog()) is expected, pair
+            assert can_meet([one], [other], config()) is expected, pair
 
 
 json = st.recursive(
@@ -170,7 +169,7 @@ effects = st.fixed_dictionaries(
 
 @lru_cache
 def _release() -> ServiceRelease:
-    (made,) = rehearsal.releases(catalog()).values()
+    (made,) = trial_demands.releases(config()).values()
     return made[0]
 
 
@@ -195,11 +194,11 @@ def _override(name: str, fields: dict[str, Any]) -> Override:
 
 def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
     release = _release()
-    by = [(one, effects_on(release, one, catalog())) for one in overrides]
-    shaped = with_overrides(release, [pair for pair in by if pair[1]], catalog())
+    by = [(one, effects_on(release, one, config())) for one in overrides]
+    shaped = with_overrides(release, [pair for pair in by if pair[1]], config())
     assert isinstance(shaped, ServiceRelease)
     values: Any = {}
     for _, patch in shaped.shaping.patches:
         values = merged(values, patch)
-    images = {name: shaped.shaping.image(name, catalog()) for name in release.service.images}
+    images = {name: shaped.shaping.image(name, config()) for name in release.service.images}
     return shaped.replicas, shaped.node, shaped.shaping.held, repr(_sorted(values)), images

@@ -16,18 +16,18 @@ import yaml
 sys.path.insert(0, str(Path(__file__).parents[1] / "demand"))
 
 from asking import NOW, skeleton
+from demandops.config.load import load
+from demandops.decision import State, rendered
+from demandops.demand.claim import Subject, SubjectKind
+from demandops.demand.route import Route
+from demandops.errors import InvalidInput, Refused
+from demandops.plan.connection_clients import BridgeKey, EndKey
+from demandops.plan.release_keys import affected
+from demandops.render.changes.changeset import ReleaseChange
+from demandops.render.connections import client_schema
+from demandops.render.connections.ros import dds_type
 from test_carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, state
 
-from generator.catalog.loading import load
-from generator.decision import State, rendered
-from generator.demand.claim import Subject, SubjectKind
-from generator.demand.route import Route
-from generator.errors import InvalidInput, Refused
-from generator.plan.clients import BridgeKey, EndKey
-from generator.plan.planner import affected
-from generator.render.changeset import ReleaseChange
-from generator.render.connections import schema
-from generator.render.connections.ros import dds_type
 from tests import demanding
 
 
@@ -85,7 +85,7 @@ class TestZenoh:
         world.send(demand("zenoh", {"/b": "/b"}, id="other", source="vehicle01"))
         world.send(demand("zenoh"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected(before, world.state.ledger, world.state.catalog, [subject])
+        keys = affected(before, world.state.ledger, world.state.config, [subject])
         assert keys == (BridgeKey("vehicle00"), BridgeKey("edge"))
         assert [(found.name, found.change) for found in world.releases] == [
             ("zenoh-vehicle00", "start"),
@@ -98,7 +98,7 @@ class TestZenoh:
         before = world.state.ledger
         world.send(demand("mqtt"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected(before, world.state.ledger, world.state.catalog, [subject])
+        keys = affected(before, world.state.ledger, world.state.config, [subject])
         assert keys == (EndKey("c", "source"), EndKey("c", "target"))
 
     def test_its_cost_does_not_grow_with_connections_elsewhere(self) -> None:
@@ -290,8 +290,8 @@ class TestMqtt:
         before = state()
         files = dict(skeleton())
         files["inventory/brokers.yaml"] += "    tls: {}\n"
-        catalog = load({path: text for path, text in files.items() if "README" not in path})
-        world = World(State.of(catalog, before.ledger))
+        config = load({path: text for path, text in files.items() if "README" not in path})
+        world = World(State.of(config, before.ledger))
         world.send(demand("mqtt"))
         for path, text in world.files.items():
             if "mqtt-" in path and path.startswith("clusters"):
@@ -395,7 +395,7 @@ class TestSchemas:
     )
     def test_it_is_told(self, kind: str, configuration: dict[str, Any], expected: str) -> None:
         with pytest.raises(InvalidInput) as invalid:
-            schema.check(kind, configuration, "x")
+            client_schema.check(kind, configuration, "x")
         assert expected in [str(found) for found in invalid.value.faults]
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
@@ -406,11 +406,11 @@ class TestSchemas:
         for data in world.clients().values():
             (text,) = data.values()
             whole = yaml.safe_load(text)
-            schema.check(kind, whole, "x")
+            client_schema.check(kind, whole, "x")
             for spot in _mappings(whole):
                 spot["surplus"] = 1
                 with pytest.raises(InvalidInput):
-                    schema.check(kind, whole, "x")
+                    client_schema.check(kind, whole, "x")
                 del spot["surplus"]
 
 

@@ -21,10 +21,9 @@ from asking import (
     goal,
     perception,
 )
-
-from generator.decision import rendered
-from generator.errors import InvalidInput
-from generator.render.check import check_files
+from demandops.decision import rendered
+from demandops.errors import InvalidInput
+from demandops.render.output_check import check_files
 
 EXPERIMENT = sorted((Path(__file__).parents[3] / "examples" / "experiment").glob("*.yaml"))
 BUILT_IN = {"v1", "apps/v1", "rbac.authorization.k8s.io/v1"}

@@ -7,13 +7,13 @@ from datetime import timedelta
 from types import MappingProxyType
 
 import pytest
+from demandops.demand.claim import ConnectionClaim
+from demandops.demand.demand_request import ConnectionType
+from demandops.demand.lease import Lease
+from demandops.demand.route import Route
+from demandops.ledger.apply import Ledger
+from demandops.service.timing.lease_expiry import LeaseClock
 
-from generator.demand.claim import ConnectionClaim
-from generator.demand.lease import Lease
-from generator.demand.request import ConnectionType
-from generator.demand.route import Route
-from generator.ledger.ledger import Ledger
-from generator.service.expiry import LeaseClock
 from tests.scenarios.running import START, Clocks, rebuilt
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 
 import pytest
-
-from generator.service.looking import Link, Looks, interval_s
+from demandops.service.timing.polling import Link, PollTimer, interval_s
 
 
 class Clock:
@@ -17,8 +16,8 @@ class Clock:
         return self.now
 
 
-def looks(clock: Clock, interval: float, *, embedded: bool = False) -> Looks:
-    return Looks(interval, embedded=embedded, steady=clock, jittered=lambda pause: pause)
+def looks(clock: Clock, interval: float, *, embedded: bool = False) -> PollTimer:
+    return PollTimer(interval, embedded=embedded, steady=clock, jittered=lambda pause: pause)
 
 
 def test_the_first_look_is_due_at_once_and_the_next_after_the_interval() -> None:
@@ -83,7 +82,7 @@ def test_a_repository_on_this_disk_is_looked_at_every_second() -> None:
 
 
 def test_by_chance_looks_come_earlier_and_never_later() -> None:
-    made = Looks(100, steady=Clock())
+    made = PollTimer(100, steady=Clock())
     pauses = set()
     for _ in range(50):
         made.done(reached=True)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from generator.service.pace import FIRST_PAUSE_S, LONGEST_AWAY_S, LONGEST_TURN_S, Pace
+from demandops.service.timing.backoff import FIRST_PAUSE_S, LONGEST_AWAY_S, LONGEST_TURN_S, Backoff
 
 
 def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
-    pace = Pace(200)
+    pace = Backoff(200)
     away = [pace.away() for _ in range(20)]
     assert max(away) <= LONGEST_AWAY_S
     assert min(away[-5:]) >= LONGEST_AWAY_S / 2
@@ -16,7 +16,7 @@ def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
 
 
 def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew() -> None:
-    pace = Pace(200)
+    pace = Backoff(200)
     for _ in range(10):
         pace.away()
     pace.overtaken(10, 0.1, 1.0)
@@ -28,7 +28,7 @@ def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew()
 
 
 def test_a_line_is_as_long_as_can_be_judged_while_it_is_pushed() -> None:
-    pace = Pace(200)
+    pace = Backoff(200)
     assert pace.share == 200
     pace.overtaken(100, judging_s=0.1, pushing_s=0.2)
     assert pace.share == 100

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from demandops import strict_yaml
+from demandops.cluster.health import Named
+from demandops.decision import decide
+from demandops.service import rollout_targets
 
-from generator import yamlio
-from generator.cluster.health import Named
-from generator.decision import decide
-from generator.service import targets
 from tests.golden.cases import NOW, requests_of, start
 
 
@@ -17,8 +17,8 @@ from tests.golden.cases import NOW, requests_of, start
 )
 def test_a_place_knows_by_which_controller_it_is_kept(case: str, application: Named | None) -> None:
     state, files = start(case)
-    goal = yamlio.load(requests_of(case)[0].read_text())
-    found = targets.of_state(decide(state, goal, NOW, files.get).state)
+    goal = strict_yaml.load(requests_of(case)[0].read_text())
+    found = rollout_targets.of_state(decide(state, goal, NOW, files.get).state)
     assert {target.name for release, target in found} == {release.name for release, _ in found}
     assert {target.place.application for _, target in found} == {application}
     assert {target.by_helm for _, target in found} == {True, False}

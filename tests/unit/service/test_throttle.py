@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 
-from generator.catalog.catalog import CONFIG_ROOTS, Catalog
-from generator.catalog.loading import load
-from generator.demand.request import ApplicationDemand, DemandRequest, Operation
-from generator.service.throttle import Throttle
-from generator.staterepo import layout
+from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.load import load
+from demandops.demand.demand_request import ApplicationDemand, DemandRequest, Operation
+from demandops.service.timing.rate_limit import RateLimit
+from demandops.staterepo import new_repo
 
 START = datetime(2026, 3, 1, 12, 0, tzinfo=timezone.utc)
 
 
-def limited(most: int) -> Catalog:
-    files = {p: t for p, t in layout.files().items() if p.split("/")[0] in CONFIG_ROOTS}
+def limited(most: int) -> Config:
+    files = {p: t for p, t in new_repo.files().items() if p.split("/")[0] in CONFIG_ROOTS}
     domains = files["policy/access-domains.yaml"]
     files["policy/access-domains.yaml"] = domains.replace(
         "    namespace:", f"    quotas: {{demandsPerMinute: {most}}}\n    namespace:", 1
@@ -38,8 +38,8 @@ class Sending:
     """Sends demands to a throttle that allows two a minute."""
 
     def __init__(self) -> None:
-        self.throttle = Throttle()
-        self._catalog = limited(2)
+        self.throttle = RateLimit()
+        self._config = limited(2)
         self._count = 0
 
     def send(self, requester: str, at_s: float, operation: str = "") -> bool:
@@ -47,7 +47,7 @@ class Sending:
         self._count += 1
         moment = START + timedelta(seconds=at_s)
         faults = self.throttle.faults(
-            request(requester), self._catalog, operation or f"op-{self._count}", moment
+            request(requester), self._config, operation or f"op-{self._count}", moment
         )
         return not list(faults)
 

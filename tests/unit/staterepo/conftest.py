@@ -12,21 +12,20 @@ from typing import Any
 
 import pygit2
 import pytest
-
-from generator.catalog.catalog import CONFIG_ROOTS
-from generator.catalog.loading import load
-from generator.decision import Decision, State, decide
-from generator.ledger.ledger import Ledger
-from generator.staterepo import layout
+from demandops.config.config import CONFIG_ROOTS
+from demandops.config.load import load
+from demandops.decision import Decision, State, decide
+from demandops.ledger.apply import Ledger
+from demandops.staterepo import new_repo
 
 NOW = datetime(2026, 3, 1, 12, 0, 7, tzinfo=timezone.utc)
 
 
 @lru_cache(maxsize=1)
 def _fresh() -> State:
-    files = layout.files()
-    catalog = load({path: files[path] for path in files if path.split("/")[0] in CONFIG_ROOTS})
-    return State.of(catalog, Ledger())
+    files = new_repo.files()
+    config = load({path: files[path] for path in files if path.split("/")[0] in CONFIG_ROOTS})
+    return State.of(config, Ledger())
 
 
 class Desk:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-from generator.errors import StateRepoError
-from generator.staterepo.address import is_url, without_secrets
-from generator.staterepo.remote import connect
-from generator.staterepo.repository import RemoteAway
+from demandops.errors import StateRepoError
+from demandops.staterepo.git.address import is_url, without_secrets
+from demandops.staterepo.git.connect import connect
+from demandops.staterepo.git.repository import RemoteAway
 
 URLS = [
     "https://example.org/state.git",

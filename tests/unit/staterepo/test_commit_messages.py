@@ -8,12 +8,11 @@ from typing import Any
 
 import pygit2
 import pytest
-
-from generator.catalog.identifiers import id_problem
-from generator.errors import fault
-from generator.render.changeset import ReleaseChange
-from generator.staterepo import history, message
-from generator.staterepo import tree as trees
+from demandops.errors import fault
+from demandops.identifiers import id_problem
+from demandops.render.changes.changeset import ReleaseChange
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history import commit_log, commit_message
 
 CONNECTION = {
     "id": "station00/edge",
@@ -27,7 +26,7 @@ CONNECTION = {
 
 
 def test_a_join_says_what_starts_for_whom_and_what_is_missing(desk: Any) -> None:
-    text = message.of_decision(desk.join("vehicle00", "station00"), "op-1", desk.now)
+    text = commit_message.of_decision(desk.join("vehicle00", "station00"), "op-1", desk.now)
     assert text == (
         "Join edge/fusion\n"
         "\n"
@@ -56,7 +55,7 @@ def test_a_join_says_what_starts_for_whom_and_what_is_missing(desk: Any) -> None
 def test_a_further_requester_changes_nothing_that_runs(desk: Any) -> None:
     desk.join("vehicle00")
     desk.decide({"id": "link", "connections": [CONNECTION]})
-    text = message.of_decision(desk.join("vehicle01"), "op-2", desk.now)
+    text = commit_message.of_decision(desk.join("vehicle01"), "op-2", desk.now)
     assert text == (
         "Join edge/fusion\n"
         "\n"
@@ -77,7 +76,7 @@ def test_a_further_requester_changes_nothing_that_runs(desk: Any) -> None:
 
 def test_a_further_topic_says_what_of_a_release_changes(desk: Any) -> None:
     desk.join("vehicle00")
-    lines = message.of_decision(
+    lines = commit_message.of_decision(
         desk.join("vehicle00", cloud="/stations/station00/rear"), "op-2", desk.now
     ).split("\n")
     start = lines.index("Desired state:")
@@ -104,7 +103,7 @@ def test_a_release_says_what_stops_and_what_was_not_held(desk: Any) -> None:
         ],
         "connections": [CONNECTION],
     }
-    text = message.of_decision(desk.decide(goal), "op-3", desk.now)
+    text = commit_message.of_decision(desk.decide(goal), "op-3", desk.now)
     assert text == (
         "Release edge/fusion\n"
         "\n"
@@ -131,7 +130,7 @@ def test_a_release_says_what_stops_and_what_was_not_held(desk: Any) -> None:
 def test_following_people_says_what_changed_and_what_was_not_taken_in() -> None:
     releases = [ReleaseChange("of-edge", "change", "object-fusion on edge", ("- replicas 1",))]
     problems = [fault("nodes[0].id", "stands twice; remove one").within("inventory/nodes.yaml")]
-    assert message.of_follow(releases, "c" * 40, "b" * 40, problems) == (
+    assert commit_message.of_follow(releases, "c" * 40, "b" * 40, problems) == (
         "Carry out changes made in the state repo\n"
         "\n"
         "Why: commits up to cccccccccccc changed what is configured or booked.\n"
@@ -152,7 +151,7 @@ def test_following_people_says_what_changed_and_what_was_not_taken_in() -> None:
 
 def test_a_subject_line_stays_short_however_long_the_ids(desk: Any) -> None:
     decision = desk.join("vehicle00", application="edge/" + "fusion" * 40)
-    subject = message.of_decision(decision, "op-1", desk.now).split("\n")[0]
+    subject = commit_message.of_decision(decision, "op-1", desk.now).split("\n")[0]
     assert subject == "Join edge/" + ("fusion" * 40)[:79] + "…"
     assert len(subject) == 90
 
@@ -213,10 +212,10 @@ def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly
     for name in NASTY:
         assert id_problem(name) == "", name
         decision = desk.join(name)
-        text = message.of_decision(decision, "op-1", desk.now)
+        text = commit_message.of_decision(decision, "op-1", desk.now)
         try:
-            who = message.author(decision, desk.now)
-            committer = message.generator_signature(desk.now)
+            who = commit_message.author(decision, desk.now)
+            committer = commit_message.generator_signature(desk.now)
             commit = repo.create_commit(None, who, committer, text, tree, parents)
         except Exception as error:
             failed.append(f"{name!r}: {error!r}")
@@ -226,7 +225,7 @@ def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly
         assert who.email.endswith("@demandops.invalid")
         assert who.name.strip()
         assert len(who.name) <= 200
-        assert history.entry_of(repo[commit].peel(pygit2.Commit)).trailers["Requester"] == [name]
+        assert commit_log.entry_of(repo[commit].peel(pygit2.Commit)).trailers["Requester"] == [name]
     repo.references.create("refs/heads/main", parents[0])
     fsck = _git(repo, "fsck", "--strict", "--no-dangling")
     read_back = {
@@ -253,7 +252,7 @@ def test_the_author_is_the_requesters_as_listed(
     desk: Any, names: tuple[str, ...], wanted: str
 ) -> None:
     decision = desk.join(*names)
-    who = message.author(decision, desk.now)
+    who = commit_message.author(decision, desk.now)
     assert who.name == wanted
     demand = decision.changes.claims[0].key.demand
     assert who.email == f"{demand}@demandops.invalid"

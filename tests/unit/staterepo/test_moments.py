@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pygit2
 import pytest
-
-from generator.errors import StateRepoError
-from generator.staterepo import moments
+from demandops.errors import StateRepoError
+from demandops.staterepo.history import revisions
 
 NOW = datetime(2026, 1, 31, 12, 0, 30, tzinfo=timezone.utc)
 
@@ -37,8 +36,8 @@ def at(text: str) -> datetime:
     ],
 )
 def test_a_time_begins_and_ends(text: str, begins: str, ends: str) -> None:
-    assert moments.moment(text, NOW) == at(begins)
-    assert moments.moment(text, NOW, end=True) == at(ends)
+    assert revisions.moment(text, NOW) == at(begins)
+    assert revisions.moment(text, NOW, end=True) == at(ends)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +48,7 @@ def test_a_time_begins_and_ends(text: str, begins: str, ends: str) -> None:
     ),
 )
 def test_what_is_no_time(text: str) -> None:
-    assert moments.moment(text, NOW) is None
+    assert revisions.moment(text, NOW) is None
 
 
 @pytest.fixture
@@ -69,7 +68,7 @@ def repo(tmp_path: Path) -> pygit2.Repository:
 def resolved(repo: pygit2.Repository, text: str) -> str:
     tip = repo.references["refs/heads/main"].target
     assert isinstance(tip, pygit2.Oid)
-    return moments.resolve(repo, tip, text, NOW).message
+    return revisions.resolve(repo, tip, text, NOW).message
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,8 @@ from random import Random
 
 import pygit2
 import pytest
-
-from generator.staterepo import paths
-from generator.staterepo import tree as trees
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history import path_history
 
 PATH = "clusters/c/d/n/r.yaml"
 
@@ -48,7 +47,7 @@ class History:
         return set(said.split())
 
     def ours(self, path: str) -> list[str]:
-        return [t.entry.commit for t in paths.touching(self.repo, self.made[-1], path)]
+        return [t.entry.commit for t in path_history.touching(self.repo, self.made[-1], path)]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -79,26 +78,26 @@ def test_the_last_time_that_something_stood_there(tmp_path: Path) -> None:
     first = history.commit("c", 2)
     second = history.commit("d", 3)
     tip = history.commit("d", 4)
-    found = paths.of_path(history.repo, tip, PATH, 1)
+    found = path_history.of_path(history.repo, tip, PATH, 1)
     assert found.started and found.started.commit == str(started)
     assert ([one.commit for one in found.newest], found.more) == ([str(second)], 1)
     assert found.stopped is None
     stopped = history.commit(None, 5)
-    gone = paths.of_path(history.repo, stopped, PATH, 9)
+    gone = path_history.of_path(history.repo, stopped, PATH, 9)
     assert gone.stopped and gone.stopped.commit == str(stopped)
     assert [one.commit for one in gone.newest] == [str(second), str(first)]
     assert gone.started == found.started
-    never = paths.of_path(history.repo, stopped, "nothing/there", 9)
-    assert never == paths.PathHistory(None, (), 0, None)
+    never = path_history.of_path(history.repo, stopped, "nothing/there", 9)
+    assert never == path_history.PathHistory(None, (), 0, None)
 
 
 def test_where_a_release_is_or_once_was(tmp_path: Path) -> None:
     history = History(tmp_path / "r.git")
     there = history.commit("a")
     gone = history.commit(None, 0)
-    assert paths.called(history.repo, there, "r") == PATH
-    assert paths.called(history.repo, gone, "r") is None
-    assert paths.once_called(history.repo, gone, "r") == PATH
-    assert paths.once_called(history.repo, gone, "q") is None
-    assert paths.once_called(history.repo, gone, "*") is None
-    assert paths.ever_stopped(history.repo, gone) == {"r"}
+    assert path_history.called(history.repo, there, "r") == PATH
+    assert path_history.called(history.repo, gone, "r") is None
+    assert path_history.once_called(history.repo, gone, "r") == PATH
+    assert path_history.once_called(history.repo, gone, "q") is None
+    assert path_history.once_called(history.repo, gone, "*") is None
+    assert path_history.ever_stopped(history.repo, gone) == {"r"}

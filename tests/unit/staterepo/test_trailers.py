@@ -9,12 +9,11 @@ from typing import Any
 
 import pygit2
 import pytest
+from demandops.identifiers import id_problem
+from demandops.staterepo.history import commit_log, commit_message
+from demandops.staterepo.history.commit_log import operations_since, trailers_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-
-from generator.catalog.identifiers import id_problem
-from generator.staterepo import history, message
-from generator.staterepo.history import operations_since, trailers_of
 
 
 @pytest.mark.parametrize(
@@ -63,11 +62,11 @@ def test_every_id_is_read_back_by_git_and_by_us_as_it_was(
     desk: Any, repo: pygit2.Repository, names: list[str], request: str, application: str
 ) -> None:
     decision = type(desk)().join(*names, id=request, application=application)
-    text = message.of_decision(decision, "op-1", desk.now)
-    who = message.author(decision, desk.now)
+    text = commit_message.of_decision(decision, "op-1", desk.now)
+    who = commit_message.author(decision, desk.now)
     tree = repo.TreeBuilder().write()
     commit = repo.create_commit(None, who, who, text, tree, [])
-    ours = history.entry_of(repo[commit].peel(pygit2.Commit)).trailers
+    ours = commit_log.entry_of(repo[commit].peel(pygit2.Commit)).trailers
     assert ours["Requester"] == names
     assert ours["Request-Id"] == [request]
     assert ours["Application"] == [application]
@@ -122,7 +121,7 @@ def test_the_newest_commit_of_the_generator_is_found_behind_those_of_people(
 ) -> None:
     first = _commit(repo, "op-1")
     person = _commit(repo, "", first)
-    assert history.last_generated(repo, _commit(repo, "", person)) == first
+    assert commit_log.last_generated(repo, _commit(repo, "", person)) == first
     merge = _commit(repo, "", person, _commit(repo, "op-2", first))
-    assert history.last_generated(repo, merge) == first, "along the first parents"
-    assert history.last_generated(repo, _commit(repo, "")) is None
+    assert commit_log.last_generated(repo, merge) == first, "along the first parents"
+    assert commit_log.last_generated(repo, _commit(repo, "")) is None

@@ -8,10 +8,9 @@ from contextlib import contextmanager
 
 import pygit2
 import pytest
+from demandops.staterepo.git import tree as trees
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-
-from generator.staterepo import tree as trees
 
 Files = dict[str, str]
 

@@ -1,7 +1,0 @@
-"""DemandOps: from a demand of a connected vehicle to desired state in Git.
-
-The folders are the stages, in the order that data takes: catalog → demand → ledger → plan →
-render → decision → staterepo → service → cli. ``docs/architecture.md`` has one paragraph for each.
-"""
-
-__version__ = "0.1.0"

@@ -1,0 +1,285 @@
+"""``demandops request``: book requests from files, without ROS."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import click
+
+from demandops import strict_yaml
+from demandops.cli.output import (
+    SIGNS,
+    console,
+    errors,
+    output_option,
+    print_json,
+    progress,
+    signing_option,
+    state_repo_option,
+)
+from demandops.decision import Decision, admit, decide, form_faults
+from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
+from demandops.service import Generator, Receipt
+from demandops.service.approvals.proposal import where_told
+from demandops.staterepo import reader
+
+
+@dataclass(frozen=True, slots=True)
+class _Document:
+    file: str
+    goal: Any
+
+    @property
+    def request_id(self) -> str:
+        goal = self.goal if isinstance(self.goal, dict) else {}
+        id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
+        return id if isinstance(id, str) else ""
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, metavar="FILE…")
+@state_repo_option
+@click.option("--dry-run", is_flag=True, help="Show the consequence and book nothing.")
+@click.option(
+    "--wait",
+    is_flag=True,
+    help="Wait until demands that need approval are decided. Without it they are proposed, and the "
+    "next generator to start on this machine looks after them.",
+)
+@signing_option
+@output_option
+@click.pass_context
+def request(
+    ctx: click.Context,
+    files: tuple[str, ...],
+    state_repo: str,
+    dry_run: bool,
+    wait: bool,
+    signing_key: Path | None,
+    output: str,
+) -> None:
+    """Book demand requests from files.
+
+    FILE is the action goal of DeploymentRequest as YAML, as `ros2 action send_goal` takes it, or a
+    document of the kind Demand (docs/demand.md), or - for standard input. Several files, or
+    documents in one, are taken in order; one that is refused does not stop the next. All are parsed
+    before any is booked.
+    """
+    documents = [document for file in files for document in _documents(file)]
+    if not documents:
+        raise InvalidInput([fault("", "no request in " + ", ".join(files))])
+    faulty = [form_faults(document.goal) for document in documents]
+    if any(faulty):
+        rows = _unbooked(documents, faulty, state_repo)
+    elif dry_run:
+        rows = _rehearse(documents, state_repo, output)
+    else:
+        rows = _book(documents, state_repo, wait, signing_key)
+    if output == "json":
+        print_json(rows)
+    else:
+        _print(rows, documents, dry_run)
+    if any(row["outcome"] == "refused" for row in rows):
+        ctx.exit(1)
+
+
+def _documents(file: str) -> Iterable[_Document]:
+    name = "standard input" if file == "-" else file
+    try:
+        data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
+        text = data.decode("utf-8")
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InvalidInput([fault("", f"cannot be read: {reason}").within(name)]) from None
+    except UnicodeDecodeError:
+        raise InvalidInput([fault("", "is no UTF-8 text").within(name)]) from None
+    try:
+        return [_Document(name, goal) for goal in strict_yaml.load_all(text) if goal is not None]
+    except InvalidInput as error:
+        raise InvalidInput(strict_yaml.faults_in(error, name)) from None
+
+
+def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str, Any]:
+    return {
+        "index": index,
+        "request_id": request_id,
+        "outcome": outcome,
+        "commit": None,
+        "errors": [],
+        "warnings": [],
+        "not_held": [],
+    } | more
+
+
+def _unbooked(
+    documents: list[_Document], faulty: list[list[Fault]], state_repo: str
+) -> list[dict[str, Any]]:
+    """Tell every fault of the documents that do not parse, those of their contents as well."""
+    with reader.opened(state_repo) as repo:
+        state = repo.snapshot().state
+    rows = []
+    for index, (document, found) in enumerate(zip(documents, faulty, strict=True)):
+        faults = [fault("", "not booked, for another request of this call does not parse")]
+        if found:
+            try:
+                admit(state, document.goal)
+            except InvalidInput as error:
+                faults = list(error.faults)
+        rows.append(_row(index, document.request_id, "refused", errors=_errors(faults)))
+    return rows
+
+
+def _errors(faults: Iterable[Fault]) -> list[dict[str, str]]:
+    return [{"field": found.field, "message": _message(found)} for found in faults]
+
+
+def _message(found: Fault) -> str:
+    return f"{found.file}: {found.message}" if found.file else found.message
+
+
+def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str, Any]:
+    faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
+    return _row(index, document.request_id, "refused", errors=_errors(faults))
+
+
+def _book(
+    documents: list[_Document], state_repo: str, wait: bool, signing_key: Path | None
+) -> list[dict[str, Any]]:
+    with progress("reading the ledger") as tell:
+        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=tell)
+    try:
+        answers = [_handed_in(generator, document, wait) for document in documents]
+        rows = []
+        for index, (document, answer) in enumerate(zip(documents, answers, strict=True)):
+            try:
+                told = answer.result()
+            except DemandOpsError as error:
+                rows.append(_refused(index, document, error))
+                continue
+            if isinstance(told, Receipt):
+                rows.append(_booked(index, told))
+            else:
+                rows.append(_row(index, document.request_id, "proposed", proposal=told))
+        return rows
+    finally:
+        generator.close(timeout=0)
+
+
+def _handed_in(
+    generator: Generator, document: _Document, wait: bool
+) -> Future[Receipt | dict[str, str]]:
+    """Hand a request in; the future gives its receipt, or where it awaits approval."""
+    answer: Future[Receipt | dict[str, str]] = Future()
+    name = document.request_id
+
+    def listen(stage: str, text: str) -> None:
+        if stage != "proposed":
+            return
+        if wait:
+            errors.print(f"{document.file}: request '{name}' {text}")
+        elif not answer.done():
+            answer.set_result(where_told(text))
+
+    def finish(future: Future[Receipt]) -> None:
+        if answer.done():
+            return
+        error = future.exception()
+        if error is not None:
+            answer.set_exception(error)
+        else:
+            answer.set_result(future.result())
+
+    generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
+    return answer
+
+
+def _booked(index: int, receipt: Receipt) -> dict[str, Any]:
+    return _row(
+        index,
+        receipt.request_id,
+        receipt.outcome,
+        commit=receipt.commit,
+        warnings=list(receipt.warnings),
+        not_held=list(receipt.not_held),
+    )
+
+
+def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[dict[str, Any]]:
+    """Decide every request on top of the one before, in memory only."""
+    rows = []
+    with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
+        repo.refuse_other_rendering()
+        state = repo.snapshot(progress=tell).state
+        standing, written = repo.file_reader(), dict[str, str | None]()
+
+        def read(path: str) -> str | None:
+            return written[path] if path in written else standing(path)
+
+        for index, document in enumerate(documents):
+            try:
+                decision = decide(state, document.goal, datetime.now(timezone.utc), read)
+            except InvalidInput as error:
+                rows.append(_refused(index, document, error))
+                continue
+            state = decision.state
+            written.update(decision.files)
+            if output == "text":
+                _show_consequence(index, decision)
+            rows.append(
+                _row(
+                    index,
+                    decision.request.id,
+                    "proposed" if decision.approval else decision.outcome,
+                    warnings=list(decision.warnings),
+                    not_held=list(decision.changes.not_held),
+                    **({"approval": list(decision.approval)} if decision.approval else {}),
+                )
+            )
+    return rows
+
+
+def _show_consequence(index: int, decision: Decision) -> None:
+    outcome = "proposed" if decision.approval else decision.outcome
+    console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
+    for who in decision.approval:
+        console().print(f"  needs approval: {who} asks for it")
+    show_releases(decision)
+
+
+def show_releases(decision: Decision) -> None:
+    """Print what a decision changes: releases, and the files that are written or removed."""
+    out = console()
+    for release in decision.releases:
+        out.print(f"  {SIGNS[release.change]} {release.name} ({release.what})")
+        for detail in release.details:
+            out.print(f"      {detail}")
+    for path, text in sorted(decision.files.items()):
+        out.print(f"  {'remove' if text is None else 'write '} {path}")
+
+
+def _print(rows: list[dict[str, Any]], documents: list[_Document], dry_run: bool) -> None:
+    out = console()
+    for row, document in zip(rows, documents, strict=True):
+        title = f"{document.file}: request {row['index']} '{row['request_id']}'"
+        if row["outcome"] == "refused":
+            errors.print(f"{title} refused")
+            for error in row["errors"]:
+                where = f"{error['field']}: " if error["field"] else ""
+                errors.print(f"  {where}{error['message']}")
+        elif not dry_run:
+            proposal = row.get("proposal")
+            out.print(
+                f"{title} {row['outcome']} in {row['commit']}"
+                if proposal is None
+                else f"{title} awaiting approval {proposal['branch']} {proposal['link']}".rstrip()
+            )
+        for warning in row["warnings"]:
+            errors.print(f"  warning: {warning}")
+        for item in row["not_held"]:
+            errors.print(f"  not held: {item}")

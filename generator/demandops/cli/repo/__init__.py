@@ -1,0 +1,1 @@
+"""Commands for a whole state repo: lay it down, check, upgrade and verify it."""

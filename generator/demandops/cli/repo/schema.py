@@ -1,0 +1,70 @@
+"""``demandops schema``: JSON Schemas of all that people write, for editors and pipelines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+from pydantic import BaseModel
+
+from demandops.cli.output import console
+from demandops.cluster.access import AccessFile
+from demandops.config.appdef import ApplicationDefinition
+from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
+from demandops.config.override import OverrideFile
+from demandops.config.policy import AccessDomainsFile
+from demandops.config.registry import ChartsFile, ImagesFile
+from demandops.config.repo_settings import RepoSettings
+from demandops.demand.demand_goal import DemandGoal
+from demandops.demand.deployment_request_goal import WireGoal
+
+_SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
+    "access-domains": (AccessDomainsFile, "policy/access-domains.yaml"),
+    "cluster-access": (AccessFile, "the file of `demandops serve --clusters`"),
+    "application": (ApplicationDefinition, "appdefs/<name>/appdef.yaml"),
+    "brokers": (BrokersFile, "inventory/brokers.yaml"),
+    "charts": (ChartsFile, "registry/charts.yaml"),
+    "clusters": (ClustersFile, "inventory/clusters.yaml"),
+    "demand": (DemandGoal, "a demand, for `demandops demand` and `demandops request`"),
+    "deployment-request": (WireGoal, "a goal of DeploymentRequest, for `demandops request`"),
+    "images": (ImagesFile, "registry/images.yaml"),
+    "nodes": (NodesFile, "inventory/nodes.yaml"),
+    "override": (OverrideFile, "overrides/<name>.yaml"),
+    "state-repo": (RepoSettings, "demandops.yaml"),
+}
+
+
+@click.command()
+@click.argument("name", required=False, type=click.Choice(sorted(_SCHEMAS)), metavar="[NAME]")
+@click.option(
+    "--write",
+    "folder",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Write all of them to a folder, as <name>.json.",
+)
+def schema(name: str | None, folder: Path | None) -> None:
+    """Print the JSON Schema of a kind of file; without NAME, which there are.
+
+    Editors check and complete with them; in VS Code with its YAML extension, say, by
+    `# yaml-language-server: $schema=…/nodes.json` in a file's first line.
+    """
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        for each in _SCHEMAS:
+            folder.joinpath(f"{each}.json").write_text(_text(each))
+        console().print(f"{len(_SCHEMAS)} schemas in {folder}")
+    elif name is None:
+        for each, (_, what) in _SCHEMAS.items():
+            console().print(f"{each:20} {what}")
+    else:
+        click.echo(_text(name), nl=False)
+
+
+def _text(name: str) -> str:
+    model, what = _SCHEMAS[name]
+    found: dict[str, Any] = model.model_json_schema(by_alias=True)
+    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": what}
+    return json.dumps({**dialect, **found, "title": what}, indent=2, ensure_ascii=False) + "\n"

@@ -1,0 +1,151 @@
+"""``demandops upgrade``: to this program's rendering, or to the other GitOps controller."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import click
+
+from demandops.cli.output import (
+    console,
+    output_option,
+    print_json,
+    progress,
+    signing_option,
+    state_repo_option,
+)
+from demandops.render.gitops.handover import Step
+from demandops.staterepo import upgrade as upgrading
+from demandops.staterepo.git.signing import Signer
+from demandops.staterepo.upgrade import Upgrade, UpgradeRequest
+
+_MOST_PATHS = 50
+
+
+@click.command()
+@state_repo_option
+@click.option(
+    "--gitops",
+    type=click.Choice(["flux", "argocd"]),
+    help="The controller that is to read the state repo from now on; the one that reads it now "
+    "where left out.",
+)
+@click.option(
+    "--url",
+    metavar="URL",
+    help="Where the clusters fetch the state repo from (https or ssh), for the controller's "
+    "section of demandops.yaml where that is missing; by default what the other's says.",
+)
+@click.option("--dry-run", is_flag=True, help="Show what would be written and write nothing.")
+@click.option(
+    "--yes", is_flag=True, help="Do not ask, on a terminal, before the controller changes."
+)
+@signing_option
+@output_option
+def upgrade(
+    state_repo: str,
+    gitops: str | None,
+    url: str | None,
+    dry_run: bool,
+    yes: bool,
+    signing_key: Path | None,
+    output: str,
+) -> None:
+    """Render everything anew, in one commit.
+
+    Needed after an update of demandops that renders otherwise than before (a generator refuses a
+    state repo of another render version), and to go over from Flux to Argo CD or back. The clusters
+    are then handed over by a person: what to do there, before and after, is printed; docs/argocd.md
+    explains it. Where nothing would change, nothing is committed.
+    """
+    wish = UpgradeRequest(gitops, url)
+    asks = gitops is not None and not yes and output == "text" and sys.stdin.isatty()
+    now = datetime.now(timezone.utc)
+    signer = Signer(signing_key) if signing_key and not dry_run else None
+    with progress("reading the ledger") as tell:
+        if dry_run or asks:
+            made = upgrading.plan(state_repo, wish, now, tell)
+        if asks and not dry_run and made.handover.before:
+            _print_steps("before this, on the clusters:", made.handover.before)
+            if not click.confirm("Is this done?"):
+                raise click.ClickException("nothing was changed; do it first, or say --yes")
+        if not dry_run:
+            made = upgrading.upgrade(state_repo, wish, now, tell, signer)
+    if output == "json":
+        print_json(_data(made, dry_run))
+    else:
+        _print(made, dry_run)
+
+
+def _data(made: Upgrade, dry_run: bool) -> dict[str, Any]:
+    old, new = made.old.repository, made.new.repository
+    outcome = "unchanged" if not made.files else "would-change" if dry_run else "upgraded"
+    return {
+        "outcome": outcome,
+        "commit": made.commit,
+        "render_version": {"from": old.render_version, "to": new.render_version},
+        "gitops": {"from": old.gitops, "to": new.gitops},
+        "written": [path for path, text in made.files.items() if text is not None],
+        "removed": [path for path, text in made.files.items() if text is None],
+        "before": [_step_data(step) for step in made.handover.before],
+        "after": [_step_data(step) for step in made.handover.after],
+    }
+
+
+def _step_data(step: Step) -> dict[str, Any]:
+    return {"cluster": step.cluster, "what": step.what, "commands": list(step.commands)}
+
+
+def _print(made: Upgrade, dry_run: bool) -> None:
+    out = console()
+    new = made.new.repository
+    if not made.files:
+        out.print(
+            f"nothing to do: all is rendered for {new.gitops} by version {new.render_version}, "
+            f"at {made.commit}"
+        )
+        return
+    for line in _told(made, dry_run):
+        out.print(line, soft_wrap=True)
+    if made.handover.before:
+        title = (
+            "before this, on the clusters:"
+            if dry_run
+            else "this was to be done before, on the clusters:"
+        )
+        _print_steps(title, made.handover.before)
+    _print_steps("after it, on the clusters:", made.handover.after)
+
+
+def _told(made: Upgrade, dry_run: bool) -> Iterable[str]:
+    old, new = made.old.repository, made.new.repository
+    written = sum(text is not None for text in made.files.values())
+    done = f"would write {written} and remove" if dry_run else f"wrote {written} and removed"
+    yield f"{done} {len(made.files) - written} files"
+    if old.render_version != new.render_version:
+        yield f"render version {old.render_version} → {new.render_version}"
+    if old.gitops != new.gitops:
+        yield f"gitops {old.gitops} → {new.gitops}"
+        if getattr(old, new.gitops) is None:
+            yield f"{new.gitops}.url {getattr(new, new.gitops).url}"
+    if not dry_run:
+        yield f"in commit {made.commit}"
+        return
+    for path, text in list(made.files.items())[:_MOST_PATHS]:
+        yield f"  {'remove' if text is None else 'write '} {path}"
+    if len(made.files) > _MOST_PATHS:
+        yield f"  and {len(made.files) - _MOST_PATHS} more (--output json names all)"
+
+
+def _print_steps(title: str, steps: Iterable[Step]) -> None:
+    out, clusters = console(), list(steps)
+    if clusters:
+        out.print(f"\n{title}")
+    for step in clusters:
+        out.print(f"- {step.cluster}: {step.what}", soft_wrap=True)
+        for command in step.commands:
+            out.print(f"      {command}", soft_wrap=True)

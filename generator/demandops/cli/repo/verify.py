@@ -1,0 +1,82 @@
+"""``demandops verify``: are the commits what books and configuration give, and signed?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import click
+
+from demandops.cli.output import console, output_option, print_json, progress, state_repo_option
+from demandops.staterepo import reader
+from demandops.staterepo.audit.verification import Verdict
+
+
+@click.command()
+@click.argument("revisions", required=False, metavar="[REV|A..B]")
+@state_repo_option
+@click.option(
+    "--whole",
+    is_flag=True,
+    help="Load and render every commit from nothing, rather than by what differs from the one "
+    "before.",
+)
+@output_option
+def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> None:
+    """Render the ledger of commits again and compare the bytes with what was committed.
+
+    Where people keep policy/allowed-signers, every commit of the generator after it must carry a
+    good signature of a key listed there (docs/audit.md). REV, A and B are commits or times.
+    """
+    with reader.opened(state_repo) as repo, progress("rendering again") as tell:
+        verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=tell)
+    if output == "json":
+        print_json([_row(verdict) for verdict in verdicts])
+    else:
+        out = console()
+        for line in _lines(verdicts):
+            out.print(line)
+    if not all(verdict.holds for verdict in verdicts):
+        click.get_current_context().exit(1)
+
+
+def _row(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "commit": verdict.commit,
+        "summary": verdict.summary,
+        "holds": verdict.holds,
+        "skipped": verdict.skipped or None,
+        "fault": verdict.fault or None,
+        "differing": list(verdict.differing),
+        "touched": list(verdict.touched),
+        "signed": verdict.signed,
+        "signer": verdict.signer or None,
+        "signature": verdict.signature or None,
+    }
+
+
+def _lines(verdicts: list[Verdict]) -> Iterator[str]:
+    for verdict in verdicts:
+        word = "skipped" if verdict.skipped else "holds"
+        word = word if verdict.holds else "DIFFERS" if _differs(verdict) else "UNSIGNED"
+        note = f" ({verdict.skipped})" if verdict.skipped else ""
+        yield f"{verdict.commit[:10]} {word}{note}  {verdict.summary}"
+        if verdict.fault:
+            yield f"    its books cannot be rendered any more: {verdict.fault}"
+        yield from (f"    {path}" for path in verdict.differing)
+        yield from (f"    {path} (not for this commit to change)" for path in verdict.touched)
+        if verdict.signature:
+            yield f"    it {verdict.signature}"
+    skipped = sum(bool(verdict.skipped and verdict.holds) for verdict in verdicts)
+    hold = sum(verdict.holds for verdict in verdicts) - skipped
+    note = f", {skipped} skipped" if skipped else ""
+    yield f"{hold} of {len(verdicts)} commits hold{note}"
+    signed = sum(verdict.signed for verdict in verdicts)
+    if signed:
+        good = sum(bool(verdict.signer) for verdict in verdicts)
+        listed = f", {good} by keys that policy/allowed-signers lists" if good else ""
+        yield f"{signed} of {len(verdicts)} are signed{listed}"
+
+
+def _differs(verdict: Verdict) -> bool:
+    return bool(verdict.fault or verdict.differing or verdict.touched)

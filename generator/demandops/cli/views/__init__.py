@@ -1,0 +1,1 @@
+"""Commands that show: bookkeeping, history, reasons, status."""

@@ -1,0 +1,84 @@
+"""``demandops bookkeeping``: who requests what, now and before."""
+
+from __future__ import annotations
+
+import click
+from rich.table import Table
+
+from demandops.cli.output import (
+    REV_HELP,
+    console,
+    errors,
+    output_option,
+    print_json,
+    progress,
+    state_repo_option,
+)
+from demandops.plan.views.bookkeeping import Bookkeeping, as_data
+from demandops.plan.views.bookkeeping import bookkeeping as derive
+from demandops.staterepo import reader
+
+_NONE = "(nothing)"
+
+
+@click.command()
+@state_repo_option
+@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; the newest by default.")
+@output_option
+def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
+    """Show who requests which service and connection."""
+    with reader.opened(state_repo) as repo:
+        with progress("reading the ledger") as tell:
+            snapshot = repo.snapshot(at, tell)
+        for problem in repo.problems() if at is None else ():
+            errors.print(f"warning: {problem}; its last valid version is in force")
+    books, commit = derive(snapshot.state.ledger, snapshot.state.config), str(snapshot.commit)
+    if output == "json":
+        print_json(as_data(books, commit))
+        return
+    out = console()
+    out.print(services_table(books))
+    out.print(connections_table(books))
+    if books.suspended:
+        out.print(suspended_table(books))
+    out.print(f"at {commit}")
+
+
+def services_table(books: Bookkeeping) -> Table:
+    """Return the services as a table."""
+    table = Table("Service", "Kind", "Node", "For", "Takes in", "Requesters", title="Services")
+    for name, entry in books.services.items():
+        inputs = [topic for topics in entry.inputs.values() for topic in topics]
+        table.add_row(
+            name,
+            entry.service,
+            entry.node,
+            entry.source or ", ".join(entry.applications),
+            "\n".join(inputs),
+            "\n".join(entry.requesters),
+        )
+    if not books.services:
+        table.add_row(_NONE, *[""] * 5)
+    return table
+
+
+def connections_table(books: Bookkeeping) -> Table:
+    """Return the connections as a table."""
+    table = Table("Connection", "From", "To", "Topics", "Requesters", title="Connections")
+    for id, entry in books.connections.items():
+        table.add_row(
+            id, entry.source, entry.target, "\n".join(entry.topics), "\n".join(entry.requesters)
+        )
+    if not books.connections:
+        table.add_row(_NONE, *[""] * 4)
+    return table
+
+
+def suspended_table(books: Bookkeeping) -> Table:
+    """Return the claims that overrides keep from running, as a table."""
+    table = Table("Subject", "Demand", "Requesters", "By", "Reason", title="Suspended")
+    for entry in books.suspended:
+        subject = f"{entry.kind} {entry.id}"
+        requesters = "\n".join(entry.requesters)
+        table.add_row(subject, entry.demand, requesters, entry.override, entry.reason)
+    return table

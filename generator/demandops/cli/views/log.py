@@ -1,0 +1,166 @@
+"""``demandops log``: the commits of the state repo, all or those that one looks for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from itertools import islice
+from typing import Any
+
+import click
+from rich.table import Table
+
+from demandops.cli.output import console, output_option, print_json, state_repo_option
+from demandops.errors import StateRepoError
+from demandops.staterepo import reader
+from demandops.staterepo.history import revisions
+from demandops.staterepo.history.commit_log import LogEntry
+from demandops.staterepo.reader import Reader
+
+_BY_HAND = "by-hand"
+
+
+@dataclass(frozen=True, slots=True)
+class _Filters:
+    """What a commit must fit; nothing where a filter was not given."""
+
+    requester: str | None
+    application: str | None
+    connection: str | None
+    node: str | None
+    demand: str | None
+    operation: str | None
+    since: datetime | None
+    until: datetime | None
+
+
+class _Time(click.ParamType):  # type: ignore[type-arg]
+    """A time, as :func:`demandops.staterepo.history.revisions.moment` takes it."""
+
+    name = "time"
+
+    def __init__(self, *, end: bool) -> None:
+        self._end = end
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> datetime:
+        """Return the time that was written."""
+        found = revisions.moment(str(value), datetime.now(timezone.utc), end=self._end)
+        if found is None:
+            self.fail(f"'{value}' is no time; write it like {revisions.TIMES}", param, ctx)
+        return found
+
+
+@click.command()
+@click.argument("commit_range", required=False, metavar="[REV|A..B]")
+@state_repo_option
+@click.option("--requester", metavar="ID", help="In whose name something was asked or given up.")
+@click.option("--application", metavar="ID", help="About this application.")
+@click.option("--connection", metavar="ID", help="About this connection.")
+@click.option("--node", metavar="ID", help="What runs on this node, or a claim that names it.")
+@click.option("--release", metavar="NAME", help="Those that changed the file of this release.")
+@click.option("--demand", metavar="ID", help="About this demand.")
+@click.option(
+    "--operation",
+    metavar="WORD",
+    help="join, shutdown, put, release, renew, expire, decommission, follow, expire-override, "
+    "rollback, upgrade, init; or by-hand.",
+)
+@click.option(
+    "--since", type=_Time(end=False), metavar="TIME", help=f"Not before: {revisions.TIMES}."
+)
+@click.option("--until", type=_Time(end=True), metavar="TIME", help="Not after, written alike.")
+@click.option("-n", "--max-count", type=click.IntRange(1), default=None, help="At most so many.")
+@output_option
+def log(
+    commit_range: str | None,
+    state_repo: str,
+    max_count: int | None,
+    output: str,
+    **given: Any,  # noqa: ANN401 - as click gives them
+) -> None:
+    """Show the commits of the state repo, newest first; with filters, those that fit all of them.
+
+    REV, A and B are commits, or times like --since takes.
+    """
+    with reader.opened(state_repo) as repo:
+        found = _walked(repo, commit_range, given.pop("release"))
+        entries = list(islice(_fitting(repo, found, _Filters(**given)), max_count))
+    if output == "json":
+        print_json([_row(entry) for entry in entries])
+        return
+    if not entries:
+        console().print("no commit fits")
+        return
+    console().print(_table(entries))
+
+
+def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iterable[LogEntry]:
+    if release is None:
+        return repo.log(commit_range)
+    tip = repo.commit(
+        (commit_range or "").partition("..")[2] or (commit_range or "").partition("..")[0]
+    )
+    path = release if "/" in release else repo.path_called(release, tip)
+    if path is None:
+        raise StateRepoError(f"no release was ever called '{release}'; `demandops why` helps along")
+    return repo.touching(path, commit_range)
+
+
+def _fitting(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Iterable[LogEntry]:
+    trailers = {
+        "Requester": given.requester,
+        "Application": given.application,
+        "Connection": given.connection,
+        "Demand-Id": given.demand,
+    }
+    wanted = [(key, value) for key, value in trailers.items() if value is not None]
+
+    def fits(entry: LogEntry) -> bool:
+        if any(value not in entry.trailers.get(key, ()) for key, value in wanted):
+            return False
+        operation = entry.one("Operation") or _BY_HAND
+        if given.operation is not None and operation != given.operation:
+            return False
+        if given.since is not None and entry.time < given.since:
+            return False
+        if given.until is not None and entry.time > given.until:
+            return False
+        return given.node is None or repo.concerns(entry.commit, given.node)
+
+    return filter(fits, entries)
+
+
+def _table(entries: Iterable[LogEntry]) -> Table:
+    table = Table("Commit", "Time (UTC)", "Operation", "Requesters", "What")
+    for entry in entries:
+        requesters = ", ".join(entry.trailers.get("Requester", ()))
+        if entry.one("Operation") == "rollback":
+            requesters = f"{entry.author}, for {requesters}"
+        table.add_row(
+            entry.commit[:10],
+            entry.time.strftime("%Y-%m-%d %H:%M:%S"),
+            entry.one("Operation") or "by hand",
+            requesters or entry.author,
+            entry.summary,
+        )
+    return table
+
+
+def _row(entry: LogEntry) -> dict[str, Any]:
+    return {
+        "commit": entry.commit,
+        "time": entry.time.isoformat(),
+        "author": entry.author,
+        "summary": entry.summary,
+        "operation": entry.one("Operation") or None,
+        "operation_id": entry.one("Operation-Id") or None,
+        "request_id": entry.one("Request-Id") or None,
+        "demand_ids": entry.trailers.get("Demand-Id", []),
+        "requesters": entry.trailers.get("Requester", []),
+        "applications": entry.trailers.get("Application", []),
+        "connections": entry.trailers.get("Connection", []),
+        "render_version": entry.one("Render-Version") or None,
+    }

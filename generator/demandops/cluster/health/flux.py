@@ -1,0 +1,112 @@
+"""What Flux's objects say about releases. Pure: objects in, health out.
+
+Objects are plain data as the Kubernetes API gives them. Field names as of Flux 2.9
+(kustomize.toolkit.fluxcd.io/v1, helm.toolkit.fluxcd.io/v2).
+"""
+
+from __future__ import annotations
+
+from demandops.cluster.health.deployment import condition, of_client, of_deployment
+from demandops.cluster.health.health import Health, History, Object, Objects, Place, Target, Watched
+
+_HELM_NAME = "helm.toolkit.fluxcd.io/name"
+
+
+def watched(place: Place) -> tuple[Watched, ...]:
+    """Return what must be known to tell how things are at a place."""
+    kinds = ("Kustomization", "GitRepository", "HelmRelease", "Deployment")
+    return tuple(Watched(kind, place.namespace) for kind in kinds)
+
+
+def confirmed_by(place: Place) -> tuple[Watched, ...]:
+    """Return what is read once more before something is healthy: releases, then what they own."""
+    return Watched("HelmRelease", place.namespace), Watched("Deployment", place.namespace)
+
+
+def of_place(place: Place, commit: str, objects: Objects, history: History) -> Health:
+    """Return whether an access domain's Kustomization has applied a commit."""
+    found = objects.get(("Kustomization", place.namespace, place.domain))
+    name = f"Kustomization {place.namespace}/{place.domain}"
+    if found is None:
+        return Health("waiting", "is not there; apply bootstrap/ to the cluster", name)
+    status = found.get("status") or {}
+    reached = _commit(status.get("lastAppliedRevision"))
+    if reached and history.includes(reached, commit):
+        return Health("reconciled")
+    attempted = _commit(status.get("lastAttemptedRevision"))
+    ready = condition(status, "Ready")
+    if ready.get("status") == "False" and attempted and history.includes(attempted, commit):
+        return Health("waiting", str(ready.get("message", "")), name, failing=True)
+    source = objects.get(("GitRepository", place.namespace, _source(found)))
+    fetched = condition((source or {}).get("status") or {}, "Ready")
+    if fetched.get("status") == "False":
+        at = f"GitRepository {place.namespace}/{_source(found)}"
+        return Health("waiting", str(fetched.get("message", "")), at, failing=True)
+    return Health("waiting", "has not applied the commit yet", name)
+
+
+def of_target(target: Target, commit: str, objects: Objects, history: History) -> Health:
+    """Return whether a release of an applied commit runs, or is gone where it is to be gone."""
+    if not target.wanted:
+        return _gone(target, objects)
+    if not target.by_helm:
+        return of_client(target, objects)
+    release = objects.get(("HelmRelease", target.place.namespace, target.name))
+    name = f"HelmRelease {target.place.namespace}/{target.name}"
+    if release is None:
+        return Health("reconciled", "is not there yet", name)
+    status = release.get("status") or {}
+    ready = condition(status, "Ready")
+    current = status.get("observedGeneration") == release["metadata"].get("generation")
+    if ready.get("status") == "False":
+        return Health("reconciled", str(ready.get("message", "")), name, failing=True)
+    if not current or ready.get("status") != "True":
+        return Health("reconciled", str(ready.get("message") or "is being installed"), name)
+    for deployment in _deployments(target, objects):
+        health = of_deployment(deployment)
+        if health.state != "healthy":
+            return health
+    return Health("healthy")
+
+
+def since(target: Target, objects: Objects) -> str:
+    """Return since when a release is as it is, as the cluster says it; empty where it does not."""
+    kind, ready = ("HelmRelease", "Ready") if target.by_helm else ("Deployment", "Available")
+    found = objects.get((kind, target.place.namespace, target.name)) or {}
+    return str(condition(found.get("status") or {}, ready).get("lastTransitionTime", ""))
+
+
+def applied(place: Place, objects: Objects) -> str:
+    """Return the commit that an access domain's Kustomization has applied, or nothing."""
+    found = objects.get(("Kustomization", place.namespace, place.domain)) or {}
+    return _commit((found.get("status") or {}).get("lastAppliedRevision"))
+
+
+def _gone(target: Target, objects: Objects) -> Health:
+    namespace = target.place.namespace
+    kind = "HelmRelease" if target.by_helm else "Deployment"
+    if (kind, namespace, target.name) in objects or _deployments(target, objects):
+        return Health("reconciled", "is still being removed", f"{kind} {namespace}/{target.name}")
+    return Health("healthy")
+
+
+def _deployments(target: Target, objects: Objects) -> list[Object]:
+    """Return a release's Deployments; helm-controller labels all that it installs."""
+    if not target.by_helm:
+        return []
+    return [
+        found
+        for (kind, namespace, _), found in objects.items()
+        if kind == "Deployment"
+        and namespace == target.place.namespace
+        and (found["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
+    ]
+
+
+def _source(kustomization: Object) -> str:
+    return str(((kustomization.get("spec") or {}).get("sourceRef") or {}).get("name", ""))
+
+
+def _commit(revision: object) -> str:
+    """Return the commit of a Flux revision (``main@sha1:…``)."""
+    return str(revision or "").rpartition(":")[2]

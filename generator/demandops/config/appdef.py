@@ -1,0 +1,143 @@
+"""Application definitions: one YAML file and a folder make a new type of application.
+
+An appdef names its inputs and parameters and the services to run for them. A service runs once
+for each application, or once for each topic of an input, and in the second case is shared by all
+applications that ask for the same topic on the same node (paper, section on object detection).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StringConstraints, model_validator
+
+from demandops.config.file_model import Approval, DnsLabel, FileModel, Frozen, Word
+from demandops.errors import near
+
+TopicPattern = Annotated[
+    str,
+    StringConstraints(
+        pattern=r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
+    ),
+]
+"""A topic name; ``{instance}`` stands for the source or the application that the service is for."""
+
+
+class Input(Frozen):
+    """A role that demanded topics play, ``point_cloud`` say."""
+
+    description: str = ""
+    type: str = ""
+
+
+class Parameter(Frozen):
+    """A value that a demand may give, and what holds when several demands give different ones."""
+
+    description: str = ""
+    default: Any = None
+    merge: Literal["union", "max", "min", "latest"] | None = None
+
+
+class Scaling(Frozen):
+    """How many replicas a service has: one for ``topics_per_replica`` inputs, within bounds."""
+
+    min: Annotated[int, Field(ge=0, le=1000)] = 1
+    max: Annotated[int, Field(ge=1, le=1000)] = 1
+    topics_per_replica: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, alias="topicsPerReplica"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Scaling:
+        if self.min > self.max:
+            raise ValueError(
+                f"min {self.min} is above max {self.max}; lower the one or raise the other"
+            )
+        return self
+
+
+class Service(Frozen):
+    """One deployable part of an application: one Helm release for each instance.
+
+    ``each`` names the input whose every topic gets an instance of its own, shared between
+    applications; without it there is one instance for each application. ``inputs`` of an
+    application-wide service name roles of the appdef, or ``<service>.<output>``.
+    """
+
+    prefix: Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9]{0,9}$")]
+    description: str = ""
+    each: Word | None = None
+    inputs: dict[Word, str] = Field(default_factory=dict)
+    outputs: dict[Word, TopicPattern] = Field(default_factory=dict)
+    placement: Literal["application", "source"] = "application"
+    scaling: Scaling = Scaling()
+    chart: DnsLabel
+    images: tuple[DnsLabel, ...] = Field(default=(), strict=False)
+    values: Annotated[str, StringConstraints(pattern=r"^values/[A-Za-z0-9_.-]+$")]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Service:
+        if self.each and self.inputs:
+            raise ValueError("'each' already says what the service takes in; remove 'inputs'")
+        if self.placement == "source" and not self.each:
+            raise ValueError("placement 'source' needs 'each': an application has no one source")
+        return self
+
+
+class WireNames(Frozen):
+    """How the reference's ``DeploymentRequest`` names this application.
+
+    ``type`` is the number in ``Application.type``; ``inputs`` says which role each topic list of
+    the message's body plays.
+    """
+
+    type: Annotated[int, Field(ge=1, le=255)]
+    inputs: dict[Literal["ego_data_topics", "pointcloud_topics"], Word]
+
+
+class ApplicationDefinition(FileModel):
+    """One type of application: ``appdefs/<name>/appdef.yaml``."""
+
+    kind: Literal["ApplicationDefinition"]
+    name: DnsLabel
+    description: str = ""
+    inputs: dict[Word, Input]
+    parameters: dict[Word, Parameter] = Field(default_factory=dict)
+    deployment_request: WireNames | None = Field(default=None, alias="deploymentRequest")
+    services: dict[DnsLabel, Service] = Field(min_length=1)
+    approval: Approval = "none"
+
+    @model_validator(mode="after")
+    def _references(self) -> ApplicationDefinition:
+        problems = []
+        for name, service in self.services.items():
+            if service.each and service.each not in self.inputs:
+                problems.append(
+                    f"services.{name}.each: '{service.each}' is not an input"
+                    + near(service.each, self.inputs)
+                )
+            sources = self.sources()
+            problems += [
+                f"services.{name}.inputs.{role}: '{source}' is neither an input nor an output of "
+                "a service that runs for each topic" + near(source, sources)
+                for role, source in service.inputs.items()
+                if source not in sources
+            ]
+        for role in (self.deployment_request.inputs if self.deployment_request else {}).values():
+            if role not in self.inputs:
+                problems.append(
+                    f"deploymentRequest.inputs: '{role}' is not an input" + near(role, self.inputs)
+                )
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+    def sources(self) -> list[str]:
+        """Return what a service's input may name: roles, and outputs of per-topic services."""
+        outputs = [
+            f"{name}.{output}"
+            for name, service in self.services.items()
+            if service.each
+            for output in service.outputs
+        ]
+        return [*self.inputs, *outputs]

@@ -1,0 +1,85 @@
+"""All that people configured, indexed: the :class:`Catalog`, one frozen value."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from demandops.config.appdef import ApplicationDefinition, Service
+from demandops.config.inventory import Broker, Cluster, Node
+from demandops.config.override import OVERRIDES_ROOT, Override, in_order, still_in_force
+from demandops.config.policy import AccessDomain
+from demandops.config.registry import Chart, Image
+from demandops.config.repo_settings import RepoSettings
+
+CLUSTERS_FILE = "inventory/clusters.yaml"
+NODES_FILE = "inventory/nodes.yaml"
+BROKERS_FILE = "inventory/brokers.yaml"
+DOMAINS_FILE = "policy/access-domains.yaml"
+CHARTS_FILE = "registry/charts.yaml"
+IMAGES_FILE = "registry/images.yaml"
+
+MQTT_CLIENT_IMAGE = "mqtt-client"
+"""The image of the registry that both ends of an MQTT connection run."""
+
+ZENOH_BRIDGE_IMAGE = "zenoh-bridge"
+"""The image of the registry that carries a node's Zenoh connections."""
+
+DDS_ROUTER_IMAGE = "dds-router"
+"""The image of the registry that both ends of a ROS connection run."""
+
+CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
+"""The top-level entries of a state repo that people own and the configuration is made from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """What can be run, where, from which charts and images.
+
+    ``files`` keeps the texts that templates and chart schemas are read from, by path. ``overrides``
+    are all that lie there; ``ended`` maps those that ended to the time that they named then, and
+    ``in_force`` are the others, in the order in which they apply.
+    """
+
+    repository: RepoSettings
+    clusters: Mapping[str, Cluster]
+    nodes: Mapping[str, Node]
+    brokers: Mapping[str, Broker]
+    domains: Mapping[str, AccessDomain]
+    charts: Mapping[str, Chart]
+    images: Mapping[str, Image]
+    appdefs: Mapping[str, ApplicationDefinition]
+    domain_of: Mapping[str, AccessDomain]
+    files: Mapping[str, str]
+    overrides: Mapping[str, Override] = field(default_factory=dict)
+    ended: Mapping[str, str] = field(default_factory=dict)
+    in_force: tuple[Override, ...] = ()
+    judged: dict[Hashable, Override | None] = field(default_factory=dict, compare=False, repr=False)
+    """What was found denied, kept by :mod:`demandops.plan.overrides.claims_in_force`."""
+
+    def with_ended(self, ended: Mapping[str, str]) -> Config:
+        """Return the configuration with these overrides ended."""
+        in_force = in_order(still_in_force(self.overrides, ended))
+        ended = MappingProxyType(dict(ended))
+        return replace(self, ended=ended, in_force=in_force, judged={})
+
+    def without_overrides(self) -> Config:
+        """Return the configuration as it would be had nobody written an override."""
+        return replace(self, overrides={}, ended={}, in_force=(), judged={})
+
+    def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
+        """Return the appdef that ``DeploymentRequest`` names by ``number``."""
+        for appdef in self.appdefs.values():
+            if appdef.deployment_request and appdef.deployment_request.type == number:
+                return appdef
+        return None
+
+    def versions_of(self, appdef: str) -> list[str]:
+        """Return the channels and versions that a demand for an application may name."""
+        charts = {service.chart for service in self.appdefs[appdef].services.values()}
+        return sorted({known for chart in charts for known in self.charts[chart].versions()})
+
+    def values_template(self, appdef: str, service: Service) -> str:
+        """Return the path of the template that gives a service's Helm values."""
+        return f"appdefs/{appdef}/{service.values}"

@@ -1,0 +1,125 @@
+"""The base of every model that is parsed from a file or a message.
+
+Frozen, strict, unknown fields refused; :func:`parse` turns pydantic's report into faults that
+name the field the way a person would look for it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
+
+from demandops import strict_yaml
+from demandops.errors import Fault, InvalidInput, fault, near
+from demandops.settings import API_VERSION
+
+Model = TypeVar("Model", bound=BaseModel)
+
+DnsLabel = Annotated[
+    str, StringConstraints(pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$", max_length=63)
+]
+"""A name that Kubernetes takes as it is (RFC 1123 label)."""
+
+Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_length=63)]
+"""A name that people give to roles, services and images in definitions."""
+
+Approval = Literal["none", "required"]
+"""Whether a person has to agree before a demand is carried out."""
+
+
+class Frozen(BaseModel):
+    """A value that cannot change, with no room for misspelt fields."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class FileModel(Frozen):
+    """A file that people write: it says which format it is in."""
+
+    apiVersion: Literal["demandops/v1"]
+
+
+def field_path(location: tuple[int | str, ...]) -> str:
+    """Return ``nodes[3].cluster`` for ``("nodes", 3, "cluster")``."""
+    path = ""
+    for part in location:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif part != "[key]":
+            path += f".{part}" if path else part
+    return path if path.isprintable() else path.encode("unicode_escape").decode()
+
+
+def faults_of(error: ValidationError, model: type[BaseModel], file: str = "") -> list[Fault]:
+    """Return every fault of a failed validation, told as where, what and how to mend it."""
+    return [
+        fault(field_path(item["loc"]), _message(dict(item), model)).within(file)
+        for item in error.errors(include_url=False)
+    ]
+
+
+_EXPECTED = {
+    "model_type": "must be a mapping",
+    "dict_type": "must be a mapping",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "bool_type": "must be true or false",
+    "int_type": "must be a whole number",
+    "string_type": "must be text",
+}
+
+
+def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
+    kind, value = item["type"], item.get("input")
+    if kind == "missing":
+        return "is missing; add it"
+    if kind == "extra_forbidden":
+        name = str(item["loc"][-1])
+        known = _fields(model) if len(item["loc"]) == 1 else []
+        return "is not a field here; remove it or mend its spelling" + (
+            near(name, known) if known else ""
+        )
+    if kind == "string_type" and isinstance(value, int | float):
+        return f"must be text, not {strict_yaml.brief(value)}; put it in quotes"
+    if kind == "literal_error":
+        return f"is {strict_yaml.brief(value)}, but must be {item['ctx']['expected']}"
+    if kind == "string_pattern_mismatch":
+        return (
+            f"{value!r} is not a name that can be used here; it must match {item['ctx']['pattern']}"
+        )
+    if kind == "value_error":
+        return str(item["ctx"]["error"])
+    if kind == "string_too_short":
+        return "is empty; fill it in"
+    expected = _EXPECTED.get(kind) or f"{item['msg'][:1].lower()}{item['msg'][1:]}"
+    return f"{expected}, not {strict_yaml.brief(value)}"
+
+
+def _fields(model: type[BaseModel]) -> list[str]:
+    return [field.alias or name for name, field in model.model_fields.items()]
+
+
+def parse(model: type[Model], data: object, file: str = "") -> Model:
+    """Validate ``data``; raise :class:`InvalidInput` with every fault, each naming ``file``."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise InvalidInput(faults_of(error, model, file)) from None
+
+
+def parse_file(model: type[Model], text: str, file: str) -> Model:
+    """Parse one YAML file into ``model``; raise :class:`InvalidInput` with every fault."""
+    try:
+        data = strict_yaml.load(text)
+    except InvalidInput as error:
+        raise InvalidInput(strict_yaml.faults_in(error, file)) from None
+    if not isinstance(data, dict):
+        raise InvalidInput(
+            [
+                fault("", f"must be a mapping that starts with apiVersion: {API_VERSION}").within(
+                    file
+                )
+            ]
+        )
+    return parse(model, data, file)

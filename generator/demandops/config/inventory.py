@@ -1,0 +1,223 @@
+"""The inventory: which nodes, clusters and brokers there are, and who may use them.
+
+A node is a vehicle, a roadside station, an edge or a cloud server. It belongs to one cluster and
+one access domain, and a node selector finds it there.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
+
+from demandops.config.file_model import DnsLabel, FileModel, Frozen, Word
+from demandops.identifiers import id_problem, message_type_problem, topic_problem
+
+Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
+"""A host name or an IP address."""
+
+SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
+"""A key inside a Kubernetes Secret; it becomes a file name."""
+
+_ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
+Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$")]
+"""A Zenoh endpoint without certificates: ``tcp/host:7447``."""
+
+
+class Tls(Frozen):
+    """Encrypted connections to a broker; without ``caSecret`` the client image's own CAs count."""
+
+    ca_secret: DnsLabel | None = Field(default=None, alias="caSecret")
+    ca_key: SecretKey = Field(default="ca.crt", alias="caKey")
+
+
+class Credentials(Frozen):
+    """The Secret with a broker's user name and password, and the keys that they stand under."""
+
+    secret: DnsLabel
+    user_key: SecretKey = Field(default="username", alias="userKey")
+    password_key: SecretKey = Field(default="password", alias="passwordKey")
+
+
+class Zenoh(Frozen):
+    """That a node runs a Zenoh bridge where a connection needs it, and how bridges meet.
+
+    ``endpoint`` is where other nodes' bridges reach this one; ``listen`` where it listens for
+    them, by default on the endpoint's port at every address; ``connect`` are routers that it
+    always connects to. All may be left out: such a node connects to those that can be reached.
+    """
+
+    endpoint: Endpoint | None = None
+    listen: tuple[Endpoint, ...] = Field(default=(), strict=False)
+    connect: tuple[Endpoint, ...] = Field(default=(), strict=False)
+
+    @model_validator(mode="after")
+    def _reachable(self) -> Zenoh:
+        if self.listen and not self.endpoint:
+            raise ValueError("listen needs an endpoint, where others reach the node; add it")
+        return self
+
+    def listening(self) -> tuple[str, ...]:
+        """Return the endpoints that the node's bridge listens on, none where nobody connects."""
+        if self.listen or not self.endpoint:
+            return self.listen
+        protocol, _, address = self.endpoint.partition("/")
+        return (f"{protocol}/0.0.0.0:{address.rpartition(':')[2]}",)
+
+
+class Wan(Frozen):
+    """Where DDS Routers on a node can be reached, one port for each ROS connection."""
+
+    host: Host
+    first_port: Annotated[int, Field(ge=1024, le=65535)] = Field(default=20000, alias="firstPort")
+    last_port: Annotated[int, Field(ge=1024, le=65535)] = Field(default=29999, alias="lastPort")
+    transport: Literal["tcp", "udp"] = "tcp"
+
+    @model_validator(mode="after")
+    def _some_ports(self) -> Wan:
+        if self.last_port < self.first_port:
+            raise ValueError(
+                f"lastPort {self.last_port} is below firstPort {self.first_port}; swap them"
+            )
+        return self
+
+
+def _id(value: str) -> str:
+    problem = id_problem(value)
+    if problem:
+        raise ValueError(problem)
+    return value
+
+
+def _topic(value: str) -> str:
+    problem = topic_problem(value)
+    if problem:
+        raise ValueError(problem)
+    return value
+
+
+def _message_type(value: str) -> str:
+    problem = message_type_problem(value)
+    if problem:
+        raise ValueError(problem)
+    return value
+
+
+NodeId = Annotated[str, AfterValidator(_id)]
+Topic = Annotated[str, AfterValidator(_topic)]
+MessageType = Annotated[str, AfterValidator(_message_type)]
+
+LabelKey = Annotated[
+    str,
+    StringConstraints(pattern=r"^([a-z0-9.-]+/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?$"),
+]
+_LABEL_VALUE = re.compile(r"([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?")
+LabelValue = Annotated[str, StringConstraints(pattern=f"^{_LABEL_VALUE.pattern}$")]
+
+
+class Cluster(Frozen):
+    """A Kubernetes cluster whose GitOps controller reads ``clusters/<name>/``."""
+
+    name: DnsLabel
+    description: str = ""
+
+
+class Toleration(Frozen):
+    """A taint of the node that workloads put up with (Kubernetes core/v1 Toleration)."""
+
+    key: str = ""
+    operator: Literal["Exists", "Equal"] = "Equal"
+    value: str = ""
+    effect: Literal["", "NoSchedule", "PreferNoSchedule", "NoExecute"] = ""
+
+    @model_validator(mode="after")
+    def _sensible(self) -> Toleration:
+        if self.operator == "Exists" and self.value:
+            raise ValueError("operator Exists takes no value; remove it, or use Equal")
+        if self.operator == "Equal" and not self.key:
+            raise ValueError("operator Equal needs a key; add it, or use Exists for every taint")
+        return self
+
+
+class Ros(Frozen):
+    """What a container on the node needs to join its ROS graph."""
+
+    domain_id: Annotated[int, Field(ge=0, le=232)] = Field(default=0, alias="domainId")
+    rmw: Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"] = (
+        "rmw_cyclonedds_cpp"
+    )
+
+
+class Node(Frozen):
+    """A C-ITS entity that runs services.
+
+    ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
+    ``topics`` names, for each input role, the node's usual topic: releases and derived topics
+    for it carry the node's name alone; those for its further topics carry the topic as well.
+    ``zenoh`` and ``wan`` say how Zenoh and ROS connections reach the node, ``types`` the message
+    types of topics that requests do not say. ``bridged`` names topics that the initial deployment
+    carries from here to another node, under the same name: no connection carries them again.
+    """
+
+    id: NodeId
+    type: Literal["vehicle", "station", "edge", "cloud"]
+    cluster: DnsLabel
+    selector: dict[LabelKey, LabelValue] | None = None
+    topics: dict[Word, Topic] = Field(default_factory=dict)
+    tolerations: tuple[Toleration, ...] = Field(default=(), strict=False)
+    image_pull_secrets: tuple[DnsLabel, ...] = Field(
+        default=(), alias="imagePullSecrets", strict=False
+    )
+    host_network: bool = Field(default=True, alias="hostNetwork")
+    ros: Ros = Ros()
+    zenoh: Zenoh | None = None
+    wan: Wan | None = None
+    types: dict[Topic, MessageType] = Field(default_factory=dict)
+    bridged: dict[NodeId, Annotated[tuple[Topic, ...], Field(strict=False)]] = Field(
+        default_factory=dict
+    )
+
+    @model_validator(mode="after")
+    def _findable(self) -> Node:
+        if self.selector is None and not _LABEL_VALUE.fullmatch(self.id):
+            raise ValueError(
+                "the id is no label value, so nodes cannot carry it as node_id; add a selector"
+            )
+        return self
+
+    def labels(self) -> dict[str, str]:
+        """Return the node selector."""
+        return dict(self.selector) if self.selector is not None else {"node_id": self.id}
+
+
+class Broker(Frozen):
+    """A message broker and the node that it runs on."""
+
+    node: NodeId
+    type: Literal["mqtt"] = "mqtt"
+    host: Host
+    port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    tls: Tls | None = None
+    credentials: Credentials | None = None
+
+
+class ClustersFile(FileModel):
+    """``inventory/clusters.yaml``."""
+
+    kind: Literal["Clusters"]
+    clusters: tuple[Cluster, ...] = Field(strict=False)
+
+
+class NodesFile(FileModel):
+    """``inventory/nodes.yaml``."""
+
+    kind: Literal["Nodes"]
+    nodes: tuple[Node, ...] = Field(strict=False)
+
+
+class BrokersFile(FileModel):
+    """``inventory/brokers.yaml``."""
+
+    kind: Literal["Brokers"]
+    brokers: tuple[Broker, ...] = Field(strict=False)

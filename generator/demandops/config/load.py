@@ -1,0 +1,143 @@
+"""From the texts of the state repo's configuration to a :class:`Catalog`.
+
+Pure. A file set is taken whole or refused whole, with every fault of every file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from demandops.config.appdef import ApplicationDefinition
+from demandops.config.config import (
+    BROKERS_FILE,
+    CHARTS_FILE,
+    CLUSTERS_FILE,
+    DOMAINS_FILE,
+    IMAGES_FILE,
+    NODES_FILE,
+    Config,
+)
+from demandops.config.cross_check import cross_check
+from demandops.config.inventory import Broker, BrokersFile, Cluster, ClustersFile, Node, NodesFile
+from demandops.config.item_reader import ItemReader
+from demandops.config.override import OVERRIDES_ROOT, Override, OverrideFile
+from demandops.config.policy import AccessDomain, AccessDomainsFile, matches
+from demandops.config.registry import Chart, ChartsFile, Image, ImagesFile
+from demandops.config.repo_settings import ROOT_FILE, Flux, RepoSettings
+from demandops.errors import InvalidInput
+from demandops.settings import API_VERSION, RENDER_VERSION
+
+_NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
+_ANY = RepoSettings(
+    apiVersion=API_VERSION,
+    kind="StateRepository",
+    gitops="flux",
+    renderVersion=RENDER_VERSION,
+    flux=Flux(url="https://unread.invalid/repo.git"),
+)  # stands in for one that could not be read, so that the rest is checked all the same
+
+
+def load(files: Mapping[str, str]) -> Config:
+    """Parse the configuration files of a state repo.
+
+    Args:
+        files: path in the state repo → text; files of other folders are passed over.
+
+    Raises:
+        InvalidInput: with every fault of every file.
+    """
+    reading = ItemReader(files)
+    repository = reading.one(ROOT_FILE, RepoSettings)
+    if repository and repository.render_version > RENDER_VERSION:
+        reading.tell(
+            ROOT_FILE,
+            "renderVersion",
+            f"is {repository.render_version}, but this generator renders version "
+            f"{RENDER_VERSION}; update the generator",
+        )
+    if repository and getattr(repository, repository.gitops) is None:
+        reading.tell(
+            ROOT_FILE,
+            repository.gitops,
+            f"is missing, but gitops is {repository.gitops}; add it with the url that the "
+            "clusters fetch this repo from",
+        )
+    nodes = reading.listed(NODES_FILE, NodesFile, "nodes", Node, "id")
+    domains = reading.listed(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
+    config = Config(
+        repository=repository or _ANY,
+        clusters=reading.listed(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
+        nodes=nodes,
+        brokers=reading.listed(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
+        domains=domains,
+        charts=reading.named(CHARTS_FILE, ChartsFile, "charts", Chart),
+        images=reading.named(IMAGES_FILE, ImagesFile, "images", Image),
+        appdefs=_read_appdefs(reading),
+        domain_of=_domains_of_nodes(reading, nodes, domains),
+        files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
+        overrides=_read_overrides(reading),
+    ).with_ended({})
+    cross_check(config, reading)
+    if reading.faults:
+        raise InvalidInput(dict.fromkeys(reading.faults))
+    return config
+
+
+def _read_appdefs(reading: ItemReader) -> Mapping[str, ApplicationDefinition]:
+    appdefs = {}
+    for path in sorted(reading.files):
+        parts = path.split("/")
+        if len(parts) != 3 or parts[0] != "appdefs" or parts[2] != "appdef.yaml":
+            continue
+        appdef = reading.one(path, ApplicationDefinition)
+        if appdef is None:
+            continue
+        if appdef.name != parts[1]:
+            reading.tell(
+                path, "name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them one"
+            )
+            appdef = appdef.model_copy(update={"name": parts[1]})
+        appdefs[appdef.name] = appdef
+    return MappingProxyType(appdefs)
+
+
+def _read_overrides(reading: ItemReader) -> Mapping[str, Override]:
+    overrides = {}
+    for path in sorted(reading.files):
+        folder, _, name = path.partition("/")
+        if folder != OVERRIDES_ROOT or name.startswith(".") or name.endswith(".md"):
+            continue
+        stem = name.removesuffix(".yaml")
+        if stem == name or not _NAME.fullmatch(stem):
+            reading.tell(
+                path,
+                "",
+                "is no override: one is overrides/<name>.yaml, the name of small letters, digits "
+                "and '-'; rename the file, or remove it",
+            )
+            continue
+        file = reading.one(path, OverrideFile)
+        if file is not None:
+            overrides[stem] = Override.of(stem, file)
+    return MappingProxyType(overrides)
+
+
+def _domains_of_nodes(
+    reading: ItemReader, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
+) -> Mapping[str, AccessDomain]:
+    owner: dict[str, AccessDomain] = {}
+    for node in nodes:
+        matching = [d for d in domains.values() if matches(node, d.nodes)]
+        if len(matching) > 1:
+            names = " and ".join(f"'{domain.name}'" for domain in matching)
+            reading.tell(
+                NODES_FILE,
+                f"nodes[{reading.place(NODES_FILE, node)}].id",
+                f"'{node}' is in the access domains {names}; narrow their patterns so that it is "
+                "in one",
+            )
+        elif matching:
+            owner[node] = matching[0]
+    return MappingProxyType(owner)

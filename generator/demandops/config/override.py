@@ -1,0 +1,279 @@
+"""Overrides: a person's declared deviations, one file each in ``overrides/``.
+
+The model and what it means on its own: whom a selector can match, what an effect may say. Whether
+two of them conflict is :mod:`demandops.config.override_conflict`; what they do to releases and
+claims is the plan's.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from datetime import datetime, timezone
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
+
+from demandops.config.file_model import DnsLabel, FileModel, Frozen
+from demandops.config.inventory import LabelKey, LabelValue, NodeId
+from demandops.config.registry import Image
+from demandops.errors import shown
+from demandops.identifiers import id_problem
+
+OVERRIDES_ROOT = "overrides"
+
+_MOMENT = re.compile(
+    r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,6})\d*)?([Zz]|[+-]\d\d:\d\d)"
+)
+_SHAPING = ("values", "version", "images", "replicas", "node")
+_OF_SERVICES = ("values", "version", "replicas", "node", "keep")
+EFFECTS = (*_SHAPING, "hold", "deny", "keep")
+"""What an override may do, in the order in which it is told."""
+
+
+def moment_of(text: str) -> datetime:
+    """Return the moment that an RFC 3339 time with zone names, in UTC.
+
+    Raises:
+        ValueError: where it is none.
+    """
+    match = _MOMENT.fullmatch(text)
+    try:
+        if match is None:
+            raise ValueError
+        day, clock, fraction, zone = match.groups()
+        zone = "+00:00" if zone in "Zz" else zone
+        moment = datetime.fromisoformat(f"{day}T{clock}.{(fraction or '0').ljust(6, '0')}{zone}")
+        return moment.astimezone(timezone.utc)
+    except (ValueError, OverflowError):
+        raise ValueError(
+            f"{shown(text)} is no time with a time zone; write one like 2026-01-31T12:00:00Z"
+        ) from None
+
+
+def written(moment: datetime) -> str:
+    """Return a moment as messages and markers show it."""
+    text = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
+    return re.sub(r"\.?0*\+00:00$", "Z", text)
+
+
+def _moment(text: str) -> str:
+    moment_of(text)
+    return text
+
+
+def _one_line(text: str) -> str:
+    if not text.strip() or text != text.strip():
+        raise ValueError("is empty or starts or ends with white space; write one line of text")
+    if not text.isprintable():
+        raise ValueError(f"{shown(text)} is more than one line of plain text; make it one")
+    return text
+
+
+def _owner(text: str) -> str:
+    problem = id_problem(text)
+    if problem:
+        raise ValueError(problem)
+    return _one_line(text)
+
+
+def _finite(value: Any) -> None:  # noqa: ANN401 - Helm values are any data
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"holds {value}, which JSON has no number for; choose another value")
+    inner = value.values() if isinstance(value, dict) else value
+    for item in inner if isinstance(value, dict | list) else ():
+        _finite(item)
+
+
+def _patch(value: dict[str, Any]) -> dict[str, Any]:
+    _finite(value)
+    return value
+
+
+def _some(items: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not items or "" in items:
+        raise ValueError("is empty or holds nothing; say what is selected")
+    return items
+
+
+Patterns = Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_some)]
+Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)]
+
+
+def _filled_in(model: Frozen) -> None:
+    """Raise for a field that is written down and empty: it would say less than it seems to."""
+    empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
+    if empty:
+        raise ValueError(f"{' and '.join(empty)}: nothing stands there; fill it in, or remove it")
+
+
+class Selector(Frozen):
+    """What an override is for: a release or claim that every field given here fits.
+
+    Patterns take ``*`` and ``?``. ``requesters`` fits where one of the requesters does, ``labels``
+    where the node's selector has them all.
+    """
+
+    applications: Patterns | None = None
+    appdefs: Patterns | None = None
+    services: Patterns | None = None
+    connections: Patterns | None = None
+    nodes: Patterns | None = None
+    requesters: Patterns | None = None
+    labels: Annotated[dict[LabelKey, LabelValue], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _sensible(self) -> Selector:
+        if not self.model_fields_set:
+            raise ValueError("selects nothing; give at least one field, nodes: ['*'] say")
+        _filled_in(self)
+        others = [name for name in ("applications", "appdefs", "services") if getattr(self, name)]
+        if self.connections and others:
+            raise ValueError(
+                f"connections and {others[0]} never fit the same thing; write two selectors"
+            )
+        return self
+
+
+class ImagePin(Frozen):
+    """What an override says of an image of the registry; what it leaves out stays."""
+
+    repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")] | None = None
+    tag: (
+        Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")] | None
+    ) = None
+    digest: Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")] | None = None
+
+    @model_validator(mode="after")
+    def _says_something(self) -> ImagePin:
+        if not (self.repository or self.tag or self.digest):
+            raise ValueError("says nothing; give a tag, a digest or a repository")
+        return self
+
+    def over(self, image: Image) -> Image:
+        """Return the image as pinned; a tag or digest takes the place of both."""
+        anew = self.tag or self.digest
+        return Image(
+            repository=self.repository or image.repository,
+            tag=self.tag if anew else image.tag,
+            digest=self.digest if anew else image.digest,
+        )
+
+
+class OverrideFile(FileModel):
+    """``overrides/<name>.yaml``. Of those that match the same, the higher priority wins."""
+
+    kind: Literal["Override"]
+    reason: Line
+    owner: Annotated[str, StringConstraints(max_length=100), AfterValidator(_owner)]
+    priority: Annotated[int, Field(ge=-1_000_000, le=1_000_000)] = 0
+    expires: Annotated[str, AfterValidator(_moment)] | None = None
+    select: Annotated[tuple[Selector, ...], Field(strict=False), AfterValidator(_some)]
+    values: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(_patch)] | None = None
+    version: Annotated[str, StringConstraints(min_length=1, max_length=63)] | None = None
+    images: Annotated[dict[DnsLabel, ImagePin], Field(min_length=1)] | None = None
+    replicas: Annotated[int, Field(ge=0, le=1000)] | None = None
+    node: NodeId | None = None
+    hold: Literal[True] | None = None
+    deny: Literal[True] | None = None
+    keep: Literal[True] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> OverrideFile:
+        _filled_in(self)
+        problems = [*_contradictions(self.effects()), *self._misplaced()]
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+    def _misplaced(self) -> Iterable[str]:
+        """Yield effects that what is selected cannot have."""
+        effects = self.effects()
+        for index, selector in enumerate(self.select):
+            wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
+            if selector.connections and wrong:
+                yield (
+                    f"select[{index}].connections: {wrong[0]} is for services, and a connection "
+                    "has none; remove the one or the other"
+                )
+            if selector.services and "keep" in effects:
+                yield (
+                    f"select[{index}].services: keep is for applications and connections; select "
+                    "those"
+                )
+
+    def effects(self) -> tuple[str, ...]:
+        """Return the names of the effects that are given."""
+        return tuple(name for name in EFFECTS if getattr(self, name) is not None)
+
+    @property
+    def end(self) -> datetime | None:
+        """When it ceases to apply."""
+        return moment_of(self.expires) if self.expires else None
+
+
+class Override(OverrideFile):  # noqa: PLW1641 - with mappings in them overrides have no hash
+    """An override and its name, which is that of its file."""
+
+    name: str
+
+    @classmethod
+    def of(cls, name: str, file: OverrideFile) -> Override:
+        """Return what a file says, by its name."""
+        return cls.model_construct(file.model_fields_set | {"name"}, **dict(file), name=name)
+
+    def __eq__(self, other: object) -> bool:
+        """Compare exactly: to Python 1 is True and 1.0, to a chart they are three values."""
+        return isinstance(other, Override) and self.model_dump_json() == other.model_dump_json()
+
+    @property
+    def path(self) -> str:
+        """The file."""
+        return f"{OVERRIDES_ROOT}/{self.name}.yaml"
+
+    @property
+    def rank(self) -> tuple[int, str]:
+        """Where it stands among others: the higher wins."""
+        return (self.priority, self.name)
+
+
+def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
+    if not effects:
+        yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
+    if "deny" in effects and len(effects) > 1:
+        others = " and ".join(name for name in effects if name != "deny")
+        yield f"deny keeps it from running, so {others} can do nothing; keep one of them"
+    frozen = [name for name in effects if name in _SHAPING]
+    if "hold" in effects and frozen:
+        yield (
+            f"hold freezes the release as it is, so {' and '.join(frozen)} cannot change it; keep "
+            "one of them"
+        )
+
+
+def merged(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
+    """Return ``target`` with a JSON merge patch (RFC 7386) laid over; null removes."""
+    if not isinstance(patch, Mapping):
+        return patch
+    result = dict(target) if isinstance(target, Mapping) else {}
+    for key, value in patch.items():
+        if value is None:
+            result.pop(key, None)
+        else:
+            result[key] = merged(result.get(key), value)
+    return result
+
+
+def in_order(overrides: Iterable[Override]) -> tuple[Override, ...]:
+    """Return overrides in the order in which they apply: who comes last wins."""
+    return tuple(sorted(overrides, key=lambda one: one.rank))
+
+
+def still_in_force(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
+    """Return the overrides that no marker says to have ended at the time that they name now."""
+    return [
+        one
+        for name, one in overrides.items()
+        if one.end is None or ended.get(name) != written(one.end)
+    ]

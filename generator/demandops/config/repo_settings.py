@@ -1,0 +1,104 @@
+"""``demandops.yaml``: which GitOps controller reads the state repo, and how it reaches it."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
+
+from demandops.config.file_model import DnsLabel, FileModel, Frozen
+from demandops.errors import shown
+
+ROOT_FILE = "demandops.yaml"
+
+GitUrl = Annotated[
+    str, StringConstraints(pattern=r"^(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+$")
+]
+
+
+class Flux(Frozen):
+    """How the clusters' Flux reaches this repo: the GitRepository of each access domain."""
+
+    url: GitUrl
+    interval: Annotated[
+        str, StringConstraints(pattern=r"^(\d+h)?(\d+m)?(\d+s)?$", min_length=2)
+    ] = "1m"
+    secret: DnsLabel | None = None
+
+
+class ArgoCd(Frozen):
+    """How the clusters' Argo CD reaches this repo, and the namespace it runs in.
+
+    Credentials are Argo CD's own: a Secret of that namespace that names the URL.
+    """
+
+    url: GitUrl
+    namespace: DnsLabel = "argocd"
+
+
+_WEB_URL = re.compile(
+    r"(https://[^\s:@/?#]+|http://(127\.0\.0\.1|localhost|\[::1\]))(:\d+)?(/[^\s?#]*)?"
+)
+
+
+def _web_url(text: str) -> str:
+    if not _WEB_URL.fullmatch(text):
+        raise ValueError(
+            f"{shown(text)} is no address that a token is sent to; write https://HOST/PATH, "
+            "without a user (plain http only for this machine)"
+        )
+    return text
+
+
+WebUrl = Annotated[str, AfterValidator(_web_url)]
+
+
+class Proposals(Frozen):
+    """Where demands that need approval are proposed.
+
+    ``none`` pushes the branch and asks nobody. GitLab opens a merge request by push options; GitHub
+    and Gitea (Forgejo) by their API, whose address follows from ``url`` unless ``api`` says it.
+    """
+
+    forge: Literal["none", "gitlab", "github", "gitea"] = "none"
+    url: WebUrl | None = None
+    api: WebUrl | None = None
+    labels: tuple[Annotated[str, StringConstraints(pattern=r"^[^\s,][^\n\r,]*$")], ...] = Field(
+        default=(), strict=False
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Proposals:
+        has_api = self.forge in ("github", "gitea")
+        if has_api and (self.url is None or len(self.project) != 2):
+            raise ValueError(
+                f"forge: {self.forge} needs url, the project's address in a browser, like "
+                "https://github.com/OWNER/REPOSITORY"
+            )
+        if self.api is not None and not has_api:
+            raise ValueError(f"api: is not used with forge: {self.forge}; leave it out")
+        if self.labels and self.forge != "gitlab":
+            raise ValueError("labels: only GitLab's push options set them; leave them out")
+        return self
+
+    @property
+    def project(self) -> tuple[str, ...]:
+        """Return owner and name of the project, the last two parts of its address."""
+        path = (self.url or "").partition("://")[2].partition("/")[2]
+        return tuple(path.strip("/").removesuffix(".git").split("/")[-2:]) if path else ()
+
+
+class RepoSettings(FileModel):
+    """``demandops.yaml``: what the whole state repo has in common.
+
+    The section of the controller that is not chosen may stand there too, and waits.
+    """
+
+    kind: Literal["StateRepository"]
+    gitops: Literal["flux", "argocd"]
+    render_version: int = Field(alias="renderVersion", ge=1)
+    source: DnsLabel = "demandops"
+    flux: Flux | None = None
+    argocd: ArgoCd | None = None
+    proposals: Proposals = Proposals()

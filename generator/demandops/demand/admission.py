@@ -1,0 +1,136 @@
+"""Admission: can what is asked be run at all, by this configuration?
+
+Checks a request against appdefs, inventory, brokers and access domains. What is booked already
+does not matter here; that is the ledger's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from demandops.config.config import Config
+from demandops.demand import demand_request as shape
+from demandops.demand import transport_choice
+from demandops.demand.demand_request import (
+    ApplicationDemand,
+    ConnectionDemand,
+    ConnectionType,
+    DemandRequest,
+)
+from demandops.errors import Fault, fault, near, shown
+
+
+def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
+    """Yield every reason why ``request`` cannot be honoured, whatever is booked.
+
+    A shutdown is not held to the inventory: what a removed node still holds can be released.
+    """
+    yield from shape.faults(request)
+    joining = request.operation.asks
+    for index, app in enumerate(request.applications):
+        yield from _application(f"applications[{index}]", app, config, joining)
+    for index, connection in enumerate(request.connections):
+        yield from _connection(f"connections[{index}]", connection, config, joining)
+
+
+def _application(
+    where: str, app: ApplicationDemand, config: Config, joining: bool
+) -> Iterator[Fault]:
+    appdef = config.appdefs.get(app.appdef)
+    if appdef is None:
+        yield _unknown_application(where, app.appdef, config)
+    else:
+        for role, topics in app.inputs.items():
+            if role not in appdef.inputs and topics:
+                yield fault(
+                    f"{where}.inputs.{role}",
+                    f"{appdef.name} takes no such input" + near(role, appdef.inputs),
+                )
+        for name in app.parameters:
+            if name not in appdef.parameters:
+                yield fault(
+                    f"{where}.parameters.{name}",
+                    f"{appdef.name} has no such parameter" + near(name, appdef.parameters),
+                )
+        if app.version and app.version not in config.versions_of(appdef.name):
+            yield fault(
+                f"{where}.version",
+                f"{shown(app.version)} is no version or channel of {appdef.name} in "
+                "registry/charts.yaml" + near(app.version, config.versions_of(appdef.name)),
+            )
+    if not joining:
+        return
+    yield from _node(f"{where}.node", app.node, config)
+    for role, topics in app.inputs.items():
+        for position, topic in enumerate(topics):
+            yield from _node(f"{where}.inputs.{role}[{position}].source", topic.source, config)
+    if appdef is not None and not any(app.inputs.values()):
+        yield fault(
+            f"{where}.inputs",
+            f"is empty; list at least one topic of {' or '.join(sorted(appdef.inputs))}",
+        )
+
+
+def _unknown_application(where: str, asked: str, config: Config) -> Fault:
+    if asked.startswith("#"):  # the number of a DeploymentRequest
+        known = "; known: " + ", ".join(
+            f"{one.deployment_request.type} ({one.name})"
+            for one in config.appdefs.values()
+            if one.deployment_request
+        )
+    else:
+        known = near(asked, config.appdefs)
+    named = asked.removeprefix("#") if asked.startswith("#") else shown(asked)
+    message = f"{named} names no application definition{known}"
+    return fault(f"{where}.appdef", message, code="unknown-application")
+
+
+def _connection(
+    where: str, connection: ConnectionDemand, config: Config, joining: bool
+) -> Iterator[Fault]:
+    types = {known.value: known for known in ConnectionType}
+    kind = types.get(connection.type)
+    if kind is None:
+        known = ", ".join(f"{n} ({item.name})" for n, item in types.items() if n >= 0)
+        yield fault(
+            f"{where}.type",
+            f"{connection.type} is no connection type; known: {known}",
+            code="unknown-connection-type",
+        )
+    if not joining:
+        return
+    yield from _node(f"{where}.source", connection.source, config)
+    yield from _node(f"{where}.target", connection.target, config)
+    if kind is None:
+        return
+    if kind is ConnectionType.AUTO:
+        ends_known = connection.source in config.nodes and connection.target in config.nodes
+        if ends_known and transport_choice.choice(connection, config) is kind:
+            yield _within(where, transport_choice.none_fits(connection, config))
+        return
+    for found in transport_choice.obstacles(kind, connection, config):
+        yield _within(where, found)
+
+
+def _within(where: str, found: Fault) -> Fault:
+    """Return a fault of a part of the request, told to be at ``where``."""
+    return replace(found, field=f"{where}.{found.field}")
+
+
+def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
+    if not node:
+        return  # told by the request's own checks
+    if node not in config.nodes:
+        yield fault(
+            where,
+            f"{shown(node)} is not in inventory/nodes.yaml" + near(node, config.nodes),
+            code="unknown-node",
+        )
+    elif node not in config.domain_of:
+        yield fault(
+            where,
+            f"{shown(node)} is in no access domain; a platform engineer adds it to "
+            "policy/access-domains.yaml",
+            code="no-access-domain",
+        )

@@ -1,0 +1,134 @@
+"""Claims: one demand's hold on one subject. Claims are all that the ledger stores."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from datetime import datetime
+from enum import Enum
+from types import MappingProxyType
+
+from demandops.demand.demand_request import OVERRIDE_PREFIX, ConnectionType, InputTopic
+from demandops.demand.lease import Lease
+from demandops.demand.route import Route
+
+
+class SubjectKind(Enum):
+    """What a claim can hold; the values are the ledger's folder names."""
+
+    APPLICATION = "applications"
+    CONNECTION = "connections"
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """An application or a connection, by its exact id."""
+
+    kind: SubjectKind
+    id: str
+
+    def __str__(self) -> str:
+        """Return ``application 'edge/fusion'``."""
+        return f"{self.kind.value[:-1]} '{self.id}'"
+
+
+@dataclass(frozen=True, slots=True)
+class ClaimKey:
+    """What a claim is found by; one file of the ledger."""
+
+    subject: Subject
+    demand: str
+
+
+@dataclass(frozen=True, slots=True)
+class ApplicationClaim:  # noqa: PLW1641 - with mappings in them claims have no hash
+    """One demand's hold on an application. ``inputs`` are sorted by topic within each role."""
+
+    application: str
+    demand: str
+    request: str
+    requesters: tuple[str, ...]
+    booked: datetime
+    appdef: str
+    node: str
+    inputs: Mapping[str, tuple[InputTopic, ...]]
+    parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    version: str = ""
+    lease: Lease | None = None
+
+    def __eq__(self, other: object) -> bool:
+        """Compare exactly: to Python 1 is True and 1.0, to a chart they are three values."""
+        if not isinstance(other, ApplicationClaim):
+            return NotImplemented
+        same = all(getattr(self, one.name) == getattr(other, one.name) for one in fields(self))
+        return same and _exact(self.parameters) == _exact(other.parameters)
+
+    @property
+    def subject(self) -> Subject:
+        """The application that is held."""
+        return Subject(SubjectKind.APPLICATION, self.application)
+
+    @property
+    def key(self) -> ClaimKey:
+        """Where in the ledger the claim stands."""
+        return ClaimKey(self.subject, self.demand)
+
+    def all_inputs(self) -> Iterable[tuple[str, InputTopic]]:
+        """Return every (role, topic)."""
+        return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
+
+
+def _exact(values: Mapping[str, object]) -> str:
+    return json.dumps(dict(values), sort_keys=True, default=repr) if values else ""
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionClaim:
+    """One demand's hold on a connection. ``topics`` are routes by source topic, sorted.
+
+    ``type`` is never ``AUTO``.
+    """
+
+    connection: str
+    demand: str
+    request: str
+    requesters: tuple[str, ...]
+    booked: datetime
+    type: ConnectionType
+    source: str
+    target: str
+    broker: str
+    topics: Mapping[str, Route]
+    lease: Lease | None = None
+
+    @property
+    def subject(self) -> Subject:
+        """The connection that is held."""
+        return Subject(SubjectKind.CONNECTION, self.connection)
+
+    @property
+    def key(self) -> ClaimKey:
+        """Where in the ledger the claim stands."""
+        return ClaimKey(self.subject, self.demand)
+
+
+Claim = ApplicationClaim | ConnectionClaim
+
+KEPT = OVERRIDE_PREFIX
+
+
+def is_kept(claim: Claim) -> bool:
+    """Tell whether an override holds a claim, rather than a demand."""
+    return claim.demand.startswith(KEPT)
+
+
+def demand_id(request: str, requesters: Iterable[str]) -> str:
+    """Return the demand id of a request that carries none.
+
+    The reference's message has no demand id, so it is made from the request id and the sorted,
+    de-duplicated requesters: the same request sent again is the same demand.
+    """
+    exact = json.dumps([request, sorted(set(requesters))], ensure_ascii=True)
+    return hashlib.sha256(exact.encode()).hexdigest()[:20]

@@ -1,0 +1,246 @@
+"""Our own demand as plain data, parsed into a :class:`DemandRequest`.
+
+The action ``demandops_interfaces/action/Demand`` and YAML of the kind ``Demand`` come through
+:func:`parse`. It names its demand, carries any application type and replaces what it held before.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from types import MappingProxyType
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, PlainValidator
+
+from demandops import strict_yaml
+from demandops.config.file_model import Frozen
+from demandops.config.policy import seconds_of
+from demandops.demand.demand_request import (
+    ApplicationDemand,
+    ConnectionDemand,
+    ConnectionType,
+    DemandRequest,
+    InputTopic,
+    Operation,
+)
+from demandops.demand.goal_form import valid_part
+from demandops.demand.route import RouteOptions
+from demandops.errors import Fault, fault, shown
+from demandops.identifiers import absolute
+from demandops.settings import API_VERSION
+
+TypeName = Literal["auto", "mqtt", "zenoh", "ros"]
+
+_TYPES = {known.name.lower(): known.value for known in ConnectionType}
+
+
+class GoalTopic(Frozen):
+    """A topic that an application takes in, and the node that publishes it."""
+
+    topic: str = ""
+    source: str = ""
+    type: str = ""
+
+
+class GoalApplication(Frozen):
+    """One application: its id, type (the name of an appdef), node and inputs by role.
+
+    ``parameters`` are values, ``parameters_json`` the same as JSON text. ``version`` is a version
+    or a channel of the registry. ``connect`` says by what inputs of other nodes come that no
+    connection of the demand carries.
+    """
+
+    id: str = ""
+    type: str = ""
+    node: str = ""
+    inputs: dict[str, list[GoalTopic]] = Field(default_factory=dict)
+    parameters: dict[str, Any] = Field(default_factory=dict)
+    parameters_json: dict[str, str] = Field(default_factory=dict)
+    version: str = ""
+    connect: Literal["auto", "mqtt", "zenoh", "ros", "none"] = "auto"
+
+
+class GoalRoute(RouteOptions):
+    """A topic of a connection; it has the same name at both ends where ``target`` is left out."""
+
+    source: str = ""
+    target: str = ""
+
+
+class GoalConnection(Frozen):
+    """One connection and the topics that it carries."""
+
+    id: str = ""
+    type: TypeName = "auto"
+    source: str = ""
+    target: str = ""
+    broker: str = ""
+    topics: list[GoalRoute] = Field(default_factory=list)
+
+
+def _lease_form(value: object) -> object:
+    if value is None or (isinstance(value, str | int) and not isinstance(value, bool)):
+        return value
+    raise ValueError(
+        f"must be a duration like 10m, or whole seconds, not {strict_yaml.brief(value)}"
+    )
+
+
+Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
+"""One validator for all that it may be: pydantic names each member of a union a field."""
+
+
+class DemandGoal(Frozen):
+    """A demand. ``lease`` is a duration like ``10m``, or whole seconds."""
+
+    apiVersion: Literal["demandops/v1"] = API_VERSION
+    kind: Literal["Demand"] = "Demand"
+    operation: Literal["put", "release", "renew"] = "put"
+    demand: str = ""
+    request: str = ""
+    requesters: list[str] = Field(default_factory=list)
+    lease: Lease = None
+    applications: list[GoalApplication] = Field(default_factory=list)
+    connections: list[GoalConnection] = Field(default_factory=list)
+    answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
+
+
+_DEEPEST = 50
+"""Levels of a parameter's value: a claim's file is read to a depth of 100."""
+_LISTS_OF_TEXT = ("requesters",)
+
+
+def is_demand_goal(data: dict[str, Any]) -> bool:
+    """Tell whether plain data is meant as a goal of our own action."""
+    return "kind" in data or "apiVersion" in data
+
+
+def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
+    """Parse a goal of our own action.
+
+    Returns:
+        The request and the faults of its form; a request with faults must not be booked.
+    """
+    goal, faults = valid_part(data, DemandGoal, _LISTS_OF_TEXT)
+    requesters = tuple(goal.requesters)
+    request = DemandRequest(
+        id=goal.request or goal.demand,
+        operation=Operation(goal.operation),
+        applications=tuple(
+            _application(f"applications[{index}]", app, requesters, faults)
+            for index, app in enumerate(goal.applications)
+        ),
+        connections=tuple(_connection(connection, requesters) for connection in goal.connections),
+        demand=goal.demand,
+        named_by=requesters,
+        lease_s=_lease(goal.lease, faults),
+    )
+    return request, faults
+
+
+def form_faults(data: dict[str, Any]) -> list[Fault]:
+    """Return what of ``data`` has not the form of a goal."""
+    return parse(data)[1]
+
+
+def _lease(lease: str | int | None, faults: list[Fault]) -> int | None:
+    if not isinstance(lease, str):
+        return lease
+    try:
+        return seconds_of(lease)
+    except ValueError as error:
+        faults.append(fault("lease", str(error)))
+        return None
+
+
+def _application(
+    where: str,
+    app: GoalApplication,
+    requesters: tuple[str, ...],
+    faults: list[Fault],
+) -> ApplicationDemand:
+    parameters: dict[str, Any] = {}
+    for name, value in app.parameters.items():
+        parameters[name] = _usable(f"{where}.parameters.{name}", value, faults)
+    for name, text in app.parameters_json.items():
+        place = f"{where}.parameters_json.{name}"
+        if name in parameters:
+            faults.append(fault(place, "is given in parameters already; give it once"))
+            continue
+        try:
+            parameters[name] = _usable(place, json.loads(text), faults)
+        except (ValueError, RecursionError):
+            message = 'is no JSON; a text needs quotes of its own, as in "\\"fast\\""'
+            faults.append(fault(place, message))
+    return ApplicationDemand(
+        id=app.id,
+        appdef=app.type,
+        node=app.node,
+        requesters=requesters,
+        inputs=MappingProxyType(
+            {
+                role: tuple(InputTopic(absolute(t.topic), t.source, t.type) for t in topics)
+                for role, topics in app.inputs.items()
+                if topics
+            }
+        ),
+        parameters=MappingProxyType(parameters),
+        version=app.version,
+        connect=None if app.connect == "none" else _TYPES[app.connect],
+    )
+
+
+def _usable(where: str, value: object, faults: list[Fault]) -> object:
+    """Return a parameter's value; what of it no ledger could keep is noted, and left out."""
+    problem = _unkeepable(value, 0)
+    if problem:
+        faults.append(fault(where, problem))
+    return None if problem else value
+
+
+def _unkeepable(value: object, depth: int) -> str:
+    if depth > _DEEPEST:
+        return f"is nested deeper than {_DEEPEST} levels; make it flatter"
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"holds {value}, which is no finite number; give one, or leave it out"
+    if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
+        return f"holds {shown(value)}, which is no Unicode text; write whole characters"
+    parts = [*value, *value.values()] if isinstance(value, dict) else value
+    nested = parts if isinstance(parts, list) else ()
+    return next(filter(None, (_unkeepable(part, depth + 1) for part in nested)), "")
+
+
+def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> ConnectionDemand:
+    return ConnectionDemand(
+        id=connection.id,
+        type=_TYPES[connection.type],
+        source=connection.source,
+        target=connection.target,
+        topics=tuple(
+            route.route(absolute(route.source), absolute(route.target or route.source))
+            for route in connection.topics
+        ),
+        broker=connection.broker,
+        requesters=requesters,
+    )
+
+
+_NAMES = (
+    (re.compile(r"^(applications\[\d+\])\.appdef$"), r"\1.type"),
+    (re.compile(r"^(applications|connections)\[\d+\]\.requesters"), "requesters"),
+    (re.compile(r"^id$"), "request"),
+)
+
+
+_OF_CONNECTION = re.compile(r"connections\[(\d+)\]")
+
+
+def field(path: str, request: DemandRequest) -> str:
+    """Return the goal's name for a field of its request; of a derived connection, its input."""
+    for pattern, replacement in _NAMES:
+        if pattern.match(path):
+            return pattern.sub(replacement, path)
+    of = _OF_CONNECTION.match(path)
+    return (request.connections[int(of[1])].because if of else "") or path

@@ -1,0 +1,241 @@
+"""One demand request: applications and connections wanted, or no longer wanted.
+
+The same value comes from the ROS 2 action and from YAML
+(:mod:`demandops.demand.deployment_request_goal`). It is structurally sound by
+construction; :func:`faults` says what its contents break, all together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from types import MappingProxyType
+
+from demandops.demand import route as routes
+from demandops.demand.lease import LONGEST_S, Term
+from demandops.demand.route import Route
+from demandops.errors import Fault, fault
+from demandops.identifiers import id_problem, topic_problem
+
+OVERRIDE_PREFIX = "override:"
+"""What the demand id of an override's own claim starts with, and no other demand's."""
+
+
+class Operation(Enum):
+    """What a request does to the ledger.
+
+    The reference's goal joins and shuts down, adding to and taking from what its requesters hold.
+    Our own names its demand and puts (replaces), releases or renews it; ``EXPIRE`` is the
+    generator's, for a demand whose lease ran out, ``DECOMMISSION`` its operator's, for a node or a
+    requester that leaves for good, ``ROLLBACK`` a person's, to go back to the books of an earlier
+    commit.
+    """
+
+    JOIN = "join"
+    SHUTDOWN = "shutdown"
+    PUT = "put"
+    RELEASE = "release"
+    RENEW = "renew"
+    EXPIRE = "expire"
+    DECOMMISSION = "decommission"
+    ROLLBACK = "rollback"
+
+    @property
+    def asks(self) -> bool:
+        """Tell whether something is asked for, rather than given up or kept."""
+        return self in (Operation.JOIN, Operation.PUT)
+
+    @property
+    def is_reference(self) -> bool:
+        """Tell whether it is of the reference's action, which names no demand."""
+        return self in (Operation.JOIN, Operation.SHUTDOWN)
+
+
+class ConnectionType(Enum):
+    """How a connection carries its topics; the values are the wire's numbers.
+
+    ``AUTO`` is asked for only, and is no number of the wire: a claim holds what was chosen
+    (:func:`demandops.demand.transport_choice.resolved`).
+    """
+
+    AUTO = -1
+    ROS = 0
+    MQTT = 1
+    ZENOH = 2
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class InputTopic:
+    """A topic that an application takes in, and the node that publishes it."""
+
+    topic: str
+    source: str
+    type: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ApplicationDemand:
+    """One application of a request. ``appdef`` is empty where the wire's number is unknown."""
+
+    id: str
+    appdef: str
+    node: str
+    requesters: tuple[str, ...]
+    inputs: Mapping[str, tuple[InputTopic, ...]]
+    parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    version: str = ""
+    connect: int | None = None
+    """The connection type for inputs of other nodes that the request leaves out, if any."""
+    term: Term | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionDemand:
+    """One connection of a request.
+
+    ``type`` is a value of :class:`ConnectionType` or an unknown number of the wire; ``broker`` is
+    empty where it is left open. ``because`` is the field of the input that a derived one is for.
+    """
+
+    id: str
+    type: int
+    source: str
+    target: str
+    topics: tuple[Route, ...]
+    broker: str
+    requesters: tuple[str, ...]
+    term: Term | None = None
+    because: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Leaving:
+    """What is decommissioned: a name, as what (``node``, ``requester``), and who has it done."""
+
+    name: str
+    kinds: frozenset[str]
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DemandRequest:
+    """A whole request: booked as a whole or refused as a whole.
+
+    ``demand`` is the demand's id where the request names it; the reference's does not, and there
+    it is made for each subject (:func:`demandops.demand.claim.demand_id`). ``named_by`` says in
+    whose name a request speaks that lists no subject. ``lease_s`` is the lease that it asks for, in
+    seconds.
+    """
+
+    id: str
+    operation: Operation
+    applications: tuple[ApplicationDemand, ...] = ()
+    connections: tuple[ConnectionDemand, ...] = ()
+    demand: str = ""
+    named_by: tuple[str, ...] = ()
+    lease_s: int | None = None
+    leaving: Leaving | None = None
+
+    def requesters(self) -> tuple[str, ...]:
+        """Return everybody in whose name something is asked, in the order listed, each once."""
+        subjects: tuple[ApplicationDemand | ConnectionDemand, ...]
+        subjects = (*self.applications, *self.connections)
+        listed = (who for subject in subjects for who in subject.requesters)
+        return tuple(dict.fromkeys((*self.named_by, *listed)))
+
+
+def faults(request: DemandRequest) -> Iterator[Fault]:
+    """Yield every fault of a request that shows without looking at configuration or ledger."""
+    joining = request.operation.asks
+    if request.id and request.id != request.demand:  # which it is where none is given
+        yield from _id("id", request.id)
+    yield from _named(request)
+    listing = request.operation not in (Operation.RELEASE, Operation.RENEW)
+    if listing and not (request.applications or request.connections):
+        yield fault(
+            "id" if request.operation.is_reference else "applications",
+            "the request lists no application and no connection; list what it is for",
+            code="empty",
+        )
+    for index, app in enumerate(request.applications):
+        where = f"applications[{index}]"
+        yield from _id(f"{where}.id", app.id)
+        yield from _requesters(f"{where}.requesters", app.requesters)
+        if joining or app.node:
+            yield from _id(f"{where}.node", app.node)
+        for role, topics in app.inputs.items():
+            for position, topic in enumerate(topics):
+                yield from _input(f"{where}.inputs.{role}[{position}]", topic, joining)
+    for index, connection in enumerate(request.connections):
+        yield from _connection(f"connections[{index}]", connection, joining)
+
+
+def _named(request: DemandRequest) -> Iterator[Fault]:
+    """Yield the faults of what only our own requests carry."""
+    if request.operation.is_reference:
+        return
+    yield from _id("demand", request.demand)
+    if request.demand.startswith(OVERRIDE_PREFIX):
+        yield fault(
+            "demand", f"starts with '{OVERRIDE_PREFIX}', as overrides do; choose another demand id"
+        )
+    if not (request.applications or request.connections):  # else told for each of these
+        yield from _requesters("requesters", request.named_by)
+    if request.lease_s is not None and not 0 < request.lease_s <= LONGEST_S:
+        yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
+    if request.operation is not Operation.PUT and request.lease_s is not None:
+        yield fault("lease", "is set by a put; leave it out, or put the demand again")
+    if request.operation is not Operation.PUT and (request.applications or request.connections):
+        yield fault(
+            "applications" if request.applications else "connections",
+            f"a {request.operation.value} names its demand alone; put the demand with less to give "
+            "up a part of it",
+        )
+
+
+def _input(where: str, topic: InputTopic, joining: bool) -> Iterator[Fault]:
+    problem = topic_problem(topic.topic)
+    if problem:
+        yield fault(f"{where}.topic", problem)
+    if joining or topic.source:
+        yield from _id(f"{where}.source", topic.source)
+    if topic.type:
+        yield from _id(f"{where}.type", topic.type)
+
+
+def _connection(where: str, connection: ConnectionDemand, joining: bool) -> Iterator[Fault]:
+    yield from _id(f"{where}.id", connection.id)
+    yield from _requesters(f"{where}.requesters", connection.requesters)
+    for end in ("source", "target"):
+        node = getattr(connection, end)
+        if joining or node:
+            yield from _id(f"{where}.{end}", node)
+    if connection.broker:
+        yield from _id(f"{where}.broker", connection.broker)
+    if joining and not connection.topics:
+        yield fault(f"{where}.topics", "is empty; a connection carries at least one topic, list it")
+    yield from routes.faults(f"{where}.topics", connection.topics)
+    for index, route in enumerate(connection.topics):
+        same_place = connection.source and connection.source == connection.target
+        if joining and same_place and route.source == route.target:
+            yield fault(
+                f"{where}.topics[{index}].target",
+                f"'{route.target}' would feed itself, for source and target are both "
+                f"'{connection.source}'; name another target node or topic",
+            )
+
+
+def _id(where: str, value: str) -> Iterator[Fault]:
+    problem = id_problem(value)
+    if problem:
+        yield fault(where, problem)
+
+
+def _requesters(where: str, requesters: Iterable[str]) -> Iterator[Fault]:
+    empty = True
+    for index, requester in enumerate(requesters):
+        empty = False
+        yield from _id(f"{where}[{index}]", requester)
+    if empty:
+        yield fault(where, "is empty; say for whom this is asked")

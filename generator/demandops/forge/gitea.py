@@ -1,0 +1,33 @@
+"""Pull requests of Gitea and Forgejo, by their API v1 (``/api/swagger`` of every instance)."""
+
+from __future__ import annotations
+
+from typing import Any
+from urllib.parse import quote
+
+from demandops.forge.api import ForgeError
+from demandops.forge.pull_request import PullRequest
+from demandops.forge.pull_request_api import Pulls
+
+_NOT_FOUND = 404
+
+
+class Gitea(Pulls):
+    """A repository on Gitea or Forgejo."""
+
+    NAME = "Gitea"
+    HEADERS = {"Accept": "application/json", "Authorization": "token {token}"}  # noqa: RUF012
+    EXISTS = 409
+
+    def find(self, branch: str, target: str) -> PullRequest | None:
+        """Return the pull request for a branch."""
+        try:  # the branch is the rest of the path, its slash as it is
+            path = f"{self._pulls}/{quote(target, safe='')}/{quote(branch, safe='/')}"
+            return self._read(self._api.call("GET", path, self.HEADERS))
+        except ForgeError as error:
+            if error.status == _NOT_FOUND:
+                return None
+            raise
+
+    def _is_merged(self, data: Any) -> bool:  # noqa: ANN401
+        return bool(data["merged"])

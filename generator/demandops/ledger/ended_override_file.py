@@ -1,0 +1,73 @@
+"""Markers: which overrides ended, and when, as files of the ledger.
+
+Whether an override applies must follow from the repo alone, or a replay and ``verify`` would give
+other bytes than the day did. So the generator commits that one ended, and a person's file that
+names a later time is in force again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+from demandops import strict_yaml
+from demandops.config.file_model import Frozen, parse_file
+from demandops.config.override import Override, moment_of, written
+from demandops.errors import InvalidInput
+from demandops.ledger.claim_file import LEDGER_ROOT
+from demandops.settings import LEDGER_API_VERSION
+
+MARKERS_ROOT = f"{LEDGER_ROOT}/overrides"
+
+
+class _Marker(Frozen):
+    apiVersion: Literal["demandops.ledger/v1"]
+    kind: Literal["EndedOverride"]
+    override: str
+    expires: str
+
+
+def path_of(name: str) -> str:
+    """Return the path of an override's marker."""
+    return f"{MARKERS_ROOT}/{name}.yaml"
+
+
+def write(override: Override) -> str:
+    """Return the text that says that an override ended at the time that it names."""
+    assert override.end is not None  # noqa: S101 - only such a one ends
+    return strict_yaml.dump(
+        {
+            "apiVersion": LEDGER_API_VERSION,
+            "kind": "EndedOverride",
+            "override": override.name,
+            "expires": written(override.end),
+        }
+    )
+
+
+def read(files: Mapping[str, str]) -> dict[str, str]:
+    """Return override → the time at which it ended.
+
+    What is no marker says nothing; :func:`stale` has it removed.
+    """
+    ended = {}
+    for path, text in files.items():
+        name = path.removeprefix(f"{MARKERS_ROOT}/").removesuffix(".yaml")
+        try:
+            marker = parse_file(_Marker, text, path)
+            if marker.override == name and path == path_of(name):
+                ended[name] = written(moment_of(marker.expires))
+        except (InvalidInput, ValueError):
+            continue
+    return ended
+
+
+def stale(paths: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
+    """Return the markers whose override is gone, or names another time by now."""
+    ended = read(paths)
+    fitting = {
+        path_of(name)
+        for name, override in overrides.items()
+        if override.end is not None and ended.get(name) == written(override.end)
+    }
+    return sorted({*paths} - fitting)

@@ -1,0 +1,153 @@
+"""Going back: the claims of an earlier commit, booked again as they stood there.
+
+What was booked since goes only where that is wanted. A claim that comes back has the lease that it
+had, for its full term from now on: with its old end it would be released at once. Claims of
+overrides' own are nobody's demand: whether they come or go is settled as after every change
+(:mod:`demandops.plan.overrides.kept_claims`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+from demandops.config.config import Config
+from demandops.demand import admission, permission
+from demandops.demand.claim import ApplicationClaim, Claim, is_kept
+from demandops.demand.demand_request import (
+    ApplicationDemand,
+    ConnectionDemand,
+    DemandRequest,
+    Operation,
+)
+from demandops.demand.lease import Lease, Term
+from demandops.errors import Fault, Refused, fault
+from demandops.ledger.claim_file import path_of
+from demandops.ledger.ledger import Changes, ClaimChange, Ledger, differences
+
+_SHOWN = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Restoration(DemandRequest):
+    """A request to go back to the books of a commit.
+
+    ``to`` is the commit, ``made`` when it was made, ``claims`` what it held; ``by`` and ``email``
+    are who asks for it.
+    """
+
+    to: str = ""
+    made: datetime | None = None
+    claims: tuple[Claim, ...] = ()
+    drop_newer: bool = False
+    reason: str = ""
+    by: str = ""
+    email: str = ""
+
+
+def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+    """Make the books what they were.
+
+    Raises:
+        Refused: where that would drop or undo what was booked since, and it may not.
+    """
+    assert isinstance(request, Restoration)  # noqa: S101 - the operation says so
+    changes = _changes(ledger, request)
+    if not request.drop_newer:
+        newer = [c for c in changes if c.before is not None and not is_kept(c.before)]
+        if newer:
+            raise Refused(_newer(newer))
+    start = ledger
+    for change in changes:
+        ledger = ledger.replace(change.key, _fresh(change, now))
+    return ledger, Changes(claims=differences(start, ledger, [change.key for change in changes]))
+
+
+def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
+    """Return what going back changes; a claim whose lease alone was renewed stays as it is."""
+    wanted = {claim.key: claim for claim in request.claims}
+    gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in wanted]
+    back = [ClaimChange(ledger.get(key), claim) for key, claim in wanted.items()]
+    back = [change for change in back if not _alike(change.before, change.after)]
+    return sorted([*gone, *back], key=lambda change: path_of(change.key))
+
+
+def _alike(one: Claim | None, other: Claim | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    if is_kept(one):  # when it was kept is no part of what is asked
+        one = replace(one, booked=other.booked)
+    return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
+
+
+def _fresh(change: ClaimChange, now: datetime) -> Claim | None:
+    claim = change.after
+    if claim is None or claim.lease is None:
+        return claim
+    term = Term(claim.lease.seconds, claim.lease.slack)
+    lease: Lease = term.starting(now)
+    return replace(claim, lease=lease)
+
+
+def _newer(changes: list[ClaimChange]) -> Iterator[Fault]:
+    for change in changes[:_SHOWN]:
+        claim = change.before
+        assert claim is not None  # noqa: S101 - the caller chose those
+        what = "drop" if change.after is None else "undo a change of"
+        message = (
+            f"would {what} the claim of {', '.join(claim.requesters)} on {claim.subject}, booked "
+            f"{claim.booked:%Y-%m-%d %H:%M:%S} UTC (request '{claim.request}')"
+        )
+        yield fault("", message, code="newer").within(path_of(claim.key))
+    more = len(changes) - _SHOWN
+    rest = f"and {more} more; " if more > 0 else ""
+    message = f"{rest}what was booked since stays unless it is to go as well (--drop-newer)"
+    yield fault("", message, code="newer")
+
+
+def faults(request: Restoration, ledger: Ledger, config: Config) -> Iterator[Fault]:
+    """Yield why claims that come back are not possible any more, by what is configured now."""
+    for change in _changes(ledger, request):
+        if change.after is None or is_kept(change.after):  # overrides keep or drop their own
+            continue
+        asked = _asked(change.after)
+        for found in (*admission.faults(asked, config), *permission.faults(asked, config)):
+            field = found.field.partition("].")[2] or found.field
+            yield replace(found, field=field).within(path_of(change.key))
+
+
+def _asked(claim: Claim) -> DemandRequest:
+    """Return the request that would book a claim today."""
+    applications: Iterable[ApplicationDemand] = ()
+    connections: Iterable[ConnectionDemand] = ()
+    if isinstance(claim, ApplicationClaim):
+        app = ApplicationDemand(
+            id=claim.application,
+            appdef=claim.appdef,
+            node=claim.node,
+            requesters=claim.requesters,
+            inputs=claim.inputs,
+            parameters=claim.parameters,
+            version=claim.version,
+        )
+        applications = (app,)
+    else:
+        connection = ConnectionDemand(
+            id=claim.connection,
+            type=claim.type.value,
+            source=claim.source,
+            target=claim.target,
+            topics=tuple(claim.topics.values()),
+            broker=claim.broker,
+            requesters=claim.requesters,
+        )
+        connections = (connection,)
+    return DemandRequest(
+        id=claim.request,
+        operation=Operation.PUT,
+        applications=tuple(applications),
+        connections=tuple(connections),
+        demand=claim.demand,
+        lease_s=claim.lease.seconds if claim.lease else None,
+    )

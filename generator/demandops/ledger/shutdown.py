@@ -1,0 +1,159 @@
+"""Releasing: which claims a shutdown means, and what remains of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from datetime import datetime
+from types import MappingProxyType
+from typing import TypeAlias
+
+from demandops.demand.claim import (
+    ApplicationClaim,
+    Claim,
+    ClaimKey,
+    ConnectionClaim,
+    Subject,
+    SubjectKind,
+    demand_id,
+)
+from demandops.demand.demand_request import (
+    ApplicationDemand,
+    ConnectionDemand,
+    ConnectionType,
+    DemandRequest,
+    InputTopic,
+)
+from demandops.errors import Fault, Refused, fault
+from demandops.ledger.ledger import Changes, Ledger, differences
+
+
+def release(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+    """Release what a shutdown lists; raise :class:`Refused` where nothing of it is held."""
+    start = ledger
+    keys: list[ClaimKey] = []
+    not_held: list[str] = []
+    for subject, asked in _listed(request):
+        # looked up in what was held at first: a second listing of a subject means the same claim
+        claim = _meant(start.of(subject), request.id, asked)
+        if claim is None:
+            not_held.append(f"{subject} for {', '.join(asked.requesters)}")
+            continue
+        not_held += [f"{subject}: {name}" for name in _subtracted(claim, asked, now)[1]]
+        left = ledger.get(claim.key)
+        if left is not None:
+            ledger = ledger.replace(claim.key, _subtracted(left, asked, now)[0])
+        keys.append(claim.key)
+    changes = differences(start, ledger, keys)
+    if not changes:
+        raise Refused([_nothing_held(start, request)])
+    return ledger, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
+
+
+Asked: TypeAlias = ApplicationDemand | ConnectionDemand
+
+
+def _listed(request: DemandRequest) -> Iterator[tuple[Subject, Asked]]:
+    for app in request.applications:
+        yield Subject(SubjectKind.APPLICATION, app.id), app
+    for connection in request.connections:
+        yield Subject(SubjectKind.CONNECTION, connection.id), connection
+
+
+def _meant(claims: Iterable[Claim], request: str, asked: Asked) -> Claim | None:
+    """Return the claim that a shutdown means, or nothing: nothing is ever released by guess."""
+    claims = [claim for claim in claims if _same_ends(claim, asked)]
+    requesters = set(asked.requesters)
+    made = demand_id(request, requesters)
+    exact = [claim for claim in claims if set(claim.requesters) == requesters]
+    meant = (
+        [claim for claim in exact if claim.demand == made]
+        or [claim for claim in exact if claim.request == request]
+        or exact
+        or [claim for claim in claims if set(claim.requesters) >= requesters]
+    )
+    return meant[0] if len(meant) == 1 else None
+
+
+def _same_ends(claim: Claim, asked: Asked) -> bool:
+    if isinstance(claim, ApplicationClaim) and isinstance(asked, ApplicationDemand):
+        return asked.node in ("", claim.node) and asked.appdef == claim.appdef
+    if isinstance(claim, ConnectionClaim) and isinstance(asked, ConnectionDemand):
+        return (
+            asked.source in ("", claim.source)
+            and asked.target in ("", claim.target)
+            and asked.type in (ConnectionType.AUTO.value, claim.type.value)
+        )
+    return False
+
+
+def _subtracted(claim: Claim, asked: Asked, now: datetime) -> tuple[Claim | None, list[str]]:
+    """Return what remains of ``claim`` (nothing: it is dropped) and what of it was not held."""
+    if isinstance(claim, ApplicationClaim) and isinstance(asked, ApplicationDemand):
+        return _subtracted_inputs(claim, asked, now)
+    if isinstance(claim, ConnectionClaim) and isinstance(asked, ConnectionDemand):
+        return _subtracted_topics(claim, asked, now)
+    raise AssertionError("a claim and what is asked are of one kind")  # pragma: no cover
+
+
+def _subtracted_inputs(
+    claim: ApplicationClaim, asked: ApplicationDemand, now: datetime
+) -> tuple[Claim | None, list[str]]:
+    if not any(asked.inputs.values()):
+        return None, []
+    rest: dict[str, tuple[InputTopic, ...]] = {}
+    missing = []
+    for role in sorted({*claim.inputs, *asked.inputs}):
+        held = claim.inputs.get(role, ())
+        gone: set[InputTopic] = set()
+        for topic in asked.inputs.get(role, ()):
+            found = {t for t in held if t.topic == topic.topic and topic.source in ("", t.source)}
+            gone |= found
+            if not found:
+                missing.append(f"{role} {topic.topic} of {topic.source}")
+        left = tuple(topic for topic in held if topic not in gone)
+        if left:
+            rest[role] = left
+    if not rest:
+        return None, missing
+    if rest == dict(claim.inputs):
+        return claim, missing
+    return replace(claim, inputs=MappingProxyType(rest), booked=now), missing
+
+
+def _subtracted_topics(
+    claim: ConnectionClaim, asked: ConnectionDemand, now: datetime
+) -> tuple[Claim | None, list[str]]:
+    if not asked.topics:
+        return None, []
+    gone = {route.source for route in asked.topics}
+    missing = [f"topic {topic}" for topic in sorted(gone - set(claim.topics))]
+    rest = {source: route for source, route in claim.topics.items() if source not in gone}
+    if not rest:
+        return None, missing
+    if rest == dict(claim.topics):
+        return claim, missing
+    return replace(claim, topics=MappingProxyType(rest), booked=now), missing
+
+
+def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
+    """Say that a shutdown finds nothing, with the claims that come near: a typo must show."""
+    near = [
+        f"{claim.subject} for {', '.join(claim.requesters)} (request '{claim.request}')"
+        for subject, _ in _listed(request)
+        for claim in ledger.of(subject)
+    ]
+    where = "applications[0].id" if request.applications else "connections[0].id"
+    if not near:
+        wanted = set(request.requesters())
+        near = [
+            f"{claim.subject} for {', '.join(claim.requesters)}"
+            for claim in sorted(ledger, key=lambda claim: (str(claim.subject), claim.demand))
+            if wanted & set(claim.requesters)
+        ]
+    shown = "; ".join(dict.fromkeys(near[:5])) or "none"
+    return fault(
+        where,
+        f"nothing that the shutdown lists is held; claims that come near: {shown}",
+        code="not-held",
+    )

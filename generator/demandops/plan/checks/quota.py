@@ -1,0 +1,81 @@
+"""Quotas: does a booking leave more than an access domain allows?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from demandops.config.config import Config
+from demandops.config.policy import AccessDomain
+from demandops.demand.claim import ApplicationClaim, Claim, Subject, SubjectKind
+from demandops.errors import Fault, fault
+from demandops.ledger.apply import Changes, Ledger
+from demandops.plan.release import ServiceKey
+from demandops.plan.release_keys import keys_of
+
+
+def faults(before: Ledger, after: Ledger, changes: Changes, config: Config) -> Iterator[Fault]:
+    """Yield every quota that ``changes`` go beyond; what was over it before may stay and shrink."""
+    booked = [change.after for change in changes.claims if change.after]
+    holders = {(_node(claim), who) for claim in booked for who in claim.requesters}
+    domains = {
+        (found.name, who): found for node, who in holders if (found := config.domain_of.get(node))
+    }
+    for (_, requester), domain in sorted(domains.items(), key=lambda pair: pair[0]):
+        yield from _claims(requester, before, after, domain, config)
+    touched = [c.after or c.before for c in changes.claims]
+    for node in sorted(_nodes(claim for claim in touched if claim)):
+        yield from _services(node, before, after, config)
+
+
+def _claims(
+    requester: str, before: Ledger, after: Ledger, domain: AccessDomain, config: Config
+) -> Iterator[Fault]:
+    most = domain.quotas.claims_per_requester
+    if most is None:
+        return
+    count = _held(requester, after, domain, config)
+    if count > most and count > _held(requester, before, domain, config):
+        yield _over(domain, "claimsPerRequester", most, f"'{requester}' would hold {count} claims")
+
+
+def _held(requester: str, ledger: Ledger, domain: AccessDomain, config: Config) -> int:
+    claims = ledger.of_requester(requester)
+    return sum(config.domain_of.get(_node(claim)) is domain for claim in claims)
+
+
+def _services(node: str, before: Ledger, after: Ledger, config: Config) -> Iterator[Fault]:
+    domain = config.domain_of.get(node)
+    most = domain.quotas.services_per_node if domain else None
+    if domain is None or most is None:
+        return
+    count = _running(node, after, config)
+    if count > most and count > _running(node, before, config):
+        yield _over(domain, "servicesPerNode", most, f"'{node}' would run {count} services")
+
+
+def _running(node: str, ledger: Ledger, config: Config) -> int:
+    applications = (Subject(SubjectKind.APPLICATION, name) for name in ledger.at_node(node))
+    keys = {key for subject in applications for key in keys_of(ledger, config, subject)}
+    return sum(isinstance(key, ServiceKey) and key.node == node for key in keys)
+
+
+def _over(domain: AccessDomain, quota: str, most: int, what: str) -> Fault:
+    return fault(
+        "",
+        f"{what}, and quotas.{quota} of access domain '{domain.name}' allows {most}; release "
+        "something first, or have policy/ changed",
+        code="quota",
+    )
+
+
+def _node(claim: Claim) -> str:
+    """Return where a claim counts: where the application runs or the connection leads."""
+    return claim.node if isinstance(claim, ApplicationClaim) else claim.target
+
+
+def _nodes(claims: Iterable[Claim]) -> set[str]:
+    nodes = set()
+    for claim in claims:
+        if isinstance(claim, ApplicationClaim):
+            nodes |= {claim.node, *(topic.source for _, topic in claim.all_inputs())}
+    return nodes

@@ -1,0 +1,81 @@
+"""Invented demands: what every appdef would run, and every override would make of it.
+
+What people merge is tried before somebody demands it. Gives releases to render; renders nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from datetime import datetime, timezone
+
+from demandops.config.appdef import ApplicationDefinition
+from demandops.config.config import Config
+from demandops.config.override import Override
+from demandops.config.policy import matches
+from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
+from demandops.ledger import apply as booking
+from demandops.ledger.apply import Ledger
+from demandops.plan.overrides.effects import effects_on, with_overrides
+from demandops.plan.planner import plan
+from demandops.plan.release import ServiceRelease
+from demandops.plan.release_keys import affected
+
+_NEVER = datetime.fromtimestamp(0, timezone.utc)
+
+
+def releases(config: Config) -> dict[str, list[ServiceRelease]]:
+    """Return appdef → its services for an invented demand on some node, without overrides.
+
+    Raises:
+        Refused: where one cannot be planned.
+    """
+    place = next(iter(sorted(config.domain_of)), None)
+    if place is None:
+        return {}
+    plain = config.without_overrides()
+    return {
+        appdef.name: list(_services(appdef, place, plain)) for appdef in config.appdefs.values()
+    }
+
+
+def _services(
+    appdef: ApplicationDefinition, place: str, config: Config
+) -> Iterator[ServiceRelease]:
+    request = DemandRequest(
+        id="rehearsal",
+        operation=Operation.JOIN,
+        applications=(
+            ApplicationDemand(
+                id=f"rehearsal/{appdef.name}",
+                appdef=appdef.name,
+                node=place,
+                requesters=("rehearsal",),
+                inputs={
+                    role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", place),)
+                    for role in appdef.inputs
+                },
+            ),
+        ),
+    )
+    ledger, changes = booking.apply(Ledger(), request, _NEVER)
+    for key in affected(Ledger(), ledger, config, changes.subjects()):
+        release = plan(ledger, config, key)
+        if isinstance(release, ServiceRelease):
+            yield release
+
+
+def overridden(
+    override: Override, invented: Iterable[ServiceRelease], appdef: str, config: Config
+) -> Iterator[ServiceRelease]:
+    """Yield the invented releases of an appdef as an override would have those it may be for."""
+    for release in invented:
+        effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
+        if effects and any(
+            not selector.connections
+            and (not selector.services or matches(release.key.service, selector.services))
+            and (not selector.appdefs or matches(appdef, selector.appdefs))
+            for selector in override.select
+        ):
+            shaped = with_overrides(release, [(override, effects)], config)
+            if isinstance(shaped, ServiceRelease):
+                yield shaped

@@ -1,0 +1,122 @@
+"""Plans brought forward from one ledger to another, by what each was seen to read.
+
+Planning is a function of ledger and configuration. Where nothing that it read of the ledger has
+changed the result is the same, so only the others are planned again. It does not presume which
+releases a claim affects: a proof must not take that over from the generator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeAlias, TypeVar, cast
+
+from demandops.config.config import Config
+from demandops.demand.claim import Subject
+from demandops.ledger.ledger import ClaimChange, Ledger, entries
+from demandops.plan.planner import plan
+from demandops.plan.release import Release
+from demandops.plan.release_keys import ReleaseKey, keys_of
+
+T = TypeVar("T")
+
+_Unit: TypeAlias = "Subject | ReleaseKey"
+_Read: TypeAlias = "Subject | tuple[str, ...]"
+
+_ALL: _Read = ("all",)
+"""What somebody read who went through the whole ledger."""
+
+
+class IncrementalPlan:
+    """The plan of one configuration, for one ledger after the other."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._keys: dict[Subject, tuple[ReleaseKey, ...]] = {}
+        self._readers: dict[_Read, set[_Unit]] = {}
+        self._planned: set[ReleaseKey] = set()
+
+    def advance(
+        self, ledger: Ledger, changes: Iterable[ClaimChange]
+    ) -> dict[ReleaseKey, Release | None]:
+        """Plan anew what the changes may have changed; all, the first time.
+
+        Args:
+            ledger: the books after the changes.
+            changes: every claim that is not what it was.
+
+        Returns:
+            The releases that were planned anew; nothing for one that does not run (any more).
+
+        Raises:
+            Refused: as :func:`demandops.plan.planner.plan`; the plan must then be made afresh.
+        """
+        stale = {unit for read in _changed(changes) for unit in self._readers.pop(read, ())}
+        for subject in ledger.claims:
+            if subject in stale or subject not in self._keys:
+                self._keys[subject] = self._traced(
+                    ledger,
+                    subject,
+                    lambda seen, of=subject: tuple(keys_of(seen, self._config, of, strict=True)),  # type: ignore[misc]
+                )
+        for subject in [one for one in stale if one in self._keys]:
+            if subject not in ledger.claims:
+                del self._keys[subject]
+        wanted = {key for keys in self._keys.values() for key in keys}
+        gone = self._planned - wanted
+        found: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
+        for key in sorted(wanted - self._planned | (wanted & stale), key=repr):
+            found[key] = self._traced(
+                ledger,
+                key,
+                lambda seen, of=key: plan(seen, self._config, of),  # type: ignore[misc]
+            )
+        self._planned = wanted
+        return found
+
+    def _traced(self, ledger: Ledger, unit: _Unit, work: Callable[[Ledger], T]) -> T:
+        reads: set[_Read] = set()
+        result = work(
+            Ledger(
+                cast(Any, _Recording(ledger.claims, reads)),
+                cast(Any, _Recording(ledger.index, reads)),
+                cast(Any, None),  # when leases end is no part of a plan
+            )
+        )
+        for read in reads:
+            self._readers.setdefault(read, set()).add(unit)
+        return result
+
+
+def _changed(changes: Iterable[ClaimChange]) -> set[_Read]:
+    """Return whatever reads otherwise after the changes."""
+    reads: set[_Read] = {_ALL}
+    for change in changes:
+        reads |= {change.key.subject, *entries(change.before), *entries(change.after)}
+    return reads
+
+
+class _Recording:
+    """A map of the ledger that notes what is read of it."""
+
+    def __init__(self, map: Any, reads: set[_Read]) -> None:  # noqa: ANN401 - either map
+        self._map, self._reads = map, reads
+
+    def get(self, key: _Read, default: Any = None) -> Any:  # noqa: ANN401
+        self._reads.add(key)
+        return self._map.get(key, default)
+
+    def __getitem__(self, key: _Read) -> Any:  # noqa: ANN401
+        self._reads.add(key)
+        return self._map[key]
+
+    def __contains__(self, key: _Read) -> bool:
+        self._reads.add(key)
+        return key in self._map
+
+    def __iter__(self) -> Iterator[Any]:
+        self._reads.add(_ALL)
+        return iter(self._map)
+
+    def values(self) -> Any:  # noqa: ANN401
+        self._reads.add(_ALL)
+        return self._map.values()

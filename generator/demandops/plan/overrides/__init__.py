@@ -1,0 +1,1 @@
+"""What overrides make of claims and releases, before anything is planned."""

@@ -1,0 +1,117 @@
+"""What overrides make of a planned release: another version, place, number or image, or none.
+
+Applied to the releases that a demand touches and to no others. Values are patched when they are
+rendered, for a template gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from demandops.config.config import DDS_ROUTER_IMAGE, MQTT_CLIENT_IMAGE, ZENOH_BRIDGE_IMAGE, Config
+from demandops.config.override import Override
+from demandops.demand.claim import KEPT, Claim
+from demandops.ledger.apply import Ledger
+from demandops.plan.overrides.claims_in_force import denied_by
+from demandops.plan.overrides.selectors import Traits, selects
+from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease, Shaping, place
+
+_CLIENT_IMAGES: dict[type[MqttEnd | RosEnd | Bridge], str] = {
+    MqttEnd: MQTT_CLIENT_IMAGE,
+    RosEnd: DDS_ROUTER_IMAGE,
+    Bridge: ZENOH_BRIDGE_IMAGE,
+}
+
+
+def shaped(release: Release, ledger: Ledger, config: Config) -> Release | None:
+    """Return a release as the overrides in force have it, or nothing where one denies it.
+
+    Raises:
+        Refused: where the node that it is moved to is gone.
+    """
+    if not config.in_force:
+        return release
+    claims = _claims(release, ledger)
+    traits = _traits(release, claims)
+    if denying(release, ledger, config) is not None:
+        return None
+    kept = {claim.demand.removeprefix(KEPT) for claim in claims if claim.demand.startswith(KEPT)}
+    by = []
+    for override in config.in_force:
+        effects = _effects(release, override, config) if selects(override, traits, config) else ()
+        if override.keep and override.name in kept:
+            effects = (*effects, "keep")
+        if effects:
+            by.append((override, effects))
+    return with_overrides(release, by, config)
+
+
+def denying(release: Release, ledger: Ledger, config: Config) -> Override | None:
+    """Return the override that keeps a service from running, or nothing."""
+    if not isinstance(release, ServiceRelease) or not any(one.deny for one in config.in_force):
+        return None
+    return denied_by(_traits(release, _claims(release, ledger)), config)
+
+
+def with_overrides(
+    release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
+) -> Release:
+    """Return a release with the effects of these overrides, who comes last wins."""
+    by = tuple(by)
+    if not by:
+        return release
+    release = replace(release, shaping=Shaping(by))
+    if not isinstance(release, ServiceRelease):
+        return release
+    for override, effects in by:
+        if "version" in effects:
+            chart = config.charts[release.service.chart].at(str(override.version))
+            release = replace(release, chart=chart or release.chart)
+        if "replicas" in effects and override.replicas is not None:
+            release = replace(release, replicas=override.replicas)
+        if "node" in effects:
+            node, domain = place(config, str(override.node))
+            release = replace(release, node=node, domain=domain)
+    return release
+
+
+def effects_on(release: Release, override: Override, config: Config) -> tuple[str, ...]:
+    """Return what an override would do to a release, were it selected."""
+    return _effects(release, override, config)
+
+
+def _effects(release: Release, override: Override, config: Config) -> tuple[str, ...]:
+    if isinstance(release, ServiceRelease):
+        images = set(release.service.images)
+        known = config.charts[release.service.chart].versions()
+        possible = {"values", "replicas", "node", "hold"}
+        possible |= {"version"} if override.version in known else set()
+    else:
+        images = {_CLIENT_IMAGES[type(release)]}
+        possible = {"hold"}
+    possible |= {"images"} if images & {*(override.images or ())} else set()
+    return tuple(name for name in override.effects() if name in possible)
+
+
+def _claims(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
+    if isinstance(release, ServiceRelease):
+        return tuple(claim for app in release.applications for claim in ledger.application(app))
+    names = release.connections if isinstance(release, Bridge) else (release.connection,)
+    return tuple(claim for name in names for claim in ledger.connection(name))
+
+
+def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:
+    nodes = (release.node.id,)
+    if isinstance(release, ServiceRelease):
+        appdefs = {claim.appdef for claim in claims if hasattr(claim, "appdef")}
+        return Traits(
+            nodes,
+            release.requesters,
+            release.applications,
+            tuple(sorted(appdefs)),
+            service=release.key.service,
+        )
+    requesters = {who for claim in claims for who in claim.requesters}
+    names = release.connections if isinstance(release, Bridge) else (release.connection,)
+    return Traits(nodes, tuple(sorted(requesters)), connections=names)

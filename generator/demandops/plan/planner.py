@@ -1,0 +1,208 @@
+"""From claims to releases.
+
+:func:`plan` derives one release by its key (:mod:`demandops.plan.release_keys`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from types import MappingProxyType
+
+from demandops.config.appdef import ApplicationDefinition, Parameter, Scaling, Service
+from demandops.config.config import Config
+from demandops.config.override import Override
+from demandops.config.registry import ChartSource
+from demandops.demand.claim import ApplicationClaim, Subject, SubjectKind
+from demandops.demand.demand_request import InputTopic
+from demandops.errors import Refused, fault
+from demandops.ledger.apply import Ledger
+from demandops.plan import connection_clients, naming, parameters
+from demandops.plan.connection_clients import BridgeKey, EndKey
+from demandops.plan.overrides import effects
+from demandops.plan.overrides.claims_in_force import in_force
+from demandops.plan.release import Release, ServiceKey, ServiceRelease, place
+from demandops.plan.release_keys import ReleaseKey, appdef_of, keys_of
+
+
+def plan(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
+    """Return the release at ``key`` as overrides shape it, or nothing where no claim needs it.
+
+    Raises:
+        Refused: where claims contradict each other in a parameter, or what a claim names is no
+            longer in the configuration.
+    """
+    ledger = in_force(ledger, config)
+    release = _unshaped(ledger, config, key)
+    return effects.shaped(release, ledger, config) if release else None
+
+
+def denied(ledger: Ledger, config: Config, key: ReleaseKey) -> tuple[Release, Override] | None:
+    """Return the release that is needed at ``key`` and the override that denies it, or nothing."""
+    ledger = in_force(ledger, config)
+    release = _unshaped(ledger, config, key)
+    by = effects.denying(release, ledger, config) if release else None
+    return (release, by) if release and by else None
+
+
+def _unshaped(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
+    if isinstance(key, EndKey):
+        return connection_clients.end(ledger, config, key)
+    if isinstance(key, BridgeKey):
+        return connection_clients.bridge(ledger, config, key)
+    return _service(ledger, config, key)
+
+
+def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease | None:
+    named = (key.application,) if key.application is not None else None
+    users = tuple(  # an application may run elsewhere by now, or as something else
+        application
+        for application in named or ledger.taking(str(key.source), str(key.topic))
+        if key in keys_of(ledger, config, Subject(SubjectKind.APPLICATION, application))
+    )
+    claims = tuple(claim for user in users for claim in ledger.application(user))
+    if not claims:
+        return None
+    appdef = appdef_of(config, claims[0].appdef)
+    service = appdef.services[key.service]
+    node, domain = place(config, key.node)
+    if service.each is not None:
+        claims = tuple(claim for claim in claims if _takes(claim, service.each, key))
+        inputs = {service.each: _shared_input(claims, service.each, key)}
+    else:
+        inputs = _application_inputs(config, appdef, service, claims)
+    definitions: dict[str, Parameter] = {}
+    for name in sorted({claim.appdef for claim in claims}, reverse=True):
+        definitions |= appdef_of(config, name).parameters
+    values = parameters.merged(definitions, claims)
+    return ServiceRelease(
+        key=key,
+        name=service_name(config, service, key),
+        node=node,
+        domain=domain,
+        appdef=min(
+            name
+            for name, known in config.appdefs.items()
+            if known.services.get(key.service) == service
+        ),
+        service=service,
+        chart=_chart(config, service, claims),
+        inputs=MappingProxyType(inputs),
+        outputs=MappingProxyType(outputs(config, service, key)),
+        parameters=MappingProxyType(values),
+        replicas=_replicas(service.scaling, sum(map(len, inputs.values()))),
+        applications=users,
+        requesters=_requesters(claims),
+    )
+
+
+def _chart(config: Config, service: Service, claims: Iterable[ApplicationClaim]) -> ChartSource:
+    """Return the chart in the version that the claims ask for, the default where it has none.
+
+    Raises:
+        Refused: where applications that share the service ask for different ones.
+    """
+    chart = config.charts[service.chart]
+    asked = {claim.version: chart.at(claim.version) or chart for claim in claims}
+    if len({source.version for source in asked.values()}) > 1:
+        versions = " and ".join(
+            f"{source.version} (for '{version}')" for version, source in sorted(asked.items())
+        )
+        message = (
+            f"{service.chart} is shared and asked for in versions {versions}; ask for the same"
+        )
+        raise Refused([fault("version", message, code="conflict")])
+    return next(iter(asked.values()))
+
+
+def _requesters(claims: Iterable[ApplicationClaim]) -> tuple[str, ...]:
+    return tuple(sorted({who for claim in claims for who in claim.requesters}))
+
+
+def _takes(claim: ApplicationClaim, role: str, key: ServiceKey) -> bool:
+    return any(
+        (topic.source, topic.topic) == (key.source, key.topic)
+        for topic in claim.inputs.get(role, ())
+    )
+
+
+def _shared_input(
+    claims: Iterable[ApplicationClaim], role: str, key: ServiceKey
+) -> tuple[InputTopic, ...]:
+    types = {
+        topic.type
+        for claim in claims
+        for topic in claim.inputs.get(role, ())
+        if (topic.source, topic.topic) == (key.source, key.topic) and topic.type
+    }
+    return (InputTopic(str(key.topic), str(key.source), min(types, default="")),)
+
+
+def _application_inputs(
+    config: Config,
+    appdef: ApplicationDefinition,
+    service: Service,
+    claims: tuple[ApplicationClaim, ...],
+) -> dict[str, tuple[InputTopic, ...]]:
+    inputs: dict[str, tuple[InputTopic, ...]] = {}
+    for role, origin in sorted(service.inputs.items()):
+        producer_name, _, output = origin.partition(".")
+        if not output:
+            inputs[role] = _united(claims, origin)
+            continue
+        producer = appdef.services[producer_name]
+        found = set()
+        for topic in _united(claims, str(producer.each)):
+            node = topic.source if producer.placement == "source" else claims[0].node
+            key = ServiceKey(producer_name, node, source=topic.source, topic=topic.topic)
+            found.add(InputTopic(outputs(config, producer, key)[output], topic.source))
+        inputs[role] = tuple(sorted(found))
+    return inputs
+
+
+def _united(claims: Iterable[ApplicationClaim], role: str) -> tuple[InputTopic, ...]:
+    types: dict[tuple[str, str], set[str]] = {}
+    for claim in claims:
+        for topic in claim.inputs.get(role, ()):
+            types.setdefault((topic.topic, topic.source), set()).add(topic.type)
+    return tuple(InputTopic(*key, max(found)) for key, found in sorted(types.items()))
+
+
+def service_name(config: Config, service: Service, key: ServiceKey) -> str:
+    """Return the release name of a service instance.
+
+    A source's usual topic (``topics`` of its inventory entry) needs no mention:
+    ``od-edge-vehicle00``. Others carry a slug of the topic.
+    """
+    if key.application is not None:
+        return naming.object_name(service.prefix, key.application)
+    source, topic = str(key.source), str(key.topic)
+    if _is_usual(config, service, source, topic):
+        return naming.object_name(service.prefix, key.node, source)
+    return naming.object_name(service.prefix, key.node, source, topic)
+
+
+def _is_usual(config: Config, service: Service, source: str, topic: str) -> bool:
+    node = config.nodes.get(source)
+    return node is not None and node.topics.get(str(service.each)) == topic
+
+
+def outputs(config: Config, service: Service, key: ServiceKey) -> dict[str, str]:
+    """Return the topics that a service instance publishes, by the appdef's name for each."""
+    if key.application is not None:
+        instance = naming.topic_part(key.application)
+    elif _is_usual(config, service, str(key.source), str(key.topic)):
+        instance = naming.topic_part(str(key.source))
+    else:
+        instance = naming.topic_part(str(key.source), str(key.topic))
+    return {
+        name: pattern.replace("{instance}", instance)
+        for name, pattern in sorted(service.outputs.items())
+    }
+
+
+def _replicas(scaling: Scaling, topics: int) -> int:
+    """Return the replicas for ``topics`` inputs, within the appdef's bounds."""
+    if scaling.topics_per_replica is None:
+        return scaling.min
+    wanted = -(-topics // scaling.topics_per_replica)
+    return max(scaling.min, min(scaling.max, wanted))

@@ -1,0 +1,106 @@
+"""Which releases follow from claims: their keys, without what is in them.
+
+:func:`affected` names the releases that a change of claims may touch, so that the cost of a demand
+does not grow with the number of others. :mod:`demandops.plan.planner` derives each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from demandops.config.appdef import ApplicationDefinition
+from demandops.config.config import Config
+from demandops.demand.claim import Subject, SubjectKind
+from demandops.errors import Refused, fault
+from demandops.ledger.apply import Ledger
+from demandops.plan import connection_clients
+from demandops.plan.connection_clients import BridgeKey, EndKey
+from demandops.plan.overrides.claims_in_force import in_force
+from demandops.plan.release import ServiceKey
+
+ReleaseKey = ServiceKey | EndKey | BridgeKey
+
+
+def keys_of(
+    ledger: Ledger, config: Config, subject: Subject, *, strict: bool = False
+) -> Iterator[ReleaseKey]:
+    """Yield what must run because ``subject`` is held and no override denies it.
+
+    Of an application whose definition is gone nobody can say: nothing, or where ``strict`` it is
+    refused, for what runs must not stop because somebody deleted a file that it still needs.
+    """
+    yield from keys_booked(in_force(ledger, config), config, subject, strict=strict)
+
+
+def keys_booked(
+    ledger: Ledger, config: Config, subject: Subject, *, strict: bool = False
+) -> Iterator[ReleaseKey]:
+    """Yield what ``subject`` needs by the claims of ``ledger``, suspended or not."""
+    if subject.kind is SubjectKind.CONNECTION:
+        yield from connection_clients.keys_of(ledger, subject.id)
+        return
+    claims = ledger.application(subject.id)
+    if not claims:
+        return
+    known = strict or claims[0].appdef in config.appdefs
+    appdef = appdef_of(config, claims[0].appdef) if known else None
+    for name, service in (appdef.services if appdef else {}).items():
+        if service.each is None:
+            yield ServiceKey(name, claims[0].node, application=subject.id)
+            continue
+        topics = {
+            (topic.source, topic.topic)
+            for claim in claims
+            for topic in claim.inputs.get(service.each, ())
+        }
+        for source, topic in sorted(topics):
+            node = source if service.placement == "source" else claims[0].node
+            yield ServiceKey(name, node, source=source, topic=topic)
+
+
+def affected(
+    before: Ledger, after: Ledger, config: Config, subjects: Iterable[Subject]
+) -> tuple[ReleaseKey, ...]:
+    """Return every release that a change of ``subjects`` may have added, altered or removed.
+
+    Raises:
+        Refused: where the definition of what is to run from now on is gone.
+    """
+    keys = (
+        key
+        for subject in subjects
+        for ledger in (before, after)
+        for key in keys_of(ledger, config, subject, strict=ledger is after)
+    )
+    return tuple(dict.fromkeys(keys))
+
+
+def all_keys(ledger: Ledger, config: Config) -> tuple[ReleaseKey, ...]:
+    """Return every release that the ledger asks for.
+
+    Raises:
+        Refused: where the definition of an application that is held is gone.
+    """
+    subjects = [Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)]
+    keys = (key for s in subjects for key in keys_of(ledger, config, s, strict=True))
+    return tuple(dict.fromkeys(keys))
+
+
+def appdef_of(config: Config, name: str) -> ApplicationDefinition:
+    """Return an application definition by name.
+
+    Raises:
+        Refused: where the state repo has none.
+    """
+    appdef = config.appdefs.get(name)
+    if appdef is None:
+        raise Refused(
+            [
+                fault(
+                    "appdef",
+                    f"'{name}' is in use, but appdefs/{name} is gone; restore it",
+                    code="unknown-application",
+                ).within(f"appdefs/{name}/appdef.yaml")
+            ]
+        )
+    return appdef

@@ -1,0 +1,134 @@
+"""Bookkeeping: for each service and connection, who requests it.
+
+The view of the paper's Table III, column 4, derived from claims; nothing stores it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from demandops.config.config import Config
+from demandops.demand.claim import SubjectKind
+from demandops.ledger.apply import Ledger
+from demandops.plan.connection_clients import connection_topics
+from demandops.plan.overrides.claims_in_force import in_force, suspended
+from demandops.plan.planner import plan
+from demandops.plan.release import ServiceRelease
+from demandops.plan.release_keys import all_keys
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceEntry:
+    """Who requests one service, and what it takes in (role → sorted topics)."""
+
+    applications: tuple[str, ...]
+    service: str
+    node: str
+    source: str | None
+    source_topic: str | None
+    inputs: dict[str, list[str]]
+    requesters: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionEntry:
+    """Who requests one connection, and which source topics it carries."""
+
+    source: str
+    target: str
+    topics: tuple[str, ...]
+    requesters: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SuspendedEntry:
+    """A claim that is booked and not planned, and the override that suspends it."""
+
+    kind: str
+    id: str
+    demand: str
+    requesters: tuple[str, ...]
+    override: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Bookkeeping:
+    """The whole view: services by release name, connections by id, both sorted.
+
+    ``suspended`` are the claims that an override keeps from running; they are in neither.
+    """
+
+    services: dict[str, ServiceEntry]
+    connections: dict[str, ConnectionEntry]
+    suspended: tuple[SuspendedEntry, ...] = ()
+
+
+def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
+    """Return who requests what."""
+    services = {}
+    for key in all_keys(ledger, config):
+        release = plan(ledger, config, key)
+        if isinstance(release, ServiceRelease):
+            services[release.name] = ServiceEntry(
+                applications=release.applications,
+                service=release.key.service,
+                node=release.node.id,
+                source=release.key.source,
+                source_topic=release.key.topic,
+                inputs={
+                    role: sorted({topic.topic for topic in topics})
+                    for role, topics in release.inputs.items()
+                },
+                requesters=release.requesters,
+            )
+    connections = {}
+    standing = in_force(ledger, config)
+    for id in ledger.subjects(SubjectKind.CONNECTION):
+        claims = standing.connection(id)
+        if not claims:
+            continue
+        connections[id] = ConnectionEntry(
+            source=claims[0].source,
+            target=claims[0].target,
+            topics=tuple(connection_topics(claims)),
+            requesters=tuple(sorted({who for claim in claims for who in claim.requesters})),
+        )
+    return Bookkeeping(
+        services=dict(sorted(services.items())),
+        connections=connections,
+        suspended=tuple(_suspended(ledger, config)),
+    )
+
+
+def _suspended(ledger: Ledger, config: Config) -> Iterator[SuspendedEntry]:
+    for claim, override in suspended(ledger, config):
+        kind = claim.subject.kind.value[:-1]
+        yield SuspendedEntry(
+            kind,
+            claim.subject.id,
+            claim.demand,
+            claim.requesters,
+            override.path,
+            override.reason,
+        )
+
+
+def as_data(books: Bookkeeping, commit: str) -> dict[str, Any]:
+    """Return the bookkeeping as plain data, the contract of ``bookkeeping --output json``.
+
+    ``suspended`` is there only where something is.
+    """
+    data = asdict(books)
+    for entry in data["services"].values():
+        entry["applications"] = list(entry["applications"])
+        entry["requesters"] = list(entry["requesters"])
+    for entry in data["connections"].values():
+        entry["topics"] = sorted(entry["topics"])
+        entry["requesters"] = list(entry["requesters"])
+    held_back = data.pop("suspended")
+    if held_back:
+        data["suspended"] = [one | {"requesters": list(one["requesters"])} for one in held_back]
+    return data | {"commit": commit}

@@ -1,0 +1,63 @@
+"""Zenoh: one zenoh-bridge-ros2dds on each node, with the topics of all its Zenoh connections.
+
+Configuration as eclipse-zenoh/zenoh-plugin-ros2dds 1.10 reads it. The bridge reads it once, so its
+checksum stands in the pod template.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+from demandops.config.config import ZENOH_BRIDGE_IMAGE, Config
+from demandops.plan import naming
+from demandops.plan.release import Bridge
+from demandops.render.connections import client_pod, client_schema
+from demandops.render.engine import Engine
+
+
+def configuration(bridge: Bridge) -> dict[str, Any]:
+    """Return the configuration of a node's bridge.
+
+    ``allow`` names what passes; a list that is missing there lets nothing pass. Nobody is looked
+    for by multicast: who connects to whom is in Git.
+    """
+    lists = {"publishers": bridge.publishers, "subscribers": bridge.subscribers}
+    ros: dict[str, Any] = {
+        "nodename": naming.ros_name(bridge.name),
+        "domain": bridge.node.ros.domain_id,
+        "allow": {
+            name: [_exactly(topic) for topic in topics] for name, topics in lists.items() if topics
+        },
+    }
+    if bridge.rates:
+        ros["pub_max_frequencies"] = [
+            f"{_exactly(topic)}={rate:g}" for topic, rate in bridge.rates.items()
+        ]
+    return {
+        "mode": "router",
+        "connect": {"endpoints": list(bridge.connect)},
+        "listen": {"endpoints": list(bridge.listen)},
+        "scouting": {"multicast": {"enabled": False}},
+        "plugins": {"ros2dds": ros},
+    }
+
+
+def _exactly(topic: str) -> str:
+    """Return the regular expression that matches a topic's name and nothing else."""
+    return f"^{re.escape(topic)}$"
+
+
+def render(bridge: Bridge, config: Config, engine: Engine) -> str:
+    """Return the manifests of a node's bridge as one YAML text."""
+    data = configuration(bridge)
+    client_schema.check("zenoh", data, bridge.name)
+    text = json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+    return engine.text(
+        "connections/zenoh/bridge.yaml.j2",
+        bridge=bridge,
+        configuration=text,
+        checksum=client_pod.checksum(text),
+        **client_pod.context(bridge, ZENOH_BRIDGE_IMAGE, config),
+    )

@@ -1,0 +1,169 @@
+"""The template engine: Jinja2, strict, with every value written as JSON.
+
+``{{ x }}`` never glues text into YAML: whatever it holds is emitted as one JSON value, undefined
+names fail, and templates from the state repo run in Jinja's sandbox. Templates of the program
+come from its ``templates`` folder, those of appdefs from the configuration's files.
+"""
+
+from __future__ import annotations
+
+import re
+import traceback
+from collections.abc import Mapping
+from typing import Any
+
+from jinja2 import BaseLoader, Environment, FileSystemLoader, StrictUndefined, TemplateError
+from jinja2.environment import Template
+from jinja2.exceptions import TemplateNotFound, TemplateSyntaxError
+from jinja2.runtime import Undefined
+
+from demandops import strict_yaml
+from demandops.errors import InvalidInput, fault
+from demandops.plan import naming
+from demandops.render.template_sandbox import Sandbox
+from demandops.settings import data_folder
+
+_TEMPLATE_FAULTS = (
+    TemplateError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+    LookupError,
+    RecursionError,
+)  # what a template can make happen: its author's to mend, whatever it is
+
+
+class _Verbatim(str):
+    """Text that is YAML already: the result of a filter of ours."""
+
+
+class _FilesLoader(BaseLoader):
+    """Finds templates in the configuration's files, under their path in the state repo."""
+
+    def __init__(self, files: Mapping[str, str]) -> None:
+        self._files = files
+
+    def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
+        """Return the template's text; its path stands in for a file name in tracebacks."""
+        if template not in self._files:
+            raise TemplateNotFound(template)
+        return self._files[template], template, lambda: True
+
+
+def _finalize(value: object) -> object:
+    if isinstance(value, _Verbatim):
+        return value
+    if isinstance(value, Undefined):
+        str(value)  # StrictUndefined raises here, naming what is missing
+    return strict_yaml.scalar(_plain(value))
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _block(value: Mapping[str, Any], indent: int) -> _Verbatim:
+    text = strict_yaml.dump(value) if value else "{}\n"
+    pad = " " * indent
+    return _Verbatim(
+        "".join(
+            pad + line if line.strip() else line for line in text.splitlines(keepends=True)
+        ).rstrip("\n")
+    )
+
+
+def _literal(value: str, indent: int) -> _Verbatim:
+    """Return ``value`` as the body of a literal block (``|``)."""
+    pad = " " * indent
+    return _Verbatim("\n".join(pad + line for line in value.rstrip("\n").split("\n")))
+
+
+def _bare(value: str) -> _Verbatim:
+    """Return ``value`` without quotes, for comments: it must be a plain path."""
+    if not re.fullmatch(r"[A-Za-z0-9._/-]+", value):
+        raise ValueError(f"'{value}' cannot stand in a comment")
+    return _Verbatim(value)
+
+
+def _configure(environment: Environment) -> Environment:
+    environment.filters.pop("tojson", None)  # everything is JSON already; twice would be text
+    environment.filters["block"] = _block
+    environment.filters["literal"] = _literal
+    environment.filters["bare"] = _bare
+    environment.filters["ros_name"] = naming.ros_name
+    return environment
+
+
+_OPTIONS: dict[str, Any] = {
+    "undefined": StrictUndefined,
+    "finalize": _finalize,
+    "autoescape": False,
+    "trim_blocks": True,
+    "lstrip_blocks": True,
+    "keep_trailing_newline": True,
+    "auto_reload": False,
+}
+
+
+class Engine:
+    """Renders the program's templates and those of one configuration. Compiles each once."""
+
+    def __init__(self, files: Mapping[str, str]) -> None:
+        self._own = _configure(
+            Environment(loader=FileSystemLoader(data_folder("templates")), **_OPTIONS)  # noqa: S701 - YAML, not HTML
+        )
+        self._config = _configure(Sandbox(loader=_FilesLoader(files), **_OPTIONS))
+
+    def text(self, template: str, **context: object) -> str:
+        """Render a template of the program (``flux/release.yaml.j2``)."""
+        return self._own.get_template(template).render(**context)
+
+    def data(self, template: str, **context: object) -> dict[str, Any]:
+        """Render a values template of the configuration and parse it.
+
+        Raises:
+            InvalidInput: naming the template and, where it is known, the line.
+        """
+        try:
+            compiled: Template = self._config.get_template(template)
+            values = strict_yaml.load_rendered(compiled.render(**context))
+        except InvalidInput as error:
+            raise InvalidInput(
+                fault(
+                    f"{found.field} of what is rendered", f"{found.message}; mend the template"
+                ).within(template)
+                for found in error.faults
+            ) from None
+        except TemplateNotFound as error:
+            raise InvalidInput(
+                [
+                    fault(
+                        _line(error, template), f"'{error.name}' does not exist; mend the template"
+                    ).within(template)
+                ]
+            ) from None
+        except TemplateSyntaxError as error:
+            raise InvalidInput(
+                [
+                    fault(f"line {error.lineno}", f"{error.message}; mend the template").within(
+                        template
+                    )
+                ]
+            ) from None
+        except _TEMPLATE_FAULTS as error:
+            raise InvalidInput(
+                [fault(_line(error, template), f"{error}; mend the template").within(template)]
+            ) from None
+        if not isinstance(values, dict):
+            raise InvalidInput([fault("", "must give a mapping of Helm values").within(template)])
+        return values
+
+
+def _line(error: Exception, template: str) -> str:
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == template]
+    return f"line {lines[-1]}" if lines else ""

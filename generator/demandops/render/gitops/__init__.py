@@ -1,0 +1,1 @@
+"""What a GitOps controller reads: Flux's objects, or Argo CD's."""

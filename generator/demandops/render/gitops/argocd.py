@@ -1,0 +1,85 @@
+"""Argo CD: one Application for each service, and for each access domain one that brings them in.
+
+Fields of argoproj.io/v1alpha1 as of Argo CD 3.2. Each cluster has an Argo CD of its own. The
+Applications of services are in the access domain's namespace and not in Argo CD's, for there
+nothing would keep them from naming another domain's project (docs/decisions/0011).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from demandops.config.config import Config
+from demandops.config.policy import AccessDomain
+from demandops.config.repo_settings import RepoSettings
+from demandops.plan.release import ServiceRelease
+from demandops.render.engine import Engine
+from demandops.render.gitops.paths import (
+    bootstrap_path,
+    domain_folder,
+    domains_by_cluster,
+    domains_in_use,
+)
+from demandops.settings import MAIN_BRANCH
+
+IN_CLUSTER = "https://kubernetes.default.svc"
+"""The name under which an Argo CD knows the cluster that it runs in."""
+
+
+def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
+    """Return the name of a domain's AppProject, and of the Application over its folder."""
+    return f"{repository.source}-{domain.name}"
+
+
+def render(
+    release: ServiceRelease, values: Mapping[str, Any], repository: RepoSettings, engine: Engine
+) -> str:
+    """Return the one file of a service: its Application."""
+    return engine.text(
+        "argocd/release.yaml.j2",
+        release=release,
+        chart=release.chart,
+        values=values,
+        project=project_of(release.domain, repository),
+        repository=repository,
+        branch=MAIN_BRANCH,
+        server=IN_CLUSTER,
+    )
+
+
+def standing_files(config: Config, engine: Engine) -> dict[str, str]:
+    """Return bootstrap files, and for each access domain a placeholder."""
+    files = {
+        bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
+        for cluster, domains in domains_by_cluster(config).items()
+    }
+    for cluster, domain in domains_in_use(config):
+        files[f"{domain_folder(cluster, domain)}/_domain.yaml"] = engine.text(
+            "argocd/domain.yaml.j2", cluster=cluster, domain=domain
+        )
+    return files
+
+
+def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine: Engine) -> str:
+    return engine.text(
+        "argocd/bootstrap.yaml.j2",
+        cluster=cluster,
+        domains=domains,
+        folders={domain.name: domain_folder(cluster, domain) for domain in domains},
+        projects={domain.name: project_of(domain, config.repository) for domain in domains},
+        urls=_sources(config),
+        repository=config.repository,
+        branch=MAIN_BRANCH,
+        server=IN_CLUSTER,
+    )
+
+
+def _sources(config: Config) -> list[str]:
+    """Return every address that a domain's Applications may take something from."""
+    section = config.repository.argocd
+    assert section is not None  # noqa: S101 - the configuration holds what gitops names
+    charts = {
+        source.oci or source.http for chart in config.charts.values() for source in chart.sources()
+    }
+    return [section.url, *sorted(url for url in charts if url and url != section.url)]

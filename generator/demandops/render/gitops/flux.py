@@ -1,0 +1,84 @@
+"""Flux: one HelmRelease for each service, one chart source for each chart, a folder a domain.
+
+Fields of helm.toolkit.fluxcd.io/v2 and source.toolkit.fluxcd.io/v1 as of Flux 2.9. Requesters do
+not appear here: who else asks for a running service changes the ledger and nothing that runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from demandops.config.config import Config
+from demandops.config.policy import AccessDomain
+from demandops.config.registry import ChartSource
+from demandops.plan.release import ServiceRelease
+from demandops.render.engine import Engine
+from demandops.render.gitops.paths import (
+    bootstrap_path,
+    domain_folder,
+    domains_by_cluster,
+    domains_in_use,
+)
+from demandops.settings import MAIN_BRANCH
+
+
+def render(release: ServiceRelease, values: Mapping[str, Any], engine: Engine) -> str:
+    """Return the one file of a service: its HelmRelease."""
+    chart = release.chart
+    return engine.text(
+        "flux/release.yaml.j2",
+        release=release,
+        chart_kind="OCIRepository" if chart.oci else "HelmChart",
+        chart_name=chart_object(release.service.chart, chart),
+        values=values,
+    )
+
+
+def chart_object(name: str, chart: ChartSource) -> str:
+    """Return the name of the object that fetches one chart in one version."""
+    return f"{name}-{chart.version}".lower()
+
+
+def standing_files(config: Config, engine: Engine) -> dict[str, str]:
+    """Return bootstrap files, and for each access domain a placeholder and the chart sources."""
+    files = {
+        bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
+        for cluster, domains in domains_by_cluster(config).items()
+    }
+    for cluster, domain in domains_in_use(config):
+        folder = domain_folder(cluster, domain)
+        files[f"{folder}/_domain.yaml"] = engine.text(
+            "flux/domain.yaml.j2", cluster=cluster, domain=domain
+        )
+        for name, chart in sorted(config.charts.items()):
+            for source in chart.sources():
+                object_name = chart_object(name, source)
+                files[f"{folder}/_charts/{object_name}.yaml"] = engine.text(
+                    "flux/chart.yaml.j2",
+                    chart=source,
+                    chart_name=name,
+                    name=object_name,
+                    namespace=domain.namespace,
+                    source=config.repository.source,
+                )
+    return files
+
+
+def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine: Engine) -> str:
+    return engine.text(
+        "flux/bootstrap.yaml.j2",
+        cluster=cluster,
+        domains=domains,
+        folders={domain.name: domain_folder(cluster, domain) for domain in domains},
+        charts=sorted(
+            {
+                source.folder
+                for chart in config.charts.values()
+                for source in chart.sources()
+                if source.folder
+            }
+        ),
+        repository=config.repository,
+        branch=MAIN_BRANCH,
+    )

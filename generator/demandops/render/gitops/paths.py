@@ -1,0 +1,49 @@
+"""Where a release stands in the state repo, whichever controller reads it.
+
+Other programs rely on these paths, and so do both controllers: a folder is one access domain's
+part of one cluster.
+"""
+
+from __future__ import annotations
+
+from demandops.config.config import Config
+from demandops.config.policy import AccessDomain
+from demandops.plan import naming
+from demandops.plan.release import Release
+
+CLUSTERS_ROOT = "clusters"
+BOOTSTRAP_ROOT = "bootstrap"
+
+
+def domain_folder(cluster: str, domain: AccessDomain) -> str:
+    """Return the folder that a controller applies as one."""
+    return f"{CLUSTERS_ROOT}/{cluster}/{domain.name}"
+
+
+def path_of(release: Release) -> str:
+    """Return ``clusters/<cluster>/<access domain>/<node>/<release>.yaml``."""
+    folder = domain_folder(release.node.cluster, release.domain)
+    return f"{folder}/{naming.object_name('', release.node.id)}/{release.name}.yaml"
+
+
+def bootstrap_path(cluster: str) -> str:
+    """Return the path of what makes a cluster follow the repo."""
+    return f"{BOOTSTRAP_ROOT}/{cluster}.yaml"
+
+
+def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
+    """Return every (cluster, access domain) that some node belongs to, sorted."""
+    pairs = {
+        (node.cluster, config.domain_of[node.id].name)
+        for node in config.nodes.values()
+        if node.id in config.domain_of
+    }
+    return [(cluster, config.domains[name]) for cluster, name in sorted(pairs)]
+
+
+def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
+    """Return the access domains of each cluster that has one."""
+    found: dict[str, list[AccessDomain]] = {}
+    for cluster, domain in domains_in_use(config):
+        found.setdefault(cluster, []).append(domain)
+    return found

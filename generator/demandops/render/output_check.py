@@ -1,0 +1,173 @@
+"""The last look before a commit: is what was rendered valid, and is it ours to write?
+
+Values are held against the chart's own ``values.schema.json``, built-in kinds against the schema
+of Kubernetes, and every path must lie in a folder that the generator owns. Validators are
+compiled once.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import kubernetes_validate
+
+from demandops import strict_yaml
+from demandops.config.config import Config
+from demandops.config.file_model import field_path
+from demandops.config.override import OVERRIDES_ROOT
+from demandops.config.registry import ChartSource
+from demandops.errors import Fault, InvalidInput, fault
+
+KUBERNETES_VERSION = "1.36.0"
+"""The release whose schemas built-in kinds are held against."""
+
+OWN_ROOTS = ("bootstrap/", "clusters/", "ledger/")
+
+_BUILT_IN = frozenset({"v1", "apps/v1", "networking.k8s.io/v1", "rbac.authorization.k8s.io/v1"})
+
+
+def check_values(
+    values: Mapping[str, Any], chart: ChartSource, config: Config, template: str
+) -> None:
+    """Hold Helm values against the chart's schema, where the chart is in the state repo.
+
+    As Helm does it: laid over the chart's defaults, for a schema may require what has one.
+
+    Raises:
+        InvalidInput: naming the values template, or the override that patches them, and each value
+            that does not fit.
+    """
+    schema = config.files.get(f"{chart.folder}/values.schema.json") if chart.folder else None
+    if schema is None:
+        return
+    file = f"{chart.folder}/values.schema.json"
+    try:
+        validator = _values_validator(schema)
+    except ValueError as error:  # what JSON and the schema's own rules raise
+        reason = str(error).splitlines()[0]
+        message = f"is no JSON schema that can be used: {reason}; mend it"
+        raise InvalidInput([fault("", message).within(file)]) from None
+    file = f"{chart.folder}/values.yaml"
+    try:
+        defaults = _defaults(config.files.get(file, ""))
+    except InvalidInput as error:
+        raise InvalidInput(strict_yaml.faults_in(error, file)) from None
+    whole = _laid_over(defaults, values)
+    origin = "the override" if template.startswith(f"{OVERRIDES_ROOT}/") else "the template"
+    faults = [
+        fault(
+            f"values.{path}" if path else "values",
+            f"{message}; mend {origin} or {chart.folder}",
+        ).within(template)
+        for path, message in _problems(validator, whole)
+    ]
+    if faults:
+        raise InvalidInput(faults)
+
+
+def check_files(files: Mapping[str, str | None]) -> None:
+    """Check what is about to be committed (``None`` means that the file is removed).
+
+    Raises:
+        InvalidInput: with every fault of every file. One is a fault of the program or of a
+            template, never of a demand.
+    """
+    faults: list[Fault] = []
+    seen: dict[tuple[str, str, str, str], str] = {}
+    for path, text in sorted(files.items()):
+        if not path.startswith(OWN_ROOTS) or ".." in path.split("/"):
+            faults.append(fault("", "is not the generator's to write").within(path))
+        if text is None or path.startswith("ledger/"):
+            continue
+        for document in _documents(path, text, faults):
+            faults += _check_object(path, document, seen)
+    if faults:
+        raise InvalidInput(faults)
+
+
+def _documents(path: str, text: str, faults: list[Fault]) -> Iterable[dict[str, Any]]:
+    try:
+        documents = [strict_yaml.load_rendered(part) for part in text.split("\n---\n")]
+    except InvalidInput as error:
+        faults += strict_yaml.faults_in(error, path)
+        return []
+    for document in documents:
+        if not isinstance(document, dict):
+            faults.append(fault("", "holds something that is no object").within(path))
+    return [document for document in documents if isinstance(document, dict)]
+
+
+def _check_object(
+    path: str, document: dict[str, Any], seen: dict[tuple[str, str, str, str], str]
+) -> Iterable[Fault]:
+    metadata = document.get("metadata") or {}
+    api, kind = str(document.get("apiVersion")), str(document.get("kind"))
+    name = str(metadata.get("name"))
+    cluster = path.split("/")[1].removesuffix(".yaml")
+    identity = (cluster, kind, str(metadata.get("namespace")), name)
+    other = seen.get(identity)
+    if other is not None:
+        where = "here twice" if other == path else f"in {other} too"
+        yield fault("metadata.name", f"{kind} {name} stands {where}").within(path)
+    seen[identity] = path
+    if api in _BUILT_IN:
+        for where, message in _problems(_kind_validator(api, kind), document):
+            yield fault(where, message).within(path)
+
+
+def _problems(validator: Any, instance: object) -> list[tuple[str, str]]:  # noqa: ANN401
+    return [
+        (field_path(tuple(error.instance_path)), error.message)
+        for error in validator.iter_errors(instance)
+    ]
+
+
+def _laid_over(defaults: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge values over defaults by Helm's rule: mappings merge, null removes, the rest wins."""
+    merged = dict(defaults)
+    for key, value in values.items():
+        if value is None:
+            merged.pop(key, None)
+        elif isinstance(value, dict) and isinstance(merged.get(key), dict):
+            merged[key] = _laid_over(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
+
+
+@lru_cache(maxsize=256)
+def _defaults(text: str) -> dict[str, Any]:
+    values = strict_yaml.load(text)
+    return values if isinstance(values, dict) else {}
+
+
+@lru_cache(maxsize=256)
+def _values_validator(schema: str) -> Any:  # noqa: ANN401
+    return jsonschema_rs.validator_for(json.loads(schema))
+
+
+@lru_cache(maxsize=64)
+def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
+    """Compile the schema of one built-in kind from the definitions of one Kubernetes release."""
+    *group, version = api.split("/")
+    prefix = f"{group[0].split('.')[0]}-" if group else ""
+    folder = Path(kubernetes_validate.__file__).parent / "kubernetes-json-schema"
+    folder = folder / f"v{KUBERNETES_VERSION}-local-strict"
+    name = f"{kind.lower()}-{prefix}{version}.json"
+    schema = json.loads((folder / name).read_text())
+    definitions = _definitions(folder)
+    text = json.dumps(schema).replace("/api/_definitions.json#/$defs/", "#/$defs/")
+    return jsonschema_rs.Draft7Validator({**json.loads(text), "$defs": definitions})
+
+
+@lru_cache(maxsize=1)
+def _definitions(folder: Path) -> dict[str, Any]:
+    text = (folder / "_definitions.json").read_text()
+    data = json.loads(text.replace("/api/_definitions.json#/$defs/", "#/$defs/"))
+    definitions: dict[str, Any] = data["$defs"]
+    return definitions

@@ -1,0 +1,1 @@
+"""Demands that wait for a person to merge their branch."""

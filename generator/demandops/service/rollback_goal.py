@@ -1,0 +1,57 @@
+"""A rollback on its way through queue and outbox: plain data that only this program makes.
+
+No goal of an action and no request file has this form. It is judged like a demand, on the newest
+tip, so it works while others write: what they booked meanwhile counts as newer.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from demandops.errors import Refused, fault
+from demandops.ledger.restoration import Restoration
+from demandops.settings import API_VERSION
+from demandops.staterepo.git.repository import StateRepository
+from demandops.staterepo.load.rollback_source import restoration
+from demandops.staterepo.load.snapshot import Snapshot
+
+_KIND = "Rollback"
+
+
+def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dict[str, Any]:
+    """Return the goal to go back to a commit, in the name of ``who`` (name, e-mail address)."""
+    return {
+        "apiVersion": API_VERSION,
+        "kind": _KIND,
+        "to": to,
+        "dropNewer": drop_newer,
+        "reason": " ".join(reason.split()),
+        "by": list(who),
+    }
+
+
+def is_rollback(goal: object) -> bool:
+    """Tell whether a goal is one of these."""
+    return isinstance(goal, dict) and goal.get("kind") == _KIND
+
+
+def understood(goal: dict[str, Any], repository: StateRepository, head: Snapshot) -> Restoration:
+    """Return the request behind a goal.
+
+    Raises:
+        Refused: where its commit is none that the state repo went through.
+        InvalidInput: where that commit's ledger is not valid.
+    """
+    to = str(goal["to"])
+    if not repository.includes(str(head.commit), to):
+        message = f"commit {to} is not in the history of the state repo; roll back to one that is"
+        raise Refused([fault("", message)])
+    name, email = goal["by"]
+    return restoration(
+        repository.objects,
+        to,
+        drop_newer=bool(goal["dropNewer"]),
+        reason=goal["reason"],
+        by=name,
+        email=email,
+    )

@@ -1,0 +1,1 @@
+"""When something is due: fetches, retries, leases, overrides, and rate limits."""

@@ -1,0 +1,63 @@
+"""How many demands a requester may send in a minute, by the quotas of the access domains.
+
+Counted here, by what this generator received: each hand-in once, however often it is judged.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+
+from demandops.config.config import Config
+from demandops.demand.demand_request import DemandRequest
+from demandops.errors import Fault, fault
+
+_WINDOW = timedelta(minutes=1)
+
+
+class RateLimit:
+    """Remembers the last minute of each requester that has a limit."""
+
+    def __init__(self) -> None:
+        self._seen: dict[tuple[str, str], deque[tuple[datetime, str]]] = {}
+
+    def faults(
+        self, request: DemandRequest, config: Config, operation: str, received: datetime
+    ) -> Iterator[Fault]:
+        """Count a hand-in and yield every quota that it goes beyond; giving up is not limited."""
+        if not request.operation.asks:
+            return
+        nodes = [app.node for app in request.applications]
+        nodes += [connection.target for connection in request.connections]
+        domains = {d.name: d for d in map(config.domain_of.get, nodes) if d is not None}
+        for domain in domains.values():
+            most = domain.quotas.demands_per_minute
+            for requester in request.requesters() if most else ():
+                if self._counted((domain.name, requester), operation, received) > (most or 0):
+                    message = (
+                        f"'{requester}' sent more than the {most} demands in a minute that "
+                        f"quotas.demandsPerMinute of access domain '{domain.name}' allows; send "
+                        "it again later"
+                    )
+                    yield fault("", message, code="quota")
+
+    def _counted(self, key: tuple[str, str], operation: str, received: datetime) -> int:
+        self._forget(received)
+        seen = self._seen.pop(key, None) or deque()
+        self._seen[key] = seen  # the one that sent last stands last
+        while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
+            seen.popleft()
+        places = [known for _, known in seen]
+        if operation in places:
+            return places.index(operation) + 1
+        seen.append((received, operation))
+        return len(seen)
+
+    def _forget(self, now: datetime) -> None:
+        """Drop the requesters that have sent nothing for a minute: vehicles come and go."""
+        while self._seen:
+            key = next(iter(self._seen))
+            if self._seen[key] and abs(now - self._seen[key][-1][0]) <= _WINDOW:
+                return
+            del self._seen[key]

@@ -1,0 +1,1 @@
+"""Proof: commits are what books and configuration give, and are signed."""

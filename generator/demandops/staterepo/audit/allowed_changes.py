@@ -1,0 +1,90 @@
+"""What a commit of the generator may change: generated files, and claims that its message names.
+
+Part of proving a commit (:mod:`demandops.staterepo.audit.verification`); goes by files and
+message alone and knows nothing of what a change means for what runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from pygit2 import Commit, Repository
+
+from demandops.config.repo_settings import ROOT_FILE
+from demandops.demand.claim import KEPT, Claim
+from demandops.errors import InvalidInput
+from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import ended_override_file
+from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history.commit_log import LogEntry
+
+_OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
+_ENDING = ("follow", "upgrade", "expire-override")
+"""Operations that may say, or take back, that an override ended."""
+
+
+def not_its_own(repo: Repository, commit: Commit, entry: LogEntry) -> tuple[str, ...]:
+    """Return the files that a commit changed although its message does not account for it.
+
+    People's files, and claims of demands that it does not name or that are not written as the
+    generator writes them.
+    """
+    if not commit.parents:
+        return ()
+    return tuple(sorted(_foreign(repo, commit, entry)))
+
+
+def _foreign(repo: Repository, commit: Commit, entry: LogEntry) -> Iterator[str]:
+    before, operation = commit.parents[0].tree, entry.one("Operation")
+    named = _named(entry)
+    for path, blob in trees.differences(repo, before, commit.tree, ""):
+        root = path.split("/", 1)[0]
+        if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
+            continue
+        if root != ledger_format.LEDGER_ROOT:
+            yield path
+        elif path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
+            if operation not in _ENDING or (blob and not _is_marker(commit, path)):
+                yield path
+        elif path.rsplit("/", 1)[-1] in named:
+            if blob and not _is_canonical(commit, path):
+                yield path
+        elif operation != "follow" or not _only_begins(commit, path):
+            yield path
+
+
+def _named(entry: LogEntry) -> set[str]:
+    """Return the file names of the claims that a commit's message accounts for."""
+    demands = {*entry.trailers.get("Demand-Id", ())}
+    for path in entry.trailers.get("Override", ()):  # the claims by which overrides keep something
+        demands.add(KEPT + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
+    return {f"{ledger_format.segment(demand)}.yaml" for demand in demands}
+
+
+def _only_begins(commit: Commit, path: str) -> bool:
+    """Tell whether all that changed of a claim is that its lease runs, now that it is approved."""
+    before, after = (_claim(one, path) for one in (commit.parents[0], commit))
+    if before is None or after is None or before.lease is None or after.lease is None:
+        return False
+    begun = not before.lease.has_started and after.lease.has_started
+    same = replace(before, lease=replace(before.lease, until=after.lease.until)) == after
+    return begun and same and _is_canonical(commit, path)
+
+
+def _is_marker(commit: Commit, path: str) -> bool:
+    return bool(ended_override_file.read({path: trees.read_text(commit.tree, path) or ""}))
+
+
+def _is_canonical(commit: Commit, path: str) -> bool:
+    claim = _claim(commit, path)
+    return claim is not None and ledger_format.write(claim) == trees.read_text(commit.tree, path)
+
+
+def _claim(commit: Commit, path: str) -> Claim | None:
+    text = trees.read_text(commit.tree, path)
+    try:
+        return ledger_format.read(text, path) if text is not None else None
+    except InvalidInput:
+        return None

@@ -1,0 +1,298 @@
+"""Proving commits: what the generator committed is what books and configuration give.
+
+A commit is proven whole (loaded and rendered from nothing) or by differences from the one proven
+before it. The second trusts object ids, and that planning and rendering are functions; it does not
+trust what the generator thought was affected: every release is planned and rendered again of whose
+plan anything that was read has changed (:mod:`demandops.plan.incremental_plan`), and every file
+that differs in Git is compared. The first and the last commit of a row are proven whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import pygit2
+from pygit2 import Commit, Oid, Repository, Tree
+
+from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.decision import State, rendered
+from demandops.demand.claim import Claim
+from demandops.errors import InvalidInput
+from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import ended_override_file
+from demandops.ledger.apply import ClaimChange
+from demandops.plan.incremental_plan import IncrementalPlan
+from demandops.plan.release import Release
+from demandops.plan.release_keys import ReleaseKey
+from demandops.render import override_marks
+from demandops.render.gitops import controller
+from demandops.render.gitops.paths import path_of
+from demandops.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
+from demandops.staterepo.audit import allowed_changes
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history.commit_log import LogEntry, entry_of
+from demandops.staterepo.history.commit_message import PROPOSAL
+from demandops.staterepo.load import effective_config
+
+_CHARTS = "/_charts/"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether the rendered files of one commit are those that its books and settings give.
+
+    ``touched`` are files that the commit changed and that are not its to write. ``signature`` says
+    what is wrong with it where one is asked for, ``signer`` whose it is.
+    """
+
+    commit: str
+    summary: str
+    holds: bool
+    skipped: str = ""
+    fault: str = ""
+    differing: tuple[str, ...] = ()
+    touched: tuple[str, ...] = ()
+    signed: bool = False
+    signer: str = ""
+    signature: str = ""
+
+
+@dataclass(slots=True)
+class _Proof:
+    """A commit that was rendered again, and what of it serves the next."""
+
+    tree: Tree
+    state: State
+    claims: dict[str, Claim]
+    plan: IncrementalPlan
+    planned: dict[ReleaseKey, tuple[str, Oid]]
+    held: dict[ReleaseKey, Release]
+    """Releases whose files an override holds: they follow from the commit before."""
+    steady: dict[str, Oid]
+    """What stays when nothing is demanded."""
+    standing: dict[str, Oid]
+    """What the commit holds below the generated folders."""
+
+    def take_in(self, state: State, changes: Sequence[ClaimChange], before: Tree | None) -> None:
+        """Plan and render what the changes may have changed.
+
+        Args:
+            state: books and configuration after the changes.
+            changes: every claim that is not what it was.
+            before: the commit's parent, whose files overrides may hold.
+        """
+        self.state = state
+        for key, release in self.plan.advance(state.ledger, changes).items():
+            self.planned.pop(key, None)
+            self.held.pop(key, None)
+            if release is not None and release.shaping.held:
+                self.held[key] = release
+            elif release is not None:
+                self.planned[key] = _rendered(release, state, None)
+        for key, release in self.held.items():
+            self.planned[key] = _rendered(release, state, before)
+
+    def differing(self, before: Tree | None) -> tuple[str, ...]:
+        """Return the files that are not what they should be."""
+        wanted = self.steady | dict(self.planned.values())
+        if before is not None and any(one.hold for one in self.state.config.in_force):
+            charts = {
+                path: trees.read_text(before, path) or ""
+                for path, _ in _standing(before)
+                if _CHARTS in path and path not in wanted
+            }
+            kept = override_marks.charts_kept({}, charts, self.state.config)
+            wanted |= {path: _blob(text) for path, text in kept.items()}
+        return _differing(wanted, self.standing)
+
+
+def _rendered(release: Release, state: State, before: Tree | None) -> tuple[str, Oid]:
+    path = path_of(release)
+    standing = trees.read_text(before, path) if before is not None else None
+    return path, _blob(override_marks.text_of(release, state.config, state.engine, standing))
+
+
+def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
+    """Yield a verdict on each commit, oldest first.
+
+    Args:
+        whole: whether to load and render every commit from nothing.
+    """
+    row = _Row(repo)
+    for place, revision in enumerate(commits, 1):
+        commit = trees.commit_of(repo, revision)
+        entry = entry_of(commit)
+        verdict = Verdict(entry.commit, entry.summary, True, _why_not(entry))
+        if verdict.skipped:
+            yield verdict
+            continue
+        touched = allowed_changes.not_its_own(repo, commit, entry)
+        alone = whole or place == len(commits) or bool(entry.one("In-Force"))
+        try:
+            differing = row.differing(commit, entry, alone=alone)
+        except _Unreadable as error:
+            why = f"a person's file was not valid then: {error}"
+            yield replace(verdict, skipped=why, touched=touched, holds=not touched)
+        except InvalidInput as error:  # the generator did render it then, so it must now
+            yield replace(verdict, holds=False, fault=str(error.faults[0]), touched=touched)
+        else:
+            holds = not (differing or touched)
+            yield replace(verdict, holds=holds, differing=differing, touched=touched)
+
+
+class _Unreadable(Exception):
+    """A commit that cannot be judged, for a file of people in it is not valid."""
+
+
+class _Row:
+    """Commits that are proven one after the other."""
+
+    def __init__(self, repo: Repository) -> None:
+        self._repo = repo
+        self._proof: _Proof | None = None
+
+    def differing(self, commit: Commit, entry: LogEntry, *, alone: bool) -> tuple[str, ...]:
+        """Return the files of a commit that are not what they should be.
+
+        Args:
+            alone: whether nothing that is known of another commit may serve.
+
+        Raises:
+            _Unreadable, InvalidInput: where it cannot be read, or not be rendered.
+        """
+        proof, self._proof = self._proof, None
+        if alone:
+            state = self._loaded(commit, entry)
+            files = rendered(state, _held_from(commit, state.config))
+            wanted = {path: _blob(text) for path, text in files.items()}
+            return _differing(wanted, dict(_standing(commit.tree)))
+        if proof is None or _reconfigured(proof, commit):
+            proof = _from_nothing(self._loaded(commit, entry), commit)
+        else:
+            try:
+                changes = _claims_changed(self._repo, proof, commit)
+            except InvalidInput as error:
+                raise _Unreadable(error.faults[0]) from None
+            _bring_forward(self._repo, proof, commit, changes)
+        self._proof = proof  # of one that could not be judged nothing serves the next
+        return proof.differing(_parent(commit))
+
+    def _loaded(self, commit: Commit, entry: LogEntry) -> State:
+        try:
+            return effective_config.at(self._repo, commit, entry).state
+        except InvalidInput as error:
+            raise _Unreadable(error.faults[0]) from None
+
+
+def _differing(wanted: Mapping[str, Oid], standing: Mapping[str, Oid]) -> tuple[str, ...]:
+    return tuple(
+        path
+        for path in sorted({*wanted, *standing})
+        if wanted.get(path) != standing.get(path) and not trees.is_note(path)
+    )
+
+
+def _why_not(entry: LogEntry) -> str:
+    if not entry.by_generator:
+        return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
+    version = entry.one("Render-Version")
+    if version != str(RENDER_VERSION):
+        return f"rendered by version {version}, this is version {RENDER_VERSION}"
+    return ""
+
+
+def _parent(commit: Commit) -> Tree | None:
+    return commit.parents[0].tree if commit.parents else None
+
+
+def _held_from(commit: Commit, config: Config) -> dict[str, str]:
+    """Return the files as they were before a commit, where overrides hold some of them."""
+    before = _parent(commit)
+    if before is None or not any(override.hold for override in config.in_force):
+        return {}
+    return trees.texts(before, GENERATED_ROOTS)
+
+
+def _reconfigured(proof: _Proof, commit: Commit) -> bool:
+    """Tell whether people's files, which overrides ended, or what is held back is another."""
+
+    def ids(tree: Tree) -> list[Oid | None]:
+        found = [trees.child(tree, root) for root in (*CONFIG_ROOTS, NOTES_ROOT)]
+        ledger = trees.child(tree, ledger_format.LEDGER_ROOT)
+        if isinstance(ledger, Tree):
+            found.append(trees.child(ledger, ended_override_file.MARKERS_ROOT.rsplit("/", 1)[-1]))
+        return [entry.id if entry else None for entry in found]
+
+    return ids(proof.tree) != ids(commit.tree)
+
+
+def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[ClaimChange]:
+    """Return the claims that differ from those proven before.
+
+    Raises:
+        InvalidInput: where a claim file is not valid.
+    """
+    changes = []
+    for path, blob in trees.below_root(repo, proof.tree, commit.tree, ledger_format.LEDGER_ROOT):
+        if ledger_format.kind_of(path) is None:
+            continue
+        known = proof.claims.get(path)
+        claim = ledger_format.read(_text(commit, path), path) if blob else None
+        if known or claim:
+            changes.append(ClaimChange(known, claim))
+    return changes
+
+
+def _from_nothing(state: State, commit: Commit) -> _Proof:
+    """Render a commit whole, so that the next can be proven by what differs."""
+    steady = controller.standing_files(state.config, state.engine)
+    proof = _Proof(
+        tree=commit.tree,
+        state=state,
+        claims={ledger_format.path_of(claim.key): claim for claim in state.ledger},
+        plan=IncrementalPlan(state.config),
+        planned={},
+        held={},
+        steady={path: _blob(text) for path, text in steady.items()},
+        standing=dict(_standing(commit.tree)),
+    )
+    proof.take_in(state, (), _parent(commit))
+    return proof
+
+
+def _bring_forward(
+    repo: Repository, proof: _Proof, commit: Commit, changes: Sequence[ClaimChange]
+) -> None:
+    """Render what a commit changed of its books, and note what it changed of its files."""
+    ledger = proof.state.ledger
+    for change in changes:
+        ledger = ledger.replace(change.key, change.after)
+        path = ledger_format.path_of(change.key)
+        proof.claims.pop(path, None)
+        if change.after is not None:
+            proof.claims[path] = change.after
+    for root in GENERATED_ROOTS:
+        for path, blob in trees.below_root(repo, proof.tree, commit.tree, root):
+            proof.standing.pop(path, None)
+            if blob is not None:
+                proof.standing[path] = blob
+    proof.tree = commit.tree
+    proof.take_in(replace(proof.state, ledger=ledger), changes, _parent(commit))
+
+
+def _standing(tree: Tree) -> Iterator[tuple[str, Oid]]:
+    for root in GENERATED_ROOTS:
+        entry = trees.child(tree, root)
+        if isinstance(entry, Tree):
+            yield from trees.entries(entry, f"{root}/")
+        elif entry is not None:
+            yield root, entry.id
+
+
+def _text(commit: Commit, path: str) -> str:
+    return trees.read_text(commit.tree, path) or ""
+
+
+def _blob(text: str) -> Oid:
+    return pygit2.hash(text.encode())

@@ -1,0 +1,1 @@
+"""Git itself: trees, signed commits, and the repository on this disk or behind a URL."""

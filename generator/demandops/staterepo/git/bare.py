@@ -1,0 +1,89 @@
+"""A state repo on this disk: a bare repository, written in place and fsynced."""
+
+from __future__ import annotations
+
+import logging
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import git
+import pygit2
+from pygit2 import Oid, Repository
+
+from demandops.errors import StateRepoError
+from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git.repository import MAIN, StateRepository
+
+_STALE_LOCK_S = 5.0
+
+log = logging.getLogger("demandops")
+
+
+class BareRepository(StateRepository):
+    """A bare repository on this disk, written in place and fsynced."""
+
+    def __init__(self, path: Path) -> None:
+        self.address = str(path)
+        try:
+            self.objects = Repository(str(path))
+        except pygit2.GitError:
+            raise StateRepoError(
+                f"{path} is no Git repository; make one with `demandops init {path} --bare`"
+            ) from None
+        if not self.objects.is_bare:
+            _refuse_checked_out(path)
+        if MAIN not in self.objects.references:
+            raise StateRepoError(
+                f"{path} has no branch '{MAIN_BRANCH}'; make a state repo with "
+                "`demandops init DIR --bare`"
+            )
+
+    def tip(self) -> Oid:
+        """Return the branch's commit, read anew: others may write here too."""
+        target = self.objects.references[MAIN].target
+        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
+        return target
+
+    def refresh(self) -> Oid:
+        """Return the tip; it is never behind."""
+        return self.tip()
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Move the branch if it still is at ``expected`` (checked under Git's own lock)."""
+        reference = self.objects.references[MAIN]
+        if reference.target != expected:
+            return False
+        try:
+            reference.set_target(commit, "demandops")
+        except (pygit2.GitError, OSError):
+            self._break_stale_lock()
+            return False  # another writer holds the lock or was first: judge anew
+        return True
+
+    def _break_stale_lock(self) -> None:
+        """Remove a branch's lock that a killed process left: Git holds one for milliseconds."""
+        lock = Path(self.objects.path) / f"{MAIN}.lock"
+        with suppress(FileNotFoundError):
+            if time.time() - lock.stat().st_mtime > _STALE_LOCK_S:
+                log.warning("removing %s, which a killed process left behind", lock)
+                lock.unlink()
+
+    @property
+    def always_current(self) -> bool:
+        """Say yes: there is no copy that could be behind."""
+        return True
+
+
+def _refuse_checked_out(path: Path) -> None:
+    with git.Repo(path) as repo:
+        heads = [
+            line.removeprefix("branch ")
+            for line in repo.git.worktree("list", "--porcelain").splitlines()
+            if line.startswith("branch ")
+        ]
+    if MAIN in heads:
+        raise StateRepoError(
+            f"{path} has '{MAIN_BRANCH}' checked out, and its files would fall behind the commits; "
+            f"use a bare clone: git clone --bare {path} {path}.git"
+        )

@@ -1,0 +1,267 @@
+"""A state repo behind a URL: a bare clone, and git itself to fetch and push."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import git
+import pygit2
+from pygit2 import Oid, Repository
+
+from demandops.errors import StateRepoError
+from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git.address import without_secrets
+from demandops.staterepo.git.repository import (
+    ENVIRONMENT,
+    MAIN,
+    TIMEOUT_S,
+    CutShort,
+    PushDenied,
+    RemoteAway,
+    StateRepository,
+)
+
+_REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
+_BEHIND = re.compile(r"\[rejected\]")
+_REMOTE_SAYS = re.compile(r"remote: ?(.*)")
+_REFUSED = re.compile(r"\[remote rejected\] \((.*)\)")
+_PASSING = re.compile(r"lock|failed to update ref|incorrect old value")
+_POLL_S = 0.02
+_NO_RIGHT = re.compile(r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE)
+
+Say = Callable[[str], None]
+
+log = logging.getLogger("demandops")
+
+
+class ClonedRepository(StateRepository):
+    """A bare clone of a remote; clone, fetch and push run git itself, with the user's set-up."""
+
+    def __init__(self, url: str, folder: Path, say: Say, patient: bool) -> None:
+        self.address = without_secrets(url)
+        self._url = url
+        self._folder = folder
+        self._given_up = False
+        self._talking: subprocess.Popen[bytes] | None = None
+        for lock in folder.rglob("*.lock"):  # the folder is ours alone: a killed process left it
+            lock.unlink(missing_ok=True)
+        if not self._is_sound():
+            self._clone(say)
+        self._git = git.Repo(folder)
+        self.objects = Repository(str(folder))
+        try:
+            self.refresh()
+        except RemoteAway as error:
+            if not patient:
+                raise
+            log.warning("%s; going on from what was fetched last", error)
+
+    def _is_sound(self) -> bool:
+        """Tell whether the clone of an earlier run can be used (a crash may have cut it off)."""
+        try:
+            repo = Repository(str(self._folder))
+            target = repo.references[_REMOTE_MAIN].target
+            return isinstance(repo[target], pygit2.Commit)
+        except (pygit2.GitError, KeyError):
+            return False
+
+    def _clone(self, say: Say) -> None:
+        say(f"cloning {self.address}")
+        if self._folder.exists():
+            shutil.rmtree(self._folder)
+        self._folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = self._folder.with_name(self._folder.name + ".partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        with git.Repo.init(partial, bare=True) as repo:
+            with repo.config_writer() as config:
+                config.set_value('remote "origin"', "url", self._url)
+            partial.joinpath("config").chmod(0o600)
+            self._fetch(repo)
+        partial.rename(self._folder)
+
+    def _fetch(self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False) -> None:
+        try:
+            # told here, not configured: a push that outlives a killed generator moves nothing here
+            spec = f"+{MAIN}:{_REMOTE_MAIN}"
+            self._talk(repo, "fetch", "--no-tags", "--quiet", "origin", spec, urgent=urgent)
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+            if "couldn't find remote ref" in text:
+                raise StateRepoError(
+                    f"{self.address} has no branch '{MAIN_BRANCH}'; push one made by "
+                    "`demandops init DIR`"
+                ) from None
+            raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
+
+    def tip(self) -> Oid:
+        """Return the remote's commit as of the last fetch or push."""
+        target = self.objects.references[_REMOTE_MAIN].target
+        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
+        return target
+
+    def refresh(self) -> Oid:
+        """Fetch and return the remote's commit."""
+        self._fetch(self._git)
+        return self.tip()
+
+    def look(self, urgent: Callable[[], bool]) -> Oid:
+        """Fetch, but give way to what is urgent: a demand is not to wait for a slow remote."""
+        self._fetch(self._git, urgent)
+        return self.tip()
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Push ``commit``; the remote takes it only on top of what it has."""
+        try:
+            lease = f"--force-with-lease={MAIN}:{expected}"  # forces nothing: commit is on top
+            spec = f"{commit}:{MAIN}"
+            self._talk(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
+        except git.GitCommandError as error:
+            text = without_secrets(f"{error.stdout}\n{error.stderr}")
+            if _BEHIND.search(text):  # git looked at the remote first: nothing was sent
+                return False
+            tip = self.refresh()
+            if tip == commit or self.objects.descendant_of(tip, commit):
+                return True  # it was taken, and the answer got lost
+            if tip != expected:
+                return False
+            raise self._why_not(text) from None
+        self.objects.references.create(_REMOTE_MAIN, commit, force=True)
+        return True
+
+    def listed(self, *patterns: str) -> dict[str, str]:
+        """Ask the remote for its references that match, and return name → commit.
+
+        Raises:
+            RemoteAway: where it cannot be reached.
+        """
+        try:
+            out, _ = self._talk(self._git, "ls-remote", "--quiet", "origin", *patterns)
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+            raise RemoteAway(f"{self.address} cannot be asked: {_last_line(text)}") from None
+        pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
+        return {name: commit for commit, name in pairs}
+
+    def fetch_branches(self, prefix: str) -> None:
+        """Fetch the branches whose names begin so, and forget those that are gone.
+
+        Raises:
+            RemoteAway: where the remote cannot be reached.
+        """
+        spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
+        try:
+            self._talk(self._git, "fetch", "--no-tags", "--quiet", "--prune", "origin", spec)
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+            raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
+
+    def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
+        """Push one reference and return what the remote had to say.
+
+        Args:
+            spec: what goes where.
+            lease: ``<reference>:<commit>``, what the remote must have, or nothing there.
+            options: what the server is told (``git push --push-option``).
+
+        Raises:
+            git.GitCommandError: where the remote did not take it.
+        """
+        told = [f"--push-option={option}" for option in options]
+        expects = f"--force-with-lease={lease}"
+        out, err = self._talk(self._git, "push", "--porcelain", *told, expects, "origin", spec)
+        return f"{out}\n{err}"
+
+    def why_not(self, error: git.GitCommandError) -> StateRepoError:
+        """Return why a push was not taken: to be tried again, or denied."""
+        return self._why_not(without_secrets(f"{error.stdout}\n{error.stderr}"))
+
+    def _talk(
+        self, repo: git.Repo, *command: str, urgent: Callable[[], bool] = lambda: False
+    ) -> tuple[str, str]:
+        if self._given_up:
+            raise RemoteAway(f"{self.address} was given up")
+        with repo.git.custom_environment(**ENVIRONMENT):
+            guard = repo.git.execute(  # kept: it ends the process when it goes
+                [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
+                as_process=True,
+                start_new_session=True,
+            )
+        process = guard.proc
+        assert process is not None  # noqa: S101 - it was started just now
+        self._talking = process
+        if self._given_up:  # between the first look and now
+            self.give_up()
+        try:
+            out, err = _heard(process, urgent)
+        finally:
+            self._talking = None
+        if process.returncode:
+            raise git.GitCommandError(list(command), process.returncode, err, out)
+        return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
+
+    def give_up(self) -> None:
+        """End what git is waiting for, and start nothing more."""
+        self._given_up = True
+        process = self._talking
+        if process is not None:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGTERM)
+
+    def _why_not(self, text: str) -> StateRepoError:
+        """Tell a push that can be tried again from one that is denied."""
+        refused = _REFUSED.search(text)
+        if refused and not _PASSING.search(refused[1]):
+            said = " ".join(line.strip(" '") for line in _REMOTE_SAYS.findall(text)).strip()
+            reason = f"{refused[1]}: {said}" if said else refused[1]
+            return PushDenied(f"{self.address} takes no push: {reason}")
+        if _NO_RIGHT.search(text):
+            return PushDenied(f"{self.address} takes no push: {_last_line(text)}")
+        reason = refused[1] if refused else _last_line(text)
+        return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
+
+    @property
+    def always_current(self) -> bool:
+        """Say no: the remote may have moved since the last fetch."""
+        return False
+
+
+def _heard(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:
+    """Return what git says; end it where it takes too long, or something urgent comes."""
+    end = time.monotonic() + TIMEOUT_S
+    while True:
+        try:
+            return process.communicate(timeout=_POLL_S)
+        except subprocess.TimeoutExpired:
+            hurry = urgent()
+            if not hurry and time.monotonic() < end:
+                continue
+            heard = _ended(process)
+            if hurry:
+                raise CutShort("a look at the remote was ended for a demand") from None
+            return heard
+
+
+def _ended(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
+    """End git and all that it started; kindly first, so that it takes its locks with it."""
+    for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
+        with suppress(subprocess.TimeoutExpired):
+            return process.communicate(timeout=patience)
+    raise AssertionError("a killed process has ended")  # pragma: no cover
+
+
+def _last_line(text: str) -> str:
+    text = text.replace("stderr: '", "")  # GitPython's, in front of what git said
+    lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
+    fatal = [line for line in lines if line.startswith(("fatal:", "error:", "remote:", "!"))]
+    return (fatal or lines or ["git gave no reason"])[-1]

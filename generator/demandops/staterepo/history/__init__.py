@@ -1,0 +1,1 @@
+"""What commits say: their messages, their authors, and the history of a path."""

@@ -1,0 +1,133 @@
+"""Whose commits a follow commit carries out, so that history names the person for what followed.
+
+Reads commits only. People are everybody but the generator, whichever machine it runs on.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime, timezone
+
+import git
+import pygit2
+from pygit2 import Commit, Oid, Repository, Tree
+from pygit2.enums import SortMode
+
+from demandops.config.config import CONFIG_ROOTS
+from demandops.ledger.claim_file import LEDGER_ROOT
+from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history import commit_message
+
+_ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
+_MOST_NAMED = 20
+_MOST_AUTHOR = 200
+_UNFIT = re.compile(r"[<>\x00-\x1f\x7f]")
+_EMAIL = re.compile(r"[^\s<>\x00-\x1f\x7f]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """A person's commit that was taken in."""
+
+    commit: str
+    name: str
+    email: str
+    time: datetime
+
+    @property
+    def who(self) -> str:
+        """Return ``name <email>``, as git shows it."""
+        return f"{self.name} <{self.email}>"
+
+
+def since(repo: Repository, known: Oid, to: Oid) -> tuple[Cause, ...]:
+    """Return people's commits up to ``to`` that ``known`` does not have, newest first.
+
+    Those that touch nothing the generator goes by (a README) caused nothing and are left out.
+    """
+    return tuple(
+        cause_of(commit) for commit in _peoples(repo, known, to) if _touches(commit, _ROOTS)
+    )
+
+
+class Origins:
+    """Finds which of people's commits since ``known`` a path is as it is by."""
+
+    def __init__(self, repo: Repository, known: Oid, to: Oid) -> None:
+        self._world = (repo, known, to)
+        self._commits: list[Commit] | None = None
+
+    def __call__(self, path: str) -> tuple[str, str] | None:
+        """Return commit and author of the newest that touches ``path``, else of the newest."""
+        if self._commits is None:  # most reports stand already, and then nobody asks
+            self._commits = list(_peoples(*self._world))
+        for paths in ((path,) if path else (), _ROOTS):
+            for commit in self._commits:
+                if _touches(commit, paths):
+                    cause = cause_of(commit)
+                    return cause.commit, cause.who
+        return None
+
+
+def _peoples(repo: Repository, known: Oid, to: Oid) -> Iterable[Commit]:
+    walker = repo.walk(to, SortMode.TOPOLOGICAL)
+    walker.hide(known)
+    return (commit for commit in walker if not commit_message.is_generators(commit.message))
+
+
+def _touches(commit: Commit, paths: Iterable[str]) -> bool:
+    parent = commit.parents[0].tree if commit.parents else None
+    return any(_at(parent, path) != _at(commit.tree, path) for path in paths)
+
+
+def _at(tree: Tree | None, path: str) -> Oid | None:
+    entry = trees.child(tree, path) if tree is not None else None
+    return entry.id if entry is not None else None
+
+
+def cause_of(commit: Commit) -> Cause:
+    """Return a commit and its author, in characters that a trailer and a signature can carry."""
+    name = _UNFIT.sub("", commit.author.name).strip(" .,:;\"'\\") or "unnamed"
+    email = commit.author.email if _EMAIL.fullmatch(commit.author.email or "") else ""
+    moment = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
+    return Cause(
+        str(commit.id), name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL, moment
+    )
+
+
+def trailers(causes: tuple[Cause, ...]) -> list[tuple[str, str]]:
+    """Return ``Caused-By: <commit> <name> <email>`` for each, the oldest first.
+
+    A bounded number: where there are more, the newest are named, and ``Since`` tells the rest.
+    """
+    return [("Caused-By", f"{one.commit} {one.who}") for one in reversed(causes[:_MOST_NAMED])]
+
+
+def author(causes: tuple[Cause, ...], now: datetime) -> pygit2.Signature:
+    """Return who a follow commit is of: the people whose commits it carries out.
+
+    A sole person stands there as in their own commits, so that ``git log --author`` finds both;
+    of several the names, with the generator's address, for a commit has one only.
+    """
+    if not causes:
+        return commit_message.generator_signature(now)
+    people = list(dict.fromkeys((cause.name, cause.email) for cause in reversed(causes)))
+    name = ", ".join(dict.fromkeys(name for name, _ in people))
+    if len(name) > _MOST_AUTHOR:
+        name = name[: _MOST_AUTHOR - 1].rstrip(" ,") + "…"
+    email = people[0][1] if len(people) == 1 else commit_message.GENERATOR_EMAIL
+    return pygit2.Signature(name, email, int(causes[0].time.timestamp()), 0)
+
+
+def operator() -> str:
+    """Return who runs this program as git would name them, or nothing where git does not know."""
+    try:
+        told = git.Git().execute(
+            ["git", "-c", "user.useConfigOnly=true", "var", "GIT_AUTHOR_IDENT"]
+        )
+    except git.GitCommandError:
+        return ""
+    return str(told).rsplit("> ", 1)[0] + ">"

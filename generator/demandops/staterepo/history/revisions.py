@@ -1,0 +1,124 @@
+"""Points in history as people name them: a revision that Git knows, or a time.
+
+At a time the state repo was what the newest commit on the first-parent line said whose committer
+time is not later. A time without a zone is UTC, as all that the program prints.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime, timedelta, timezone
+
+import pygit2
+from pygit2 import Commit, Oid, Repository
+
+from demandops.config.policy import seconds_of
+from demandops.errors import StateRepoError
+from demandops.settings import MAIN_BRANCH
+
+TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
+"""Examples of all that :func:`moment` takes."""
+
+_DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
+_CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2})?")
+_DAY, _MINUTE, _SECOND = timedelta(days=1), timedelta(minutes=1), timedelta(seconds=1)
+_MAIN = re.compile(rf"^(?:HEAD|{MAIN_BRANCH})(?=$|[~^@])")
+
+
+def moment(text: str, now: datetime, *, end: bool = False) -> datetime | None:
+    """Return the time that a text names, or nothing where it names none.
+
+    Args:
+        text: a date, a time of the day (the last time the clock showed it), both, or a duration
+            before ``now`` (``2h``, ``1h30m``, ``2d``).
+        now: with time zone.
+        end: whether a date stands for the end of its day and a time without seconds for the end
+            of its minute, rather than for their beginning.
+    """
+    text = text.strip()
+    try:
+        return now - timedelta(seconds=seconds_of(text.removesuffix("ago").rstrip()))
+    except ValueError:
+        pass
+    whole = _whole(text)
+    clock = _CLOCK.fullmatch(text)
+    if clock:
+        hours, minutes = text.split(":", 1)
+        text = f"{now.astimezone(timezone.utc):%Y-%m-%d}T{hours:0>2}:{minutes}"
+    try:
+        found = datetime.fromisoformat(re.sub(r"[Zz]$", "+00:00", text))
+        zone = found.tzinfo or timezone.utc
+        found = found.replace(tzinfo=zone).astimezone(timezone.utc)
+    except (ValueError, OverflowError):
+        return None
+    if clock and found > now:
+        found -= _DAY
+    return found + (whole - _SECOND) if end else found
+
+
+def _whole(text: str) -> timedelta:
+    """Return how long the time lasts that a text names: a day, a minute or a second."""
+    if _DATE.fullmatch(text):
+        return _DAY
+    clock = re.split(r"[T ]", text)[-1]
+    return _MINUTE if re.match(r"\d{1,2}:\d{2}(?!:?\d)", clock) else _SECOND
+
+
+def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
+    """Return the commit that a revision or a time names.
+
+    The name of a branch or tag comes first, then a time, then all else that Git knows.
+
+    Raises:
+        StateRepoError: where it is neither, or a time before the first commit.
+    """
+    named = _reference(repo, text)
+    if named is not None:
+        return named
+    at = moment(text, now, end=True)
+    if at is not None:
+        return at_time(repo, tip, at)
+    found = _revision(repo, _MAIN.sub(str(tip), text))
+    if found is None:
+        raise StateRepoError(
+            f"'{text}' is neither a commit of the state repo nor a time; `demandops log` lists the "
+            f"commits, a time is written like {TIMES}"
+        )
+    return found
+
+
+def at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
+    """Return the newest commit on the first-parent line that was made at ``at`` or before.
+
+    Raises:
+        StateRepoError: where there was none yet.
+    """
+    commit = repo[tip].peel(Commit)
+    latest = int(at.timestamp())
+    while commit.commit_time > latest:
+        if not commit.parents:
+            first = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
+            raise StateRepoError(
+                f"at {shown(at)} there was no state repo yet; its first commit is of {shown(first)}"
+            )
+        commit = commit.parents[0]
+    return commit
+
+
+def shown(at: datetime) -> str:
+    """Return a time as people read it."""
+    return at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def _reference(repo: Repository, text: str) -> Commit | None:
+    try:
+        return repo.lookup_reference_dwim(text).peel(Commit)
+    except (KeyError, ValueError, pygit2.GitError):
+        return None
+
+
+def _revision(repo: Repository, text: str) -> Commit | None:
+    try:
+        return repo.revparse_single(text).peel(Commit)
+    except (KeyError, ValueError, pygit2.GitError):
+        return None

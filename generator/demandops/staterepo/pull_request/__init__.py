@@ -1,0 +1,1 @@
+"""A checked-out state repo, as a person is about to merge it."""

@@ -1,0 +1,127 @@
+"""A checked-out state repo on this disk: its files, and the commit that an edit started from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pygit2
+from pygit2 import Commit, Repository
+
+from demandops.config.config import CONFIG_ROOTS
+from demandops.decision import State
+from demandops.errors import Fault, InvalidInput, StateRepoError, fault
+from demandops.ledger import claim_file as ledger_format
+from demandops.settings import GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.load import snapshot as snapshots
+
+_ROOTS = (*CONFIG_ROOTS, ledger_format.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
+_DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
+_SHALLOW = (
+    "this clone is shallow and does not hold the commit that the edit started from; fetch all of "
+    "it: git fetch --unshallow origin (in a pipeline fetch-depth: 0, or GIT_DEPTH: 0)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Base:
+    """The commit that an edit started from. ``state`` is missing where none was ever valid."""
+
+    commit: str
+    files: Mapping[str, str]
+    state: State | None
+    in_force: bool
+    """Whether its own files are valid, or ``state`` is from an earlier commit."""
+
+
+def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
+    """Return path → text of all that is the state repo's, and a fault for each symbolic link.
+
+    Raises:
+        StateRepoError: where the folder holds no state repo, or not all of it can be read.
+    """
+    if not (folder / "demandops.yaml").is_file():
+        raise StateRepoError(
+            f"{folder} is no state repo, for it has no demandops.yaml; `demandops init` makes one"
+        )
+    files, faults = dict[str, str](), list[Fault]()
+    for root in _ROOTS:
+        top = folder / root
+        for path in [top, *sorted(top.rglob("*"))]:
+            name = path.relative_to(folder).as_posix()
+            if path.is_symlink():  # it may lead to what the reader of a report must not see
+                message = "is a symbolic link, which is not followed; put a file there"
+                faults.append(fault("", message).within(name))
+            elif path.is_file():
+                files[name] = _text(path)
+    return files, faults
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_bytes().decode("utf-8", "replace")
+    except OSError as error:
+        raise StateRepoError(f"{path} cannot be read: {error.strerror}") from None
+
+
+def base_of(folder: Path, revision: str | None) -> Base | None:
+    """Return what an edit is compared with; nothing where Git knows no earlier commit.
+
+    Args:
+        folder: a checked-out state repo.
+        revision: what the edit is to be merged into, by default ``origin/main``, else ``main``.
+
+    Raises:
+        StateRepoError: where there is no such commit, or none that both come from.
+    """
+    try:
+        repo = Repository(str(folder))
+    except pygit2.GitError:
+        if revision is not None:
+            raise StateRepoError(f"{folder} is no Git checkout; leave out --base") from None
+        return None
+    if repo.is_empty or repo.head_is_unborn:
+        return None
+    commit = _started_from(repo, revision)
+    files = trees.texts(commit.tree, _ROOTS)
+    try:
+        snapshot = snapshots.load_last_valid(repo, commit.id)
+    except (InvalidInput, StateRepoError):
+        return Base(str(commit.id), files, None, False)
+    return Base(str(commit.id), files, snapshot.state, not snapshot.problems)
+
+
+def _started_from(repo: Repository, revision: str | None) -> Commit:
+    """Return the commit that the work tree and what it is to be merged into both come from."""
+    head = repo.head.peel(Commit)
+    known = [name for name in _DEFAULTS if name in repo.references]
+    if revision is None and not known:
+        if repo.is_shallow:
+            raise StateRepoError(_SHALLOW)
+        return head
+    try:
+        target = trees.commit_of(repo, revision or known[0])
+        common = repo.merge_base(head.id, target.id)
+    except (StateRepoError, pygit2.GitError, KeyError):
+        if repo.is_shallow:
+            raise StateRepoError(f"'{revision or known[0]}': {_SHALLOW}") from None
+        raise
+    if common is None:
+        if repo.is_shallow:
+            raise StateRepoError(_SHALLOW)
+        raise StateRepoError(
+            f"HEAD and {revision or known[0]} have no commit in common; name with --base what the "
+            "edit is to be merged into"
+        )
+    return trees.commit_of(repo, common)
+
+
+def author_of(folder: Path) -> str:
+    """Return the name of who made the newest commit here, or nothing."""
+    try:
+        repo = Repository(str(folder))
+        return str(repo.head.peel(Commit).author.name)
+    except (pygit2.GitError, KeyError, ValueError):
+        return ""

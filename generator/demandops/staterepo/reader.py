@@ -1,0 +1,274 @@
+"""Looking into a state repo without writing: for the command line's views, a dry run and checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from itertools import islice
+from pathlib import Path
+
+from pygit2 import Commit
+
+from demandops import settings
+from demandops.config.config import Config
+from demandops.errors import Fault, InvalidInput, StateRepoError
+from demandops.ledger.restoration import Restoration
+from demandops.render.changes.changeset import Read
+from demandops.staterepo.audit import commit_signatures, verification
+from demandops.staterepo.audit.verification import Verdict
+from demandops.staterepo.git import connect
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.address import is_url
+from demandops.staterepo.git.repository import StateRepository
+from demandops.staterepo.history import commit_log, path_history, revisions
+from demandops.staterepo.history.commit_log import LogEntry
+from demandops.staterepo.history.path_history import PathHistory
+from demandops.staterepo.load import (
+    effective_config,
+    last_valid_config,
+    problem_report,
+    rollback_source,
+)
+from demandops.staterepo.load import snapshot as snapshots
+from demandops.staterepo.load.snapshot import Progress, Snapshot
+from demandops.staterepo.write.journal import Slot
+from demandops.staterepo.write.proposal_branch import PendingProposal, waiting
+
+
+class Reader:
+    """An open state repo, at its newest commit."""
+
+    def __init__(self, address: str) -> None:
+        """Open the state repo; of a URL a clone is kept, and fetched.
+
+        Raises:
+            StateRepoError: where it cannot be read.
+        """
+        self._slot: Slot | None = None
+        folder = Path()
+        if is_url(address):
+            self._slot = Slot(settings.data_home(address) / "reader")
+            folder = self._slot.folder
+        try:
+            self._repository = connect.connect(address, folder)
+            self._tip = self._repository.refresh()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Give the clone back."""
+        if self._slot is not None:
+            self._slot.close()
+
+    @property
+    def repository(self) -> StateRepository:
+        """The state repo itself, for a command that writes to it."""
+        return self._repository
+
+    def refuse_other_rendering(self) -> None:
+        """Raise where a generator of another version writes this repo, as a generator does.
+
+        Raises:
+            StateRepoError: saying which version it is and what to do.
+        """
+        tip = trees.commit_of(self._repository.objects, self._tip)
+        last_valid_config.refuse_other_rendering(tip.tree)
+
+    def commit(self, revision: str | None = None) -> str:
+        """Return the id of a commit, by a revision or a time; the newest where none is given.
+
+        Raises:
+            StateRepoError: where it is neither, or a time before the first commit.
+        """
+        if not revision:
+            return str(self._tip)
+        now = datetime.now(timezone.utc)
+        return str(revisions.resolve(self._repository.objects, self._tip, revision, now).id)
+
+    def includes(self, commit: str, other: str) -> bool:
+        """Tell whether ``commit`` is ``other`` or comes after it."""
+        return self._repository.includes(commit, other)
+
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Tell whether two commits hold the same under ``path``."""
+        return self._repository.unchanged(commit, other, path)
+
+    def snapshot(
+        self, revision: str | None = None, progress: Progress = lambda done, total: None
+    ) -> Snapshot:
+        """Load the books and the configuration that are in force at a commit.
+
+        Where the generator reported that people broke a file, these are its last valid versions.
+
+        Raises:
+            InvalidInput, StateRepoError: where it holds no valid state repo.
+        """
+        commit = trees.commit_of(self._repository.objects, self.commit(revision))
+        told = self._told_at(commit)
+        if told is not None and told.one("In-Force"):
+            return effective_config.at(self._repository.objects, commit, told)
+        return snapshots.load(self._repository.objects, commit.id, progress)
+
+    def _told_at(self, commit: Commit) -> LogEntry | None:
+        """Return the generator's newest commit up to one: it says what is in force."""
+        base = commit_log.last_generated(self._repository.objects, commit.id)
+        if base is None:
+            return None
+        return commit_log.entry_of(trees.commit_of(self._repository.objects, base))
+
+    def problems(self) -> tuple[problem_report.Problem, ...]:
+        """Return what the generator reports not to be valid at the newest commit."""
+        return problem_report.read(self.file_reader()(problem_report.PATH))
+
+    def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
+        """Return what is not valid at a commit, as reported there or else as it was found."""
+        told = self.file_reader(str(snapshot.commit))(problem_report.PATH)
+        return problem_report.read(told) or snapshot.problems
+
+    def last_valid(self, revision: str, progress: Progress = lambda done, total: None) -> Snapshot:
+        """Load what is in force at a commit, whether or not the generator has been there since.
+
+        Of what is not valid there it is the last version that was; the problems are told.
+
+        Raises:
+            InvalidInput, StateRepoError: where there never was a valid configuration.
+        """
+        try:
+            return self.snapshot(revision, progress)
+        except InvalidInput:
+            return snapshots.load_last_valid(self._repository.objects, revision, progress)
+
+    def file_reader(self, revision: str | None = None) -> Read:
+        """Return a function that gives the text of a file at a commit."""
+        tree = trees.commit_of(self._repository.objects, self.commit(revision)).tree
+        return lambda path: trees.read_text(tree, path)
+
+    def config(self) -> Config:
+        """Return the configuration at the newest commit.
+
+        Raises:
+            InvalidInput, StateRepoError: where it holds no valid one.
+        """
+        return last_valid_config.config_at(
+            trees.commit_of(self._repository.objects, self._tip).tree
+        )
+
+    def proposals(self) -> list[PendingProposal]:
+        """Return the demands that await approval, by branch.
+
+        Raises:
+            RemoteAway: where the remote does not answer.
+        """
+        return list(waiting(self._repository))
+
+    def log(self, spec: str | None = None) -> Iterator[LogEntry]:
+        """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
+        since, until = self._sides(spec or "")
+        yield from commit_log.walk(self._repository.objects, until, since)
+
+    def touching(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
+        """Yield those commits that changed a file or folder."""
+        since, until = self._sides(spec or "")
+        objects = self._repository.objects
+        known = {one.commit for one in commit_log.walk(objects, until, since)} if since else None
+        for touch in path_history.touching(objects, until, path):
+            if known is None or touch.entry.commit in known:
+                yield touch.entry
+
+    def revisions(self, spec: str | None) -> list[str]:
+        """Return the commits that ``REV`` or ``A..B`` names, oldest first.
+
+        Raises:
+            StateRepoError: where a side is neither revision nor time.
+        """
+        since, until = self._sides(spec or "")
+        if since is None:
+            return [until]
+        walked = commit_log.walk(self._repository.objects, until, since)
+        return [entry.commit for entry in walked][::-1]
+
+    def _sides(self, spec: str) -> tuple[str | None, str]:
+        """Return the commits that ``A..B`` names; of ``REV`` the second alone."""
+        first, dots, last = spec.partition("..")
+        if not dots:
+            return None, self.commit(first)
+        if not first:
+            raise StateRepoError(f"'{spec}' has no start; write A..B")
+        return self.commit(first), self.commit(last)
+
+    def verify(
+        self,
+        commits: Sequence[str],
+        *,
+        whole: bool = False,
+        progress: Progress = lambda done, total: None,
+    ) -> list[Verdict]:
+        """Return a verdict on each commit: rendered again and compared byte by byte, and signed?
+
+        Args:
+            commits: oldest first.
+            whole: whether to load every commit from nothing, rather than by what differs.
+            progress: told (commits done, commits in all).
+        """
+        objects, verdicts = self._repository.objects, list[Verdict]()
+        for verdict in verification.verify(objects, commits, whole=whole):
+            verdicts.append(verdict)
+            progress(len(verdicts), len(commits))
+        return commit_signatures.checked(objects, verdicts)
+
+    def history(self, path: str, revision: str, most: int) -> PathHistory:
+        """Return how a file or folder came to what it is at a commit."""
+        return path_history.of_path(self._repository.objects, revision, path, most)
+
+    def path_called(self, name: str, revision: str) -> str | None:
+        """Return the path of a release, or of the last one of that name, which was stopped."""
+        objects = self._repository.objects
+        standing = path_history.called(objects, revision, name)
+        return standing or path_history.once_called(objects, revision, name)
+
+    def ever_stopped(self, revision: str) -> set[str]:
+        """Return the names of all releases that were stopped at some time."""
+        return path_history.ever_stopped(self._repository.objects, revision)
+
+    def differing(self, before: str, after: str, root: str) -> dict[str, bool]:
+        """Return the files below a folder that differ between two commits, and which are left."""
+        objects = self._repository.objects
+        sides = [trees.commit_of(objects, revision).tree for revision in (before, after)]
+        found = trees.below_root(objects, sides[0], sides[1], root)
+        return {path: blob is not None for path, blob in found}
+
+    def concerns(self, commit: str, node: str) -> bool:
+        """Tell whether a commit changed what runs on a node, or a claim that names it."""
+        return path_history.concerns(self._repository.objects, commit, node)
+
+    def behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
+        """Return the commits of people that a commit carries out, newest first."""
+        since, follows = entry.one("Since"), entry.one("Follows")
+        if not (since and follows):
+            return []
+        walked = commit_log.walk(self._repository.objects, follows, since)
+        return list(islice((one for one in walked if not one.by_generator), most))
+
+    def restoration(self, to: str, **more: object) -> Restoration:
+        """Return the request to go back to a commit."""
+        return rollback_source.restoration(self._repository.objects, to, **more)
+
+    def configured_since(self, commit: str) -> list[str]:
+        """Return the files of people that are not what they were at a commit."""
+        return rollback_source.configured_since(self._repository.objects, commit, self._tip)
+
+    def person(self) -> tuple[str, str]:
+        """Return name and e-mail address of who runs this."""
+        return rollback_source.person(self._repository.objects)
+
+
+@contextmanager
+def opened(address: str) -> Iterator[Reader]:
+    """Open a state repo for reading and close it again."""
+    reader = Reader(address)
+    try:
+        yield reader
+    finally:
+        reader.close()

@@ -1,0 +1,1 @@
+"""What is written: commits, the journal of demands, and the branches of proposals."""

@@ -1,0 +1,252 @@
+"""Proposals in the state repo: branches ``demand/…`` that wait for a person to merge them.
+
+They are the generator's own: it lays one anew on a newer main and takes it away again, each time
+only from the commit that it put there itself. Knows nothing of who waits for them, and of forges
+only the options that GitLab takes with a push.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+
+import git
+import pygit2
+from pygit2 import Oid, Repository
+
+from demandops.errors import StateRepoError
+from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.clone import ClonedRepository
+from demandops.staterepo.git.repository import MAIN, StateRepository
+from demandops.staterepo.git.tree import commit_of
+from demandops.staterepo.history import commit_log
+from demandops.staterepo.history.commit_message import PROPOSAL
+
+PREFIX = "demand/"
+_HEADS = "refs/heads/"
+_NO_OPTIONS = re.compile(r"does not support push options")
+_LINK = re.compile(r"https?://\S+")
+_MAX_SLUG = 40
+
+
+class BranchMoved(StateRepoError):
+    """Somebody else moved or took away a branch: it is not at the commit that was put there."""
+
+
+def branch_of(name: str, operation: str) -> str:
+    """Return the branch for a demand: readable, and of this operation alone."""
+    slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_MAX_SLUG].rstrip("-")
+    digest = hashlib.sha256(operation.encode()).hexdigest()[:12]
+    return f"{PREFIX}{slug}-{digest}" if slug else f"{PREFIX}{digest}"
+
+
+@dataclass(frozen=True, slots=True)
+class Heads:
+    """Where the state repo's branches are: main, and those of proposals by name."""
+
+    main: str
+    branches: dict[str, str]
+
+
+class Branches:
+    """The branches ``demand/…`` of a state repo, on this disk or behind a URL."""
+
+    def __init__(self, repository: StateRepository) -> None:
+        self._repository = repository
+        self._remote = repository if isinstance(repository, ClonedRepository) else None
+
+    def heads(self) -> Heads:
+        """Ask where the branches are now.
+
+        Raises:
+            RemoteAway: where the remote does not answer.
+        """
+        if self._remote is None:
+            found = _heads(Repository(self._repository.objects.path))
+        else:
+            found = self._remote.listed(MAIN, f"{_HEADS}{PREFIX}*")
+        named = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
+        return Heads(named.pop(MAIN_BRANCH, ""), named)
+
+    def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
+        """Make a branch point to ``commit``, durably; return the link that the server told.
+
+        Args:
+            branch: its name.
+            commit: a commit that is here.
+            expected: where the branch is now; empty where there must be none.
+            options: push options; a server that knows none gets the branch without.
+
+        Raises:
+            BranchMoved: where the branch is not as expected.
+            RemoteAway, PushDenied: where it could not be pushed for another reason.
+        """
+        if self._remote is None:
+            self._move(branch, commit, expected)
+            return ""
+        reference = f"{_HEADS}{branch}"
+        return self._push(f"{commit}:{reference}", branch, str(commit), expected, options)
+
+    def remove(self, branch: str, expected: str) -> None:
+        """Take a branch away; one that is gone already may be.
+
+        Raises:
+            BranchMoved: where it is at another commit: somebody worked on it.
+            RemoteAway, PushDenied: where it could not be pushed for another reason.
+        """
+        if self._remote is None:
+            self._move(branch, None, expected)
+            return
+        self._push(f":{_HEADS}{branch}", branch, "", expected)
+
+    def _push(
+        self, spec: str, branch: str, wanted: str, expected: str, options: Sequence[str] = ()
+    ) -> str:
+        """Push, and where that failed look whether the branch is as wanted all the same."""
+        assert self._remote is not None  # noqa: S101 - the callers have looked
+        lease = f"{_HEADS}{branch}:{expected}"
+        try:
+            return _link(self._remote.push(spec, lease, options))
+        except git.GitCommandError as error:
+            if options and _NO_OPTIONS.search(str(error.stderr)):
+                return self._push(spec, branch, wanted, expected)
+            now = self.heads().branches.get(branch, "")
+            if now == wanted:
+                return ""  # it was taken, and the answer got lost
+            if now != expected:
+                raise BranchMoved(f"{branch} was changed by somebody else") from None
+            raise self._remote.why_not(error) from None
+
+    def _move(self, branch: str, commit: Oid | None, expected: str) -> None:
+        references = self._repository.objects.references
+        name = f"{_HEADS}{branch}"
+        now = str(references[name].target) if name in references else ""
+        if commit is None and not now:
+            return
+        if now != expected:
+            raise BranchMoved(f"{branch} was changed by somebody else")
+        if commit is None:
+            references.delete(name)
+        elif now:
+            references[name].set_target(commit, "demandops")
+        else:
+            references.create(name, commit)
+
+    def tree(self, tip: Oid, files: Mapping[str, str | None]) -> Oid:
+        """Return the tree of ``tip`` with ``files`` changed."""
+        objects = self._repository.objects
+        return trees.write(objects, commit_of(objects, tip).tree, files)
+
+    def message(self, commit: str) -> str:
+        """Return a commit's message; nothing where the commit is not here."""
+        try:
+            return commit_of(self._repository.objects, commit).message
+        except StateRepoError:
+            return ""
+
+    def is_fresh(self, tip: Oid, commit: str, base: str, made: Oid) -> bool:
+        """Tell whether merging ``commit`` into ``tip`` gives the files of ``made``, and cleanly.
+
+        Args:
+            tip: main as it is.
+            commit: the proposal as it stands, on top of ``base``.
+            base: main as it was.
+            made: the tree that the demand would have on main as it is.
+        """
+        objects = self._repository.objects
+        try:
+            old, stands = commit_of(objects, base).tree, commit_of(objects, commit).tree
+        except StateRepoError:
+            return False  # the clone was made anew, or git tidied up
+        now = commit_of(objects, tip).tree
+        wanted = objects[made].peel(pygit2.Tree)
+        proposed = dict(trees.differences(objects, old, stands, ""))
+        if proposed != dict(trees.differences(objects, now, wanted, "")):
+            return False
+        moved = dict(trees.differences(objects, old, now, ""))
+        return not set(moved) & set(proposed)
+
+
+def _heads(repo: Repository) -> dict[str, str]:
+    names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
+    return {name: str(repo.references[name].target) for name in [MAIN, *names]}
+
+
+def _link(said: str) -> str:
+    """Return the address that a server prints for a person; GitLab's are of a merge request."""
+    lines = [line for line in said.splitlines() if line.startswith("remote:")]
+    links = [found[0] for line in lines if (found := _LINK.search(line))]
+    return next((link for link in links if "/merge_requests/" in link), "")
+
+
+def gitlab_options(title: str, description: str, labels: Iterable[str]) -> list[str]:
+    """Return the push options by which GitLab opens a merge request.
+
+    They hold no line breaks, so the description is of one line.
+    """
+    return [
+        "merge_request.create",
+        f"merge_request.target={MAIN_BRANCH}",
+        f"merge_request.title={title}",
+        f"merge_request.description={description}",
+        "merge_request.remove_source_branch",
+        *(f"merge_request.label={label}" for label in labels),
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class PendingProposal:
+    """A proposal that nobody has decided yet, as its commits tell it."""
+
+    branch: str
+    commit: str
+    summary: str
+    since: datetime
+    requesters: tuple[str, ...]
+    demands: tuple[str, ...]
+    operations: tuple[str, ...]
+
+
+def waiting(repository: StateRepository) -> Iterator[PendingProposal]:
+    """Yield the proposals that are not merged, by branch.
+
+    Raises:
+        RemoteAway: where the remote does not answer.
+    """
+    if isinstance(repository, ClonedRepository):
+        repository.fetch_branches(PREFIX)
+    repo = Repository(repository.objects.path)
+    space = f"refs/remotes/origin/{PREFIX}"
+    if not isinstance(repository, ClonedRepository):
+        space = f"{_HEADS}{PREFIX}"
+    main = repository.tip()
+    for name in sorted(name for name in repo.references if name.startswith(space)):
+        entries = [
+            entry
+            for entry in commit_log.walk(repo, repo.references[name].resolve().target, main)
+            if PROPOSAL in entry.trailers
+        ]
+        if entries:
+            yield _described(repo, f"{PREFIX}{name.removeprefix(space)}", entries)
+
+
+def _described(
+    repo: Repository, branch: str, entries: list[commit_log.LogEntry]
+) -> PendingProposal:
+    def all_of(key: str) -> tuple[str, ...]:
+        return tuple(sorted({value for entry in entries for value in entry.trailers.get(key, ())}))
+
+    first = commit_of(repo, entries[-1].commit)
+    return PendingProposal(
+        branch=branch,
+        commit=entries[0].commit,
+        summary=entries[0].summary,
+        since=datetime.fromtimestamp(first.author.time, tz=timezone.utc),
+        requesters=all_of("Requester"),
+        demands=all_of("Demand-Id"),
+        operations=all_of("Operation-Id"),
+    )

@@ -1,0 +1,218 @@
+"""YAML in and out, strictly and always the same way.
+
+Every file that the program reads passes :func:`load` (duplicate keys, anchors and several
+documents are errors with a line number), every file it writes passes :func:`dump`, whose strings
+mean the same in YAML 1.1 and 1.2: PyYAML, Go's parsers and a person must read one value.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import yaml
+
+from demandops.errors import Fault, InvalidInput, fault
+
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+_PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*(?:[:@=][A-Za-z0-9_./-]+)*")
+_WORDS = frozenset(
+    ["y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "none"]
+)  # some parser somewhere reads one of these as something other than text
+
+_OPENING = (yaml.MappingStartEvent, yaml.SequenceStartEvent)
+_CLOSING = (yaml.MappingEndEvent, yaml.SequenceEndEvent)
+_MAX_DEPTH = 100
+_MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
+_MISFIT = "not valid YAML: a tag or number stands where it has no meaning"
+
+_UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
+
+
+class _StrictLoader(_Loader):  # type: ignore[misc]
+    """A safe loader that refuses duplicate keys and leaves dates as text."""
+
+
+def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:  # noqa: ANN401
+    if not isinstance(node, yaml.MappingNode):
+        raise yaml.constructor.ConstructorError(
+            None, None, "a mapping is expected here", node.start_mark
+        )
+    seen: dict[str, Any] = {}
+    for key_node, value_node in node.value:
+        key = loader.construct_object(key_node, deep=True)
+        if not isinstance(key, str):
+            raise yaml.constructor.ConstructorError(
+                None,
+                None,
+                f"the key {brief(key)} must be text; put it in quotes",
+                key_node.start_mark,
+            )
+        if key in seen:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"the key {key!r} stands twice", key_node.start_mark
+            )
+        seen[key] = loader.construct_object(value_node, deep=True)
+    return seen
+
+
+_StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping)
+_StrictLoader.add_constructor(
+    "tag:yaml.org,2002:timestamp", lambda loader, node: loader.construct_scalar(node)
+)
+
+
+class _PlainDumper(_Dumper):  # type: ignore[misc]
+    """A dumper that never writes anchors and quotes whatever a parser could misread."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        """Say yes always: the same list twice is written out twice."""
+        return True
+
+
+def _text(dumper: Any, text: str) -> yaml.ScalarNode:  # noqa: ANN401
+    tag = "tag:yaml.org,2002:str"
+    if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
+        return dumper.represent_scalar(tag, text)  # type: ignore[no-any-return]
+    style = "|" if _readable_block(text) else '"'
+    return dumper.represent_scalar(tag, text, style=style)  # type: ignore[no-any-return]
+
+
+def _readable_block(text: str) -> bool:
+    """Tell whether a literal block shows ``text`` unchanged (a parameter file in a ConfigMap)."""
+    return (
+        text.endswith("\n")
+        and not text.endswith("\n\n")
+        and not text.startswith((" ", "\n"))
+        and text.count("\n") > 1
+        and not re.search(r"[ \t]\n|[^\x20-\x7e\n]", text)
+    )
+
+
+_PlainDumper.add_representer(str, _text)
+
+
+def brief(value: object) -> str:
+    """Return a value for a message, whatever it is."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no number of over 4300 digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 60 else text[:57] + "…"
+
+
+def _mark(error: yaml.YAMLError) -> str:
+    mark = getattr(error, "problem_mark", None)
+    return f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+
+
+def load_all(text: str) -> Iterator[Any]:
+    """Yield the documents of ``text``; raise :class:`InvalidInput` for what is not strict YAML."""
+    try:
+        depth = 0
+        for event in yaml.parse(text, Loader=_Loader):
+            depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
+            if depth > _MAX_DEPTH:  # before the C parser builds it and overruns its stack
+                raise InvalidInput([fault("", f"is nested deeper than {_MAX_DEPTH} levels")])
+            if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+                where = f"line {event.start_mark.line + 1}" if event.start_mark else ""
+                raise InvalidInput(
+                    [fault(where, "anchors and aliases (& and *) are not taken; write it out")]
+                )
+        yield from yaml.load_all(text, Loader=_StrictLoader)
+    except yaml.YAMLError as error:
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise InvalidInput([fault(_mark(error), f"not valid YAML: {problem}")]) from error
+    except _MISFITS as error:
+        raise InvalidInput([fault("", _MISFIT)]) from error
+
+
+def load(text: str) -> Any:  # noqa: ANN401 - raw YAML is parsed into models right behind this
+    """Return the one document of ``text`` (``None`` where it is empty)."""
+    documents = list(load_all(text))
+    if len(documents) > 1:
+        raise InvalidInput([fault("", f"holds {len(documents)} documents; only one is taken")])
+    return documents[0] if documents else None
+
+
+def load_rendered(text: str) -> Any:  # noqa: ANN401
+    """Parse one document that a template of ours or of an appdef gave.
+
+    Strict on duplicate keys, but without the look for anchors: one pass less for each release.
+
+    Raises:
+        InvalidInput: where it is not valid YAML.
+    """
+    try:
+        return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
+    except yaml.YAMLError as error:
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise InvalidInput([fault(_mark(error), f"not valid YAML: {problem}")]) from error
+    except _MISFITS as error:
+        raise InvalidInput([fault("", _MISFIT)]) from error
+
+
+def dump(data: Mapping[str, Any]) -> str:
+    """Return ``data`` as block YAML in the order given, ending in a newline."""
+    return str(
+        yaml.dump(
+            data,
+            Dumper=_PlainDumper,
+            sort_keys=False,
+            allow_unicode=True,
+            default_flow_style=False,
+            width=4096,
+        )
+    )
+
+
+def edited(text: str, key: str, value: object) -> str:
+    """Return a file with one top-level key set; all else stays, comments included.
+
+    A key that holds one plain value has it replaced where it stands; one that is missing is added
+    at the end.
+
+    Raises:
+        InvalidInput: where the file is not of a form in which that is possible.
+    """
+    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    standing = next((held for name, held in pairs if name.value == key), None)
+    if isinstance(standing, yaml.ScalarNode):
+        start, end = standing.start_mark.index, standing.end_mark.index
+        changed = text[:start] + dump({key: value}).partition(": ")[2].rstrip("\n") + text[end:]
+    else:
+        ended = "" if text.endswith("\n") else "\n"
+        added = f"{ended}\n{dump({key: value})}"
+        changed = text + (added.replace("\n", "\r\n") if "\r\n" in text else added)
+    try:
+        done = load(changed) == {**load(text), key: value}
+    except (InvalidInput, TypeError):
+        done = False
+    if not done:
+        raise InvalidInput(
+            [fault(key, f"cannot be set by the program; write {brief(value)} there")]
+        )
+    return changed
+
+
+def scalar(value: object) -> str:
+    """Return ``value`` as JSON that is also YAML: what a template's ``{{ … }}`` writes.
+
+    Characters that YAML does not print are written as ``\\uXXXX``; others stay readable.
+    """
+    text = json.dumps(value, ensure_ascii=False, sort_keys=False, default=_unknown)
+    return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+
+
+def _unknown(value: object) -> object:
+    raise TypeError(f"a template may write text, numbers, lists and mappings, not {type(value)}")
+
+
+def faults_in(error: InvalidInput, file: str) -> list[Fault]:
+    """Return the faults of ``error``, told to be in ``file``."""
+    return [fault.within(file) for fault in error.faults]

@@ -1,0 +1,139 @@
+"""The two actions that a demand can come by, as the node needs them: one form for each.
+
+What a form knows is how its goal becomes plain data and how stages and outcomes become messages.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from application_manager_interfaces.action import DeploymentRequest
+from builtin_interfaces.msg import Duration
+from demandops.cluster.health import Level
+from demandops.decision import explain
+from demandops.errors import (
+    DemandOpsError,
+    InvalidInput,
+    NotReached,
+    QueueFull,
+    ShuttingDown,
+    TurnedDown,
+    Withdrawn,
+)
+from demandops.service import Receipt
+from demandops_interfaces.action import Demand
+
+from demandops_ros.messages import as_data, demand_data
+
+LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
+
+
+class Form(Protocol):
+    """One action."""
+
+    action: Any
+
+    def data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
+        """Return a goal as plain data."""
+
+    def name(self, goal: Any) -> str:  # noqa: ANN401
+        """Return what the log calls a goal."""
+
+    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
+        """Return when a goal is to be answered, or nothing where it cannot say."""
+
+    def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
+        """Return the feedback for a stage."""
+
+    def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
+        """Return the result for what came of a goal, and how far it is."""
+
+
+class DeploymentRequestForm:
+    """The reference's action: all it can say is one line of text."""
+
+    action = DeploymentRequest
+
+    def data(self, goal: Any) -> Any:  # noqa: ANN401
+        """Return a goal as plain data."""
+        return as_data(goal)
+
+    def name(self, goal: Any) -> str:  # noqa: ANN401
+        """Return the request's id."""
+        return str(goal.id)
+
+    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
+        """Return nothing: the message has no field for it."""
+        return None
+
+    def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
+        """Return the stage as text."""
+        return DeploymentRequest.Feedback(message=text)
+
+    def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
+        """Return ``<outcome>: <commit>``, or ``<code>: <field>: <remedy>``."""
+        return DeploymentRequest.Result(message=_text(outcome))
+
+
+class DemandForm:
+    """Our own action."""
+
+    action = Demand
+
+    def data(self, goal: Any) -> Any:  # noqa: ANN401
+        """Return a goal as plain data."""
+        return demand_data(goal)
+
+    def name(self, goal: Any) -> str:  # noqa: ANN401
+        """Return the demand's id."""
+        return str(goal.demand_id)
+
+    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
+        """Return the level that the goal asks for."""
+        return LEVELS[goal.answer] if goal.answer < len(LEVELS) else None
+
+    def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
+        """Return stage and text."""
+        return Demand.Feedback(stage=stage, message=text)
+
+    def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
+        """Return code and text, and for a demand that was honoured what it came to."""
+        result = Demand.Result(code=_code(outcome), message=_text(outcome))
+        if isinstance(outcome, Receipt):
+            result.outcome = outcome.outcome
+            result.commit = outcome.commit
+            result.lease = Duration(sec=outcome.lease_s or 0)
+            result.warnings = [*outcome.warnings, *(f"not held: {x}" for x in outcome.not_held)]
+            result.reached = reached
+        return result
+
+
+def _text(outcome: Receipt | BaseException) -> str:
+    if isinstance(outcome, Receipt):
+        lines = [f"{outcome.outcome}: {outcome.commit}"]
+        lines += [f"warning: {warning}" for warning in outcome.warnings]
+        lines += [f"not held: {item}" for item in outcome.not_held]
+        return "\n".join(lines)
+    if isinstance(outcome, InvalidInput):
+        return explain(outcome)
+    if isinstance(outcome, Withdrawn):
+        return str(outcome)
+    return f"{_code(outcome)}: {outcome if isinstance(outcome, DemandOpsError) else repr(outcome)}"
+
+
+def _code(outcome: Receipt | BaseException) -> str:
+    if isinstance(outcome, Receipt):
+        return "ok"
+    if isinstance(outcome, InvalidInput):
+        return outcome.faults[0].code
+    for kind, code in (
+        (Withdrawn, "withdrawn"),
+        (TurnedDown, "turned-down"),
+        (NotReached, f"not-{getattr(outcome, 'level', '')}"),
+        (ShuttingDown, "shutting-down"),
+        (QueueFull, "queue-full"),
+        (DemandOpsError, "state-repo"),
+    ):
+        if isinstance(outcome, kind):
+            return code
+    return "fault"

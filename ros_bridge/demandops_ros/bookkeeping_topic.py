@@ -1,0 +1,86 @@
+"""The bookkeeping over ROS 2, as the command line prints it: a service and a latched topic."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from functools import partial
+from threading import Event, Thread
+from typing import Any
+
+from demandops.errors import DemandOpsError
+from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.service import Generator
+from demandops.staterepo import reader
+from demandops_interfaces.msg import Bookkeeping as BookkeepingMessage
+from rclpy.node import Node
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+
+
+def answer(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
+    """Fill the response with the bookkeeping at ``request.at``; the newest where it is empty."""
+    try:
+        if request.at:
+            with reader.opened(generator.given_address) as repo:
+                snapshot = repo.snapshot(request.at)
+        else:
+            snapshot = generator.snapshot
+        books = bookkeeping(snapshot.state.ledger, snapshot.state.config)
+    except DemandOpsError as error:
+        response.ok, response.message = False, str(error)
+        return response
+    response.ok = True
+    response.commit = str(snapshot.commit)
+    response.bookkeeping_json = json.dumps(as_data(books, response.commit), ensure_ascii=False)
+    return response
+
+
+_LATCHED = QoSProfile(
+    depth=1,
+    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+    reliability=QoSReliabilityPolicy.RELIABLE,
+)
+_SHORTEST_PAUSE_S = 1.0
+_SHARE = 20
+
+
+class BookkeepingTopic:
+    """Publishes the bookkeeping on ``~/bookkeeping`` after it changed; latecomers get the last.
+
+    Writing it down costs as much as there is, so it is done beside the worker, and no more often
+    than keeps it to a twentieth of the time.
+    """
+
+    def __init__(
+        self, node: Node, generator: Generator, in_executor: Callable[[Callable[[], None]], None]
+    ) -> None:
+        self._generator = generator
+        self._in_executor = in_executor
+        self._publisher = node.create_publisher(BookkeepingMessage, "~/bookkeeping", _LATCHED)
+        self._changed, self._closed = Event(), Event()
+        self._changed.set()
+        generator.watch(lambda config: self._changed.set())
+        Thread(target=self._run, name="demandops-bookkeeping-topic", daemon=True).start()
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._closed.set()
+        self._changed.set()
+
+    def _run(self) -> None:
+        while self._changed.wait() and not self._closed.is_set():
+            self._changed.clear()
+            start = time.monotonic()
+            snapshot = self._generator.snapshot
+            books = bookkeeping(snapshot.state.ledger, snapshot.state.config)
+            commit = str(snapshot.commit)
+            text = json.dumps(as_data(books, commit), ensure_ascii=False)
+            message = BookkeepingMessage(commit=commit, bookkeeping_json=text)
+            self._in_executor(partial(self._publish, message))
+            took = time.monotonic() - start
+            self._closed.wait(max(_SHORTEST_PAUSE_S, took * _SHARE))
+
+    def _publish(self, message: Any) -> None:  # noqa: ANN401
+        if not self._closed.is_set():
+            self._publisher.publish(message)

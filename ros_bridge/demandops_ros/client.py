@@ -1,0 +1,283 @@
+"""Demanding from a program: put a demand, keep it renewed, give it up.
+
+    with DemandClient("vehicle01") as client:
+        with client.demand("v1-recording", applications=[{
+            "id": "edge/recorder", "type": "recorder", "node": "edge",
+            "inputs": {"points": [{"topic": "/points", "source": "vehicle01"}]},
+        }]) as demand:
+            print(demand.commit)     # it runs from here on, and is given up at the end
+
+What an application or a connection holds is written as in a YAML document of the kind ``Demand``
+(docs/demand.md). Works beside the caller's own rclpy: it has a context and a thread of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from threading import Event, Thread
+from typing import Any
+
+import rclpy
+from action_msgs.msg import GoalStatus
+from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
+from demandops_interfaces.action import Demand
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+
+from demandops_ros.messages import demand_goal
+
+log = logging.getLogger("demandops.client")
+
+Told = Callable[[str, str], None]
+"""Called with stage and text as a demand goes along, from the client's thread."""
+
+_DEPTH = 100
+_RENEW_AFTER = 1 / 3
+"""Of its lease; two more attempts fit before it ends."""
+_RETRY_S = 5.0
+_UNHEARD_S = 5.0
+"""A goal is accepted within milliseconds; nobody heard one that is not within this."""
+
+
+class DemandError(Exception):
+    """A demand that was not honoured. ``code`` is a word for programs (``unknown-node``)."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What came of a goal.
+
+    ``outcome`` is booked, released or unchanged, ``lease_s`` 0 for no end, ``reached`` pushed,
+    reconciled or healthy.
+    """
+
+    outcome: str
+    commit: str
+    lease_s: float
+    warnings: tuple[str, ...]
+    reached: str
+
+
+class DemandClient:
+    """Sends demands in the name of ``requesters`` to one node."""
+
+    def __init__(
+        self,
+        *requesters: str,
+        action_name: str = DEFAULT_DEMAND_ACTION_NAME,
+        node_name: str = "demandops_client",
+        timeout_s: float = 60.0,
+        domain_id: int | None = None,
+    ) -> None:
+        """Start the client.
+
+        Args:
+            requesters: in whose name everything is asked.
+            action_name: where the node takes demands.
+            node_name: of the client's own ROS node.
+            timeout_s: how long to wait for the node, and for each answer.
+            domain_id: the ROS domain; that of the environment where it is left out.
+        """
+        self.requesters = requesters
+        self.timeout_s = timeout_s
+        self._action_name = action_name
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain_id)
+        self._node = rclpy.create_node(node_name, context=self._context)
+        deep = QoSProfile(
+            history=QoSHistoryPolicy.KEEP_LAST,
+            depth=_DEPTH,
+            reliability=QoSReliabilityPolicy.RELIABLE,
+        )
+        self._client = ActionClient(
+            self._node,
+            Demand,
+            action_name,
+            goal_service_qos_profile=deep,
+            result_service_qos_profile=deep,
+            cancel_service_qos_profile=deep,
+            feedback_sub_qos_profile=deep,
+        )
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._spinner = Thread(target=self._executor.spin, name="demandops-client", daemon=True)
+        self._spinner.start()
+
+    def __enter__(self) -> DemandClient:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        """Close it; demands that are held are not given up by this."""
+        self.close()
+
+    def close(self) -> None:
+        """End the client's thread and node."""
+        self._executor.shutdown(timeout_sec=1)
+        self._spinner.join(5)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def put(
+        self,
+        demand: str,
+        applications: Iterable[Mapping[str, Any]] = (),
+        connections: Iterable[Mapping[str, Any]] = (),
+        *,
+        lease: float | str | None = None,
+        answer: str = "pushed",
+        request: str = "",
+        told: Told = lambda stage, text: None,
+    ) -> Answer:
+        """Make a demand what is listed, and return once it is published.
+
+        Args:
+            demand: the demand's id.
+            applications, connections: as in a YAML document of the kind ``Demand``.
+            answer: when to return: pushed, reconciled or healthy.
+            lease: seconds, or a duration like ``10m``; the access domain's where left out.
+            request: free text for the commit.
+            told: called with each stage.
+
+        Raises:
+            DemandError: with the code, where it is not honoured or nobody answers in time.
+            ValueError, TypeError: for fields that the message does not have.
+        """
+        data: dict[str, Any] = {
+            "demand": demand,
+            "request": request,
+            "answer": answer,
+            "applications": list(applications),
+            "connections": list(connections),
+        }
+        return self.send(data | ({"lease": lease} if lease is not None else {}), told)
+
+    def renew(self, demand: str) -> Answer:
+        """Renew a demand's leases.
+
+        Raises:
+            DemandError: as :meth:`put`; ``not-held`` where it has ended.
+        """
+        return self.send({"operation": "renew", "demand": demand})
+
+    def release(self, demand: str) -> Answer:
+        """Give up all that a demand holds.
+
+        Raises:
+            DemandError: as :meth:`put`; ``not-held`` where it holds nothing.
+        """
+        return self.send({"operation": "release", "demand": demand})
+
+    def demand(self, demand: str, *args: Any, **options: Any) -> HeldDemand:  # noqa: ANN401
+        """Return a demand to be held for a ``with`` block; takes what :meth:`put` takes."""
+        return HeldDemand(self, demand, lambda: self.put(demand, *args, **options))
+
+    def send(self, data: Mapping[str, Any], told: Told = lambda stage, text: None) -> Answer:
+        """Send a document of the kind ``Demand`` and wait for the answer; see :meth:`put`."""
+        goal = demand_goal({"requesters": list(self.requesters), **data})
+        deadline = time.monotonic() + self.timeout_s
+        if not self._client.wait_for_server(timeout_sec=self.timeout_s):
+            raise DemandError("no-server", f"nobody takes demands on {self._action_name}")
+        handle, lost = self._accepted(goal, told, deadline)
+        if not handle.accepted:
+            raise DemandError("rejected", "the node takes no demands now; send it again later")
+        answer = self._await(handle.get_result_async(), deadline)
+        result = answer.result
+        if lost and result.code == "not-held" and goal.operation == Demand.Goal.OPERATION_RELEASE:
+            return Answer("released", "", 0.0, ("released by an attempt that got lost",), "pushed")
+        if answer.status != GoalStatus.STATUS_SUCCEEDED:
+            raise DemandError(result.code or "aborted", result.message)
+        lease_s = result.lease.sec + result.lease.nanosec / 1e9
+        warnings = tuple(result.warnings)
+        return Answer(result.outcome, result.commit, lease_s, warnings, result.reached)
+
+    def _accepted(self, goal: Any, told: Told, deadline: float) -> tuple[Any, bool]:  # noqa: ANN401
+        """Send a goal until the node has heard it; tell whether an attempt got lost.
+
+        A node that has not yet found this client loses its response. Sending again does no harm:
+        a demand that is put twice counts once.
+        """
+        lost = False
+        while True:
+            sent = self._client.send_goal_async(
+                goal, feedback_callback=lambda fb: told(fb.feedback.stage, fb.feedback.message)
+            )
+            try:
+                return self._await(sent, min(deadline, time.monotonic() + _UNHEARD_S)), lost
+            except DemandError:
+                if time.monotonic() >= deadline:
+                    raise
+                lost = True
+
+    def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
+        done = Event()
+        future.add_done_callback(lambda _: done.set())
+        if not done.wait(max(0.0, deadline - time.monotonic())):
+            raise DemandError(
+                "timeout", f"no answer on {self._action_name} within {self.timeout_s:g} s"
+            )
+        return future.result()
+
+
+class HeldDemand:
+    """A demand that is put at the start of a block, renewed meanwhile and given up at its end."""
+
+    def __init__(self, client: DemandClient, demand: str, put: Callable[[], Answer]) -> None:
+        self.id = demand
+        self.commit = ""
+        self.answer: Answer | None = None
+        self._client = client
+        self._put = put
+        self._over = Event()
+        self._keeper: Thread | None = None
+
+    def __enter__(self) -> HeldDemand:
+        """Put the demand and keep it."""
+        self.answer = self._put()
+        self.commit = self.answer.commit
+        if self.answer.lease_s:
+            self._keeper = Thread(
+                target=self._keep, args=(self.answer.lease_s,), name="demandops-lease", daemon=True
+            )
+            self._keeper.start()
+        return self
+
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+        """Give the demand up."""
+        self._over.set()
+        if self._keeper is not None:
+            self._keeper.join()
+        try:
+            self._client.release(self.id)
+        except DemandError as problem:
+            if kind is None and problem.code != "not-held":
+                raise
+            log.warning("demand %s was not released: %s", self.id, problem)
+
+    def _keep(self, lease_s: float) -> None:
+        pause = lease_s * _RENEW_AFTER
+        while not self._over.wait(pause):
+            pause = lease_s * _RENEW_AFTER
+            try:
+                self._client.renew(self.id)
+            except DemandError as problem:
+                if problem.code == "not-held":  # it ended while the link was down
+                    self._put_again()
+                else:
+                    log.warning("demand %s was not renewed: %s", self.id, problem)
+                    pause = min(pause, _RETRY_S)
+
+    def _put_again(self) -> None:
+        try:
+            self.answer = self._put()
+            self.commit = self.answer.commit
+        except DemandError as problem:
+            log.warning("demand %s ended and was not put again: %s", self.id, problem)

@@ -1,0 +1,125 @@
+"""``demandops demand``: send a demand over ROS 2, and hold it if asked to."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import click
+from demandops import strict_yaml
+from demandops.cli.output import console, errors, output_option, print_json
+from demandops.errors import InvalidInput, fault
+from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
+
+from demandops_ros.client import Answer, DemandClient, DemandError
+
+
+@click.command()
+@click.argument("file", metavar="FILE")
+@click.option("--hold", is_flag=True, help="Keep it until Ctrl-C, renewed, and then give it up.")
+@click.option("--release", is_flag=True, help="Give the demand of the file up instead.")
+@click.option("--renew", is_flag=True, help="Renew the demand of the file instead.")
+@click.option(
+    "--action",
+    default=DEFAULT_DEMAND_ACTION_NAME,
+    show_default=True,
+    metavar="NAME",
+    help="Where the node takes demands.",
+)
+@click.option(
+    "--timeout",
+    type=click.FloatRange(min=0, min_open=True),
+    default=60.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="How long to wait for the node and for an answer.",
+)
+@output_option
+def demand(
+    file: str, hold: bool, release: bool, renew: bool, action: str, timeout: float, output: str
+) -> None:
+    """Send a demand to a running node.
+
+    FILE is a YAML document of the kind Demand (docs/demand.md), or - for standard input. Exit code
+    1 where it is not honoured, with the node's reason.
+    """
+    if hold + release + renew > 1:
+        raise click.UsageError("--hold, --release and --renew exclude each other")
+    data = _document(file)
+    if release or renew:
+        kept = ("demand", "requesters", "request")
+        data = {name: value for name, value in data.items() if name in kept}
+        data["operation"] = "release" if release else "renew"
+    with DemandClient(action_name=action, timeout_s=timeout) as client:
+        try:
+            if hold:
+                _hold(client, data, output)
+            else:
+                _told(client.send(data, _stage(output)), output)
+        except DemandError as error:
+            raise InvalidInput([fault("", str(error), code=error.code).within(file)]) from None
+        except (ValueError, TypeError, AssertionError, AttributeError) as error:
+            raise InvalidInput([fault("", f"is no demand: {error}").within(file)]) from None
+
+
+def _document(file: str) -> dict[str, Any]:
+    name = "standard input" if file == "-" else file
+    try:
+        text = sys.stdin.read() if file == "-" else Path(file).read_text()
+        data = strict_yaml.load(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInput([fault("", f"cannot be read: {error}").within(name)]) from None
+    except InvalidInput as error:
+        raise InvalidInput(strict_yaml.faults_in(error, name)) from None
+    if not isinstance(data, dict) or data.get("kind") != "Demand":
+        message = "must be a mapping with kind: Demand"
+        raise InvalidInput([fault("kind", message).within(name)])
+    return data
+
+
+def _stage(output: str) -> Any:  # noqa: ANN401
+    quiet = output == "json"
+    return lambda stage, text: None if quiet else errors.print(text)
+
+
+def _told(answer: Answer, output: str) -> None:
+    if output == "json":
+        print_json(
+            {
+                "outcome": answer.outcome,
+                "commit": answer.commit,
+                "reached": answer.reached,
+                "lease": answer.lease_s or None,
+                "warnings": list(answer.warnings),
+            }
+        )
+        return
+    lease = f", holds for {answer.lease_s:g} s unless renewed" if answer.lease_s else ""
+    console().print(f"{answer.outcome} in {answer.commit}{lease}")
+    for warning in answer.warnings:
+        errors.print(f"warning: {warning}")
+
+
+def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
+    over = Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: over.set())
+    client.requesters = tuple(data.get("requesters", ()))
+    options = {name: data[name] for name in ("lease", "request", "answer") if name in data}
+    with client.demand(
+        str(data.get("demand", "")),
+        data.get("applications", ()),
+        data.get("connections", ()),
+        told=_stage(output),
+        **options,
+    ) as held:
+        if held.answer is not None:
+            _told(held.answer, output)
+        if output != "json":
+            errors.print("held until Ctrl-C")
+        over.wait()
+    if output != "json":
+        errors.print("given up")

@@ -1,0 +1,243 @@
+"""The ROS 2 node: action servers that hand demands to the generator.
+
+Many goals may be under way: each waits for its receipt without holding the executor. What the
+generator's worker thread tells (stages, receipts) is queued and handled in the executor's own
+thread, woken by a guard condition.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from threading import Thread
+from typing import Any
+
+from demandops.cluster.health import Level
+from demandops.cluster.rollout_status import RolloutStatus
+from demandops.errors import NotReached, QueueFull, ShuttingDown, Withdrawn
+from demandops.service import Generator, Receipt
+from demandops_interfaces.srv import GetBookkeeping
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.task import Future
+
+from demandops_ros.actions import DemandForm, DeploymentRequestForm, Form
+from demandops_ros.bookkeeping_topic import BookkeepingTopic, answer
+from demandops_ros.diagnostics import Diagnostics
+
+QUEUE_DEPTH = 2000
+"""Depth of the services' queues. With ROS's default of 10, goals that arrive together are lost."""
+
+DEEP = QoSProfile(
+    history=QoSHistoryPolicy.KEEP_LAST,
+    depth=QUEUE_DEPTH,
+    reliability=QoSReliabilityPolicy.RELIABLE,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """When goals are answered: those that cannot say at ``level``, none later than ``timeout_s``.
+
+    ``status`` tells what came of a demand, nothing without access to the clusters.
+    """
+
+    level: Level = "pushed"
+    timeout_s: float = 120.0
+    status: RolloutStatus | None = None
+
+
+class DemandNode(Node):  # type: ignore[misc]
+    """Serves ``DeploymentRequest`` and ``Demand`` for one state repo."""
+
+    def __init__(
+        self,
+        generator: Generator,
+        action_name: str,
+        demand_action_name: str,
+        answers: Answers,
+        **options: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__("demandops", **options)
+        self._generator = generator
+        self._answers = answers
+        self._open: dict[str, ServerGoalHandle] = {}
+        self._events: deque[Callable[[], None]] = deque()
+        self._stopping = False
+        # a group of its own: a service that waits for an event must not keep events from coming
+        self._wake = self.create_guard_condition(
+            self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
+        )
+        self._servers = [
+            self._serve(DeploymentRequestForm(), action_name),
+            self._serve(DemandForm(), demand_action_name),
+        ]
+        self.create_service(
+            GetBookkeeping,
+            "~/get_bookkeeping",
+            self._bookkeeping,
+            callback_group=ReentrantCallbackGroup(),
+        )
+        self._topic = BookkeepingTopic(self, generator, self._from_worker)
+        self._diagnostics = Diagnostics(self, generator)
+
+    def _serve(self, form: Form, name: str) -> ActionServer:
+        return ActionServer(
+            self,
+            form.action,
+            name,
+            execute_callback=partial(self._execute, form),
+            goal_callback=partial(self._admit, form),
+            cancel_callback=self._cancel,
+            goal_service_qos_profile=DEEP,
+            result_service_qos_profile=DEEP,
+            cancel_service_qos_profile=DEEP,
+            feedback_pub_qos_profile=DEEP,
+        )
+
+    def close(self) -> None:
+        """Stop what runs beside the executor."""
+        self._topic.close()
+
+    @property
+    def open_goals(self) -> int:
+        """How many goals have no result yet."""
+        return len(self._open)
+
+    def stop_accepting(self) -> None:
+        """Reject further goals; those under way go on."""
+        self._stopping = True
+
+    async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
+        """Answer from a thread of its own: an old revision may take seconds to read."""
+        done = Future(executor=self.executor)
+
+        def work() -> None:
+            filled = answer(self._generator, request, response)
+            self._from_worker(partial(done.set_result, filled))
+
+        Thread(target=work, name="demandops-bookkeeping", daemon=True).start()
+        return await done
+
+    # ---- callbacks of the action server, in the executor's thread ----
+
+    def _admit(self, form: Form, goal: Any) -> GoalResponse:  # noqa: ANN401
+        """Accept whatever can be decoded: a goal response carries no text to say why not."""
+        reason = "shutting down" if self._stopping else ""
+        if len(self._open) >= self._generator.queue_limit:
+            reason = "too many are waiting"
+            trouble = self._generator.condition.contact.trouble
+            reason += f" for the state repo: {trouble}" if trouble else ""
+        if reason:
+            self.get_logger().warning(f"goal '{form.name(goal)}' rejected: {reason}")
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
+
+    def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        """A demand can be taken back until it is committed."""
+        if self._generator.withdraw(_operation(handle)):
+            return CancelResponse.ACCEPT
+        return CancelResponse.REJECT
+
+    async def _execute(self, form: Form, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
+        operation = _operation(handle)
+        self._open[operation] = handle
+        done = Future(executor=self.executor)
+        try:
+            ticket = self._generator.submit(
+                form.data(handle.request),
+                operation,
+                lambda stage, text: self._from_worker(
+                    partial(self._feedback, form, handle, stage, text)
+                ),
+            )
+        except (ShuttingDown, QueueFull) as error:
+            return self._finish(form, handle, error)
+        ticket.future.add_done_callback(
+            lambda future: self._from_worker(partial(done.set_result, future))
+        )
+        outcome = (await done).exception() or ticket.future.result()
+        level = form.level(handle.request) or self._answers.level
+        if not isinstance(outcome, Receipt) or level == "pushed":
+            return self._finish(form, handle, outcome)
+        problem = self._unfollowed(outcome)
+        if problem:
+            outcome = replace(outcome, warnings=(*outcome.warnings, problem))
+            return self._finish(form, handle, outcome)
+        return self._finish(form, handle, await self._followed(form, handle, outcome, level), level)
+
+    def _unfollowed(self, receipt: Receipt) -> str:
+        """Return why it cannot be told what comes of a demand; empty where it can."""
+        if self._answers.status is None:
+            return "answered at pushed: this node has no access to the clusters"
+        problem = self._answers.status.reaches(target.place for target in receipt.targets)
+        return f"answered at pushed: {problem}" if problem else ""
+
+    async def _followed(
+        self, form: Form, handle: ServerGoalHandle, receipt: Receipt, level: Level
+    ) -> Receipt | NotReached:
+        """Wait until a demand is as far as asked, or its time is over."""
+        assert self._answers.status is not None  # noqa: S101 - the caller has looked
+        done = Future(executor=self.executor)
+        followed = self._answers.status.follow(
+            receipt.commit,
+            receipt.targets,
+            level,
+            self._answers.timeout_s,
+            lambda stage, text: self._from_worker(
+                partial(self._feedback, form, handle, stage, text)
+            ),
+        )
+        followed.add_done_callback(
+            lambda future: self._from_worker(partial(done.set_result, future.result()))
+        )
+        health = await done
+        if health.reaches(level):
+            return receipt
+        where = f"{health.object}: " if health.object else ""
+        return NotReached(level, f"{where}{health.reason}; it is booked in {receipt.commit}")
+
+    def _feedback(self, form: Form, handle: ServerGoalHandle, stage: str, text: str) -> None:
+        if handle.is_active:
+            handle.publish_feedback(form.feedback(stage, text))
+
+    def _finish(
+        self,
+        form: Form,
+        handle: ServerGoalHandle,
+        outcome: Receipt | BaseException,
+        reached: Level = "pushed",
+    ) -> Any:  # noqa: ANN401
+        self._open.pop(_operation(handle), None)
+        result = form.result(outcome, reached)
+        told = f"goal '{form.name(handle.request)}': "
+        if isinstance(outcome, Receipt):
+            handle.succeed()
+            self.get_logger().info(told + result.message)
+        elif isinstance(outcome, Withdrawn) and handle.is_cancel_requested:
+            handle.canceled()
+            self.get_logger().info(told + "cancelled")
+        else:
+            handle.abort()
+            self.get_logger().error(told + result.message)
+        return result
+
+    # ---- from the worker thread into the executor's ----
+
+    def _from_worker(self, event: Callable[[], None]) -> None:
+        self._events.append(event)
+        self._wake.trigger()
+
+    def _handle_events(self) -> None:
+        while self._events:
+            self._events.popleft()()
+
+
+def _operation(handle: ServerGoalHandle) -> str:
+    return str(uuid.UUID(bytes=bytes(handle.goal_id.uuid)))

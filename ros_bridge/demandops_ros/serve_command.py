@@ -1,0 +1,279 @@
+"""``demandops serve``: run the ROS 2 node until it is told to stop."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import tempfile
+import time
+from pathlib import Path
+from threading import Event, Thread
+from types import FrameType
+from typing import Any
+
+import click
+import rclpy
+from demandops.cli.output import errors, progress, signing_option
+from demandops.cluster import access, reconcile_trigger
+from demandops.cluster.rollout_status import RolloutStatus
+from demandops.service import Generator
+from demandops.service.push_listener import Webhook, read_secret
+from demandops.service.timing.polling import DEFAULT_INTERVAL, interval_s
+from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.logging import LoggingSeverity, set_logger_level
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from demandops_ros.actions import LEVELS
+from demandops_ros.node import Answers, DemandNode
+
+_OF_ANY_TYPE = ParameterDescriptor(dynamic_typing=True)
+_LEVELS = ("debug", "info", "warn", "error", "fatal")
+_POLL_S = 0.02
+_TASK_S = 5.0
+_FLUSH_S = 0.3
+_EXIT_INTERRUPTED = 130
+
+
+class _ToRos(logging.Handler):
+    """Brings what the generator logs into the node's log."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__()
+        self._log = node.get_logger()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log a record at the level that ROS has for it."""
+        text = self.format(record)
+        if record.levelno >= logging.ERROR:
+            self._log.error(text)
+        elif record.levelno >= logging.WARNING:
+            self._log.warning(text)
+        else:
+            self._log.info(text)
+
+
+@click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+@click.option(
+    "--state-repo",
+    envvar="DEMANDOPS_STATE_REPO",
+    metavar="URL_OR_DIR",
+    help="The state repo: a folder with a bare repository, or a URL that git clones; also the ROS "
+    "parameter state_repo [env: DEMANDOPS_STATE_REPO].",
+)
+@click.option(
+    "--clusters",
+    "access_file",
+    envvar="DEMANDOPS_CLUSTERS",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="How the clusters are reached, to wake them after a push and to hear what came of a "
+    "demand; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
+)
+@click.option(
+    "--fetch-interval",
+    metavar="DURATION",
+    help="How often to look for what people pushed while no demand comes, 30s for one; 0 for "
+    f"never. Default: {DEFAULT_INTERVAL}; also the ROS parameter fetch_interval.",
+)
+@click.option(
+    "--webhook",
+    metavar="HOST:PORT",
+    help="Hear of pushes there, and look at once: POST /push by GitHub, GitLab, Gitea or Forgejo; "
+    "see docs/operations.md. Off by default.",
+)
+@click.option(
+    "--webhook-secret-file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="The secret that the webhook's notifications are signed with; needed unless it listens "
+    "on this machine alone.",
+)
+@signing_option
+@click.pass_context
+def serve(
+    ctx: click.Context,
+    state_repo: str | None,
+    access_file: Path | None,
+    fetch_interval: str | None,
+    webhook: str | None,
+    webhook_secret_file: Path | None,
+    signing_key: Path | None,
+) -> None:
+    """Run the ROS 2 node that takes demands over the actions DeploymentRequest and Demand.
+
+    Everything after --ros-args goes to ROS. Parameters: action_name (of DeploymentRequest),
+    demand_action_name, answer (of DeploymentRequest: pushed, reconciled or healthy), answer_timeout
+    (seconds), state_repo, fetch_interval, log_level (debug, info, warn, error or fatal). Stop it
+    with Ctrl-C or SIGTERM: it finishes what it has in hand.
+    """
+    ros_args = list(ctx.args)
+    if ros_args and ros_args[0] != "--ros-args":
+        raise click.UsageError(f"unexpected argument {ros_args[0]}; ROS's own follow --ros-args")
+    if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
+        # a container without a home: ROS's log library would refuse to start
+        os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
+    rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        settings = _parameters(state_repo, fetch_interval)
+        secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
+        clusters = access.read(access_file).clusters if access_file else {}
+        with progress("reading the ledger") as tell:
+            generator = Generator(
+                settings["state_repo"],
+                progress=tell,
+                with_targets=bool(clusters),
+                fetch_interval=interval_s(settings["fetch_interval"]),
+                signing_key=signing_key,
+            )
+        waker = reconcile_trigger.ReconcileTrigger(clusters, generator.changed)
+        generator.watch(waker)
+        waker(generator.snapshot.state.config)  # an earlier run may have ended right after a push
+        hook = Webhook(webhook, secret, generator.look) if webhook else None
+        status = RolloutStatus(clusters, generator) if clusters else None
+        _run(generator, settings, status, hook)
+        waker.close()
+    finally:
+        rclpy.try_shutdown()
+
+
+def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
+    """Read the node's parameters before it exists, for it needs the state repo to begin with."""
+    probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
+    try:
+        values = {
+            "action_name": probe.declare_parameter("action_name", DEFAULT_ACTION_NAME).value,
+            "demand_action_name": probe.declare_parameter(
+                "demand_action_name", DEFAULT_DEMAND_ACTION_NAME
+            ).value,
+            "answer": probe.declare_parameter("answer", LEVELS[0]).value,
+            "answer_timeout": probe.declare_parameter("answer_timeout", 120.0).value,
+            "state_repo": probe.declare_parameter("state_repo", state_repo or "").value,
+            "fetch_interval": _as_told(
+                probe.declare_parameter(
+                    "fetch_interval", fetch_interval or DEFAULT_INTERVAL, _OF_ANY_TYPE
+                ).value
+            ),
+            "log_level": probe.declare_parameter("log_level", "info").value,
+        }
+    finally:
+        probe.destroy_node()
+    if not values["state_repo"]:
+        raise click.UsageError(
+            "which state repo? give --state-repo URL_OR_DIR, set DEMANDOPS_STATE_REPO, or the ROS "
+            "parameter state_repo"
+        )
+    try:
+        interval_s(values["fetch_interval"])
+    except ValueError as error:
+        raise click.UsageError(f"fetch interval: {error}") from None
+    if values["answer"] not in LEVELS:
+        raise click.UsageError(
+            f"parameter answer is '{values['answer']}'; it takes {', '.join(LEVELS)}"
+        )
+    if values["log_level"] not in _LEVELS:
+        raise click.UsageError(
+            f"parameter log_level is '{values['log_level']}'; it takes {', '.join(_LEVELS)}"
+        )
+    return values
+
+
+def _as_told(value: object) -> str:
+    """Return a parameter as text: ROS reads 30 as a number and 30s as text."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _run(
+    generator: Generator,
+    settings: dict[str, Any],
+    status: RolloutStatus | None,
+    hook: Webhook | None,
+) -> None:
+    node = DemandNode(
+        generator,
+        settings["action_name"],
+        settings["demand_action_name"],
+        Answers(settings["answer"], settings["answer_timeout"], status),
+    )
+    for name, value in settings.items():
+        shown = generator.address if name == "state_repo" else value
+        # read when the node starts; a change of them now would do nothing, so none is taken
+        of_any_type = name == "fetch_interval"
+        descriptor = ParameterDescriptor(read_only=True, dynamic_typing=of_any_type)
+        node.declare_parameter(name, shown, descriptor)
+    set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
+    library_log = logging.getLogger("demandops")
+    library_log.handlers, library_log.propagate = [_ToRos(node)], False
+    library_log.setLevel(logging.DEBUG)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    signals = _Signals()
+    # the executor spins in a thread: the main thread is free to notice a signal at once
+    spinner = Thread(target=executor.spin, name="demandops-executor")
+    spinner.start()
+    names = f"{settings['action_name']} and {settings['demand_action_name']}"
+    node.get_logger().info(f"taking demands on {names} for {generator.address}")
+    if hook is not None:
+        node.get_logger().info(f"hearing of pushes at {hook.url}")
+    signals.wait()
+    if hook is not None:
+        hook.close()
+    _drain(executor, node, generator, status)
+    executor.shutdown(timeout_sec=1)
+    spinner.join(5)
+    node.close()
+    node.destroy_node()
+
+
+def _drain(
+    executor: SingleThreadedExecutor,
+    node: DemandNode,
+    generator: Generator,
+    status: RolloutStatus | None,
+) -> None:
+    """Finish what is in hand: goals under way get their results before the node goes."""
+    node.stop_accepting()
+    node.get_logger().info(f"stopping: finishing {node.open_goals} goals in hand")
+    finished = generator.stop()
+    published = finished.result()
+    if status is not None:
+        status.close()  # goals that wait for their clusters are answered with what is known
+    while node.open_goals:
+        time.sleep(_POLL_S)
+    for _ in range(2):  # results leave by tasks of the executor: let those in it pass
+        passed = Event()
+        executor.create_task(passed.set)
+        passed.wait(_TASK_S)
+    time.sleep(_FLUSH_S)  # and clients ask for them
+    if not published:
+        node.get_logger().warning("the outbox is not empty; it is taken up at the next start")
+
+
+class _Signals:
+    """Ctrl-C and SIGTERM ask to stop; a second one stops at once.
+
+    The kernel may hand a signal to any thread. Python writes it to the wake-up pipe in whichever,
+    so the main thread, which reads there, learns of it at once.
+    """
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._read, write = os.pipe()
+        os.set_blocking(write, False)
+        signal.set_wakeup_fd(write)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._handle)
+
+    def wait(self) -> None:
+        """Return when the process was told to stop."""
+        while not self._asked:
+            os.read(self._read, 1)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self._asked:
+            errors.print("stopped at once; what was not published is in the outbox")
+            os._exit(_EXIT_INTERRUPTED)
+        self._asked = True
