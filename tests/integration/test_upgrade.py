@@ -348,7 +348,7 @@ def test_a_state_repo_that_never_stands_still_is_told(
     state: StateRepo, monkeypatch: pytest.MonkeyPatch, upgraded: Callable[..., Ran]
 ) -> None:
     monkeypatch.setattr(upgrade, "_PAUSE_S", 0)
-    monkeypatch.setattr(upgrade.Line, "publish", lambda self: False)
+    monkeypatch.setattr(upgrade.CommitLine, "publish", lambda self: False)
     before = state.tip
     ran = upgraded("--gitops", "argocd")
     assert (ran.code, state.tip) == (1, before)
