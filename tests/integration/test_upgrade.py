@@ -74,11 +74,12 @@ def newer(newer_program: Path, state: StateRepo, data_home: Path) -> Run:
     def call(*args: str, stdin: str = "") -> Ran:
         command = [sys.executable, "-m", "demandops.cli.main", *args]
         options = ["--state-repo", str(state.path)] if args[0] != "init" else []
+        roots = (newer_program / "generator", newer_program / "ros_bridge")
         done = subprocess.run(
             [*command, *options],
             cwd=newer_program,
             input=stdin,
-            env=os.environ,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, roots))},
             capture_output=True,
             text=True,
             check=False,

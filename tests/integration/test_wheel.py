@@ -55,7 +55,7 @@ def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
             for p in (ROOT / folder).rglob("*")
             if p.is_file()
         }
-        prefix = f"generator/_data/{packaged}/"
+        prefix = f"demandops/_data/{packaged}/"
         assert {n.removeprefix(prefix) for n in names if n.startswith(prefix)} == files
     assert not [name for name in names if name.startswith(("tests/", "examples/", "docs/"))]
 
@@ -79,8 +79,9 @@ def test_a_demand_is_rendered_from_the_installed_wheel(wheel: Path, tmp_path: Pa
 
     where = tmp_path / "env" / "bin" / "python"
     found = subprocess.run(
-        [str(where), "-c", "import generator; print(generator.__file__)"],
+        [str(where), "-c", "import demandops; print(demandops.__file__)"],
         cwd=tmp_path,
+        env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
         capture_output=True,
         text=True,
         check=True,
