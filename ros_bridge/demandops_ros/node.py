@@ -16,7 +16,7 @@ from threading import Thread
 from typing import Any
 
 from demandops.cluster.health import Level
-from demandops.cluster.rollout_status import RolloutStatus
+from demandops.cluster.rollout_watcher import RolloutStatus
 from demandops.errors import NotReached, QueueFull, ShuttingDown, Withdrawn
 from demandops.service import Generator, Receipt
 from demandops_interfaces.srv import GetBookkeeping

@@ -16,7 +16,7 @@ import click
 import rclpy
 from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
-from demandops.cluster.rollout_status import RolloutStatus
+from demandops.cluster.rollout_watcher import RolloutStatus
 from demandops.service import Generator
 from demandops.service.push_listener import Webhook, read_secret
 from demandops.service.timing.polling import DEFAULT_INTERVAL, interval_s

@@ -9,7 +9,7 @@ from demandops.errors import Fault, InvalidInput
 from demandops.plan.checks import trial_demands
 from demandops.plan.release import ServiceRelease
 from demandops.render.engine import Engine
-from demandops.render.gitops import controller
+from demandops.render.gitops import manifests
 
 
 def rehearse(config: Config, engine: Engine) -> None:
@@ -39,7 +39,7 @@ def _tried(releases: Iterable[ServiceRelease], config: Config, engine: Engine) -
     faults: list[Fault] = []
     for release in releases:
         try:
-            controller.render(release, config, engine)
+            manifests.render(release, config, engine)
         except InvalidInput as error:
             faults += error.faults
     return faults

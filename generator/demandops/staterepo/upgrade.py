@@ -27,7 +27,7 @@ from demandops.ledger import ended_override_file
 from demandops.plan.overrides.lifecycle import TakenIn, taken_in
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import releases_of
-from demandops.render.gitops.handover import Handover, handover
+from demandops.render.gitops.controller_switch import Handover, handover
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo import reader
 from demandops.staterepo.git import tree as trees

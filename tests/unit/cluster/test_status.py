@@ -7,7 +7,7 @@ from pathlib import Path
 
 from demandops.cluster.access import ClusterAccess
 from demandops.cluster.health import Place, Target
-from demandops.cluster.rollout_status import RolloutStatus
+from demandops.cluster.rollout_watcher import RolloutStatus
 
 from tests.unit.cluster.commits import Letters
 

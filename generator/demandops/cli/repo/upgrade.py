@@ -18,7 +18,7 @@ from demandops.cli.output import (
     signing_option,
     state_repo_option,
 )
-from demandops.render.gitops.handover import Step
+from demandops.render.gitops.controller_switch import Step
 from demandops.staterepo import upgrade as upgrading
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.upgrade import Upgrade, UpgradeRequest

@@ -7,7 +7,7 @@ repo may go over from one to the other while demands are followed.
 from __future__ import annotations
 
 from demandops.cluster.health import argocd, flux
-from demandops.cluster.health.health import (
+from demandops.cluster.health.model import (
     Health,
     History,
     Key,

@@ -8,7 +8,7 @@ form: ``status.sync.comparedTo`` says of which.
 from __future__ import annotations
 
 from demandops.cluster.health.deployment import condition, of_client, of_deployment
-from demandops.cluster.health.health import (
+from demandops.cluster.health.model import (
     Health,
     History,
     Named,

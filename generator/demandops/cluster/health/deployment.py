@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from demandops.cluster.health.health import Health, Object, Objects, Target
+from demandops.cluster.health.model import Health, Object, Objects, Target
 
 
 def of_deployment(found: Object) -> Health:

@@ -7,7 +7,7 @@ Objects are plain data as the Kubernetes API gives them. Field names as of Flux 
 from __future__ import annotations
 
 from demandops.cluster.health.deployment import condition, of_client, of_deployment
-from demandops.cluster.health.health import Health, History, Object, Objects, Place, Target, Watched
+from demandops.cluster.health.model import Health, History, Object, Objects, Place, Target, Watched
 
 _HELM_NAME = "helm.toolkit.fluxcd.io/name"
 

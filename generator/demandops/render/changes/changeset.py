@@ -18,9 +18,9 @@ from demandops.ledger.apply import ClaimChange, Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey
-from demandops.render import override_marks
+from demandops.render import release_file
 from demandops.render.engine import Engine
-from demandops.render.gitops import controller
+from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 from demandops.render.output_check import check_files
 
@@ -88,7 +88,7 @@ def of_change(
             files[old_path] = None
         standing = read(new_path) if new_path else None
         waiting += _waiting(old, new) if standing is not None else ()
-        text = override_marks.text_of(new, config, engine, standing) if new else None
+        text = release_file.text_of(new, config, engine, standing) if new else None
         if new_path and text != standing:
             files[new_path] = text
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
@@ -113,13 +113,13 @@ def render_all(
     Args:
         standing: the generated files as they are, of which overrides may hold some.
     """
-    files = controller.standing_files(config, engine)
+    files = manifests.standing_files(config, engine)
     for key in keys:
         release = plan(ledger, config, key)
         if release is not None:
             path = path_of(release)
-            files[path] = override_marks.text_of(release, config, engine, standing.get(path))
-    return files | override_marks.charts_kept(files, standing, config)
+            files[path] = release_file.text_of(release, config, engine, standing.get(path))
+    return files | release_file.charts_kept(files, standing, config)
 
 
 def _plan_leniently(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:

@@ -23,7 +23,7 @@ from demandops.render.changes.changeset import ReleaseChange, described
 from demandops.render.changes.data_diff import leaves
 from demandops.render.changes.override_suggestion import value_of
 from demandops.render.engine import Engine
-from demandops.render.gitops import controller
+from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 
 _MOST_FACTS = 20
@@ -83,7 +83,7 @@ def faults(
         try:
             release = plan(ledger, config, key)
             if release is not None:
-                controller.render(release, config, engine)
+                manifests.render(release, config, engine)
         except InvalidInput as error:
             asking = asking or _claim_files(ledger, config)
             found += _located(error.faults, asking.get(key, []), edited)

@@ -12,7 +12,7 @@ from demandops.config.override import OVERRIDES_ROOT
 from demandops.errors import Fault, fault
 from demandops.ledger import claim_file as ledger_format
 from demandops.plan.release import Release
-from demandops.render.changes import merge_preview as consequences
+from demandops.render.changes import merge_preview
 from demandops.render.changes.override_suggestion import Suggestion, fits_too, suggest
 from demandops.render.gitops.paths import BOOTSTRAP_ROOT, path_of
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
@@ -78,7 +78,7 @@ def _fits(release: Release | None, other: Release) -> bool:
 def _by_path(base: Base) -> dict[str, Release]:
     if base.state is None:
         return {}
-    known = consequences.releases_of(base.state.ledger, base.state.config)
+    known = merge_preview.releases_of(base.state.ledger, base.state.config)
     return {path_of(release): release for release in known.values()}
 
 

@@ -13,7 +13,7 @@ from demandops.config.config import Config
 from demandops.config.override import Override, written
 from demandops.plan.release import Release
 from demandops.render.engine import Engine
-from demandops.render.gitops import controller
+from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 
 _START = "# override overrides/"
@@ -34,12 +34,12 @@ def text_of(release: Release, config: Config, engine: Engine, standing: str | No
     """
     shaping = release.shaping
     if not shaping.held:
-        body = controller.render(release, config, engine)
+        body = manifests.render(release, config, engine)
         return _commented([line(one, effects) for one, effects in shaping.by], body)
     now = [line(one, effects) for one, effects in shaping.by if _OF_NOW & {*effects}]
     if standing is None:
         then = [line(one, effects) for one, effects in shaping.by if not _OF_NOW & {*effects}]
-        return _commented([*now, *then], controller.render(release, config, engine))
+        return _commented([*now, *then], manifests.render(release, config, engine))
     then, body = split(standing)
     return _commented([*now, *(one for one in then if not _TOLD_ANEW.match(one))], body)
 
