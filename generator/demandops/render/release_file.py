@@ -23,7 +23,7 @@ _TOLD_ANEW = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
-def text_of(release: Release, config: Config, engine: Engine, standing: str | None) -> str:
+def release_text(release: Release, config: Config, engine: Engine, standing: str | None) -> str:
     """Return the file of a release: rendered, or as it stands where an override holds it.
 
     Args:
@@ -35,12 +35,16 @@ def text_of(release: Release, config: Config, engine: Engine, standing: str | No
     shaping = release.shaping
     if not shaping.held:
         body = manifests.render(release, config, engine)
-        return _commented([line(one, effects) for one, effects in shaping.by], body)
-    now = [line(one, effects) for one, effects in shaping.by if _OF_NOW & {*effects}]
+        return _commented([override_comment(one, effects) for one, effects in shaping.by], body)
+    now = [override_comment(one, effects) for one, effects in shaping.by if _OF_NOW & {*effects}]
     if standing is None:
-        then = [line(one, effects) for one, effects in shaping.by if not _OF_NOW & {*effects}]
+        then = [
+            override_comment(one, effects)
+            for one, effects in shaping.by
+            if not _OF_NOW & {*effects}
+        ]
         return _commented([*now, *then], manifests.render(release, config, engine))
-    then, body = split(standing)
+    then, body = split_comments(standing)
     return _commented([*now, *(one for one in then if not _TOLD_ANEW.match(one))], body)
 
 
@@ -48,7 +52,7 @@ def _commented(lines: list[str], body: str) -> str:
     return "".join(f"{one}\n" for one in lines) + body
 
 
-def line(override: Override, effects: tuple[str, ...]) -> str:
+def override_comment(override: Override, effects: tuple[str, ...]) -> str:
     """Return the comment line for an override."""
     until = f"until {written(override.end)}; " if override.end else ""
     return (
@@ -57,7 +61,7 @@ def line(override: Override, effects: tuple[str, ...]) -> str:
     )
 
 
-def split(text: str) -> tuple[list[str], str]:
+def split_comments(text: str) -> tuple[list[str], str]:
     """Return the comment lines above a file's body, and the body."""
     lines = text.splitlines(keepends=True)
     count = 0
@@ -66,7 +70,7 @@ def split(text: str) -> tuple[list[str], str]:
     return [one.rstrip("\n") for one in lines[:count]], "".join(lines[count:])
 
 
-def charts_kept(
+def kept_charts(
     files: Mapping[str, str], standing: Mapping[str, str], config: Config
 ) -> dict[str, str]:
     """Return the chart sources that would go although a held release may still be from them.

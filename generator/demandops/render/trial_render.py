@@ -12,7 +12,7 @@ from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
 
 
-def rehearse(config: Config, engine: Engine) -> None:
+def render_trial_demands(config: Config, engine: Engine) -> None:
     """Render every service of every appdef once, for invented claims on a real node.
 
     An appdef that nobody has demanded yet is checked before the first demand comes, and so is what

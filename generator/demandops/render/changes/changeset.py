@@ -26,7 +26,7 @@ from demandops.render.output_check import check_files
 
 Change = Literal["start", "change", "stop"]
 
-Read = Callable[[str], str | None]
+FileReader = Callable[[str], str | None]
 """Returns the text of a file of the state repo, or nothing where there is none."""
 
 
@@ -36,7 +36,7 @@ class ReleaseChange:
 
     name: str
     change: Change
-    what: str
+    description: str
     details: tuple[str, ...]
 
 
@@ -48,16 +48,16 @@ class Changeset:
     releases: tuple[ReleaseChange, ...]
     overrides: tuple[str, ...] = ()
     """The files of the overrides that shaped what is written."""
-    waiting: tuple[str, ...] = ()
+    blocked: tuple[str, ...] = ()
     """What does not reach a release, for an override holds it."""
 
 
-def of_change(
+def build_changeset(
     before: Ledger,
     after: Ledger,
     claims: Iterable[ClaimChange],
     keys: Iterable[ReleaseKey],
-    world: tuple[Config, Engine, Read],
+    context: tuple[Config, Engine, FileReader],
 ) -> Changeset:
     """Return what it takes to get from one ledger to the other.
 
@@ -65,12 +65,12 @@ def of_change(
         before, after: the ledgers.
         claims: the claims that differ.
         keys: the releases that may differ (:func:`demandops.plan.planner.affected`).
-        world: the configuration, its engine and how to read the state repo as it is.
+        context: the configuration, its engine and how to read the state repo as it is.
 
     Raises:
         Refused, InvalidInput: where a release cannot be planned or rendered.
     """
-    config, engine, read = world
+    config, engine, read = context
     files: dict[str, str | None] = {
         ledger_format.path_of(change.key): ledger_format.write(change.after)
         if change.after
@@ -79,7 +79,7 @@ def of_change(
     }
     releases = []
     shaped: set[str] = set()
-    waiting: list[str] = []
+    blocked: list[str] = []
     for key in keys:
         old, new = _plan_leniently(before, config, key), plan(after, config, key)
         old_path = path_of(old) if old else None
@@ -87,18 +87,18 @@ def of_change(
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
         standing = read(new_path) if new_path else None
-        waiting += _waiting(old, new) if standing is not None else ()
-        text = release_file.text_of(new, config, engine, standing) if new else None
+        blocked += _blocked(old, new) if standing is not None else ()
+        text = release_file.release_text(new, config, engine, standing) if new else None
         if new_path and text != standing:
             files[new_path] = text
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
         if text is not None and text == standing:
             continue
         if old or new:
-            releases.append(described(old, new, standing is not None))
+            releases.append(describe_change(old, new, standing is not None))
     check_files(files)
     told = tuple(sorted(releases, key=_order))
-    return Changeset(files, told, tuple(sorted(shaped)), tuple(waiting))
+    return Changeset(files, told, tuple(sorted(shaped)), tuple(blocked))
 
 
 def render_all(
@@ -113,17 +113,17 @@ def render_all(
     Args:
         standing: the generated files as they are, of which overrides may hold some.
     """
-    files = manifests.standing_files(config, engine)
+    files = manifests.base_files(config, engine)
     for key in keys:
         release = plan(ledger, config, key)
         if release is not None:
             path = path_of(release)
-            files[path] = release_file.text_of(release, config, engine, standing.get(path))
-    return files | release_file.charts_kept(files, standing, config)
+            files[path] = release_file.release_text(release, config, engine, standing.get(path))
+    return files | release_file.kept_charts(files, standing, config)
 
 
 def _plan_leniently(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
-    """Plan what stood; where that is no longer possible there is nothing to compare with."""
+    """Plan what existed; where that is no longer possible there is nothing to compare with."""
     try:
         return plan(ledger, config, key)
     except Refused:
@@ -134,8 +134,8 @@ def _order(change: ReleaseChange) -> tuple[int, str]:
     return ["start", "change", "stop"].index(change.change), change.name
 
 
-def described(old: Release | None, new: Release | None, stood: bool) -> ReleaseChange:
-    """Return in words what becomes of a release; ``stood``: there is a file of it."""
+def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
+    """Return in words what becomes of a release; ``existed``: there is a file of it."""
     release = new or old
     assert release is not None  # noqa: S101 - the caller has one of them
     if isinstance(release, ServiceRelease):
@@ -147,7 +147,7 @@ def described(old: Release | None, new: Release | None, stood: bool) -> ReleaseC
         what = f"{release.type.name} {release.side} of connection {release.connection}"
         what += f" on {release.node.id}"
     kind: Change = "stop" if not new else "start"
-    if new and stood:
+    if new and existed:
         kind = "change"
     details = _differences(old, new) if kind == "change" else ()
     return ReleaseChange(release.name, kind, what, details)
@@ -163,7 +163,7 @@ def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
     return (*gone, *come)
 
 
-def _waiting(old: Release | None, new: Release | None) -> Iterator[str]:
+def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
     """Yield a warning where a release that is held would otherwise change."""
     if new is None or not new.shaping.held or _facts(old) == _facts(new):
         return

@@ -15,7 +15,7 @@ from demandops.ledger.apply import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import all_keys
-from demandops.render.changes.changeset import Change, described
+from demandops.render.changes.changeset import Change, describe_change
 
 _MOST_LINES = 12
 
@@ -29,7 +29,7 @@ class ReleaseDifference:
 
     name: str
     change: Change
-    what: str
+    description: str
     path: str
     details: tuple[str, ...]
 
@@ -75,13 +75,13 @@ def _difference(
     was = next((path for path, sides in at.items() if sides[0] is not None), None)
     now = next((path for path, sides in at.items() if sides[1] is not None), None)
     change: Change = "start" if was is None else "stop" if now is None else "change"
-    told = described(old, new, was is not None)
+    told = describe_change(old, new, was is not None)
     details = told.details if change == "change" and told.change == "change" else ()
     if was and now and was != now:
         details = (f"- {was}", f"+ {now}", *details)
     if change == "change" and not details and now:
         details = tuple(_lines(*at[now]))
-    return ReleaseDifference(name, change, told.what, now or was or "", details)
+    return ReleaseDifference(name, change, told.description, now or was or "", details)
 
 
 def _lines(before: str | None, after: str | None) -> Iterator[str]:

@@ -9,15 +9,15 @@ ABSENT = object()
 """Stands for a value that is not there."""
 
 
-def leaves(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
+def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
     """Yield (path, old, new) of the smallest parts that differ, as ``spec.values.image.tag``."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
             inner = f"{path}.{key}" if path else str(key)
-            yield from leaves(old.get(key, ABSENT), new.get(key, ABSENT), inner)
+            yield from leaf_differences(old.get(key, ABSENT), new.get(key, ABSENT), inner)
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for index, (left, right) in enumerate(zip(old, new, strict=True)):
-            yield from leaves(left, right, f"{path}[{index}]")
+            yield from leaf_differences(left, right, f"{path}[{index}]")
     elif type(old) is not type(new) or old != new:
         yield path, old, new
 
@@ -31,6 +31,6 @@ def merge_patch(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
             inner = merge_patch(was, value)
             if inner:
                 patch[key] = inner
-        elif next(leaves(was, value), None) is not None:
+        elif next(leaf_differences(was, value), None) is not None:
             patch[key] = value
     return patch

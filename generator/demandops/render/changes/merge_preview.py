@@ -19,9 +19,9 @@ from demandops.ledger.apply import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of
-from demandops.render.changes.changeset import ReleaseChange, described
-from demandops.render.changes.data_diff import leaves
-from demandops.render.changes.override_suggestion import value_of
+from demandops.render.changes.changeset import ReleaseChange, describe_change
+from demandops.render.changes.data_diff import leaf_differences
+from demandops.render.changes.override_suggestion import short_value
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
@@ -56,7 +56,7 @@ class MergePreview:
     files: tuple[FileChange, ...]
 
 
-def releases_of(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release]:
+def planned_releases(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release]:
     """Return what runs; what cannot be planned any more is passed over."""
     found: dict[ReleaseKey, Release] = {}
     for key in all_keys(ledger, config):
@@ -69,7 +69,7 @@ def releases_of(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release]:
     return found
 
 
-def faults(
+def render_faults(
     ledger: Ledger, config: Config, engine: Engine, edited: Collection[str] = ()
 ) -> list[Fault]:
     """Return what keeps releases from being planned or rendered, of all of them.
@@ -109,7 +109,7 @@ def _located(
         yield replace(found, file=place)
 
 
-def consequence(
+def preview(
     old: Mapping[ReleaseKey, Release],
     new: Mapping[ReleaseKey, Release],
     standing: Mapping[str, str],
@@ -135,7 +135,7 @@ def consequence(
         if before not in touched and after not in touched:
             continue
         stands = standing.get(before or after or "")
-        change = described(was, will, stands is not None)
+        change = describe_change(was, will, stands is not None)
         if change.change == "change" and not change.details:
             facts = _facts(stands or "", files.get(after or "", ""))
             change = replace(change, details=tuple(facts))
@@ -149,11 +149,11 @@ def _facts(before: str, after: str) -> Iterator[str]:
     """Yield what differs in a manifest, for a change that the plan has no words for."""
     try:
         differing = list(
-            leaves(list(strict_yaml.load_all(before)), list(strict_yaml.load_all(after)))
+            leaf_differences(list(strict_yaml.load_all(before)), list(strict_yaml.load_all(after)))
         )
     except InvalidInput:
         return
     for path, old, new in differing[:_MOST_FACTS]:
-        yield f"{path.removeprefix('[0].')}: {value_of(old)} → {value_of(new)}"
+        yield f"{path.removeprefix('[0].')}: {short_value(old)} → {short_value(new)}"
     if len(differing) > _MOST_FACTS:
         yield f"and {len(differing) - _MOST_FACTS} more"

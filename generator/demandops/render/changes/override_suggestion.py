@@ -15,7 +15,7 @@ from demandops.config.config import Config
 from demandops.config.registry import Image
 from demandops.errors import InvalidInput
 from demandops.plan.release import Bridge, Release, ServiceRelease
-from demandops.render.changes.data_diff import ABSENT, leaves, merge_patch
+from demandops.render.changes.data_diff import ABSENT, leaf_differences, merge_patch
 from demandops.render.gitops.flux import chart_object
 from demandops.settings import API_VERSION
 
@@ -40,8 +40,8 @@ class Suggestion:
     path: str
     name: str
     text: str
-    left: tuple[str, ...] = ()
-    also: tuple[str, ...] = ()
+    not_covered: tuple[str, ...] = ()
+    other_releases: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
@@ -54,7 +54,7 @@ class _Effects:
     replicas: int | None = None
     hold: bool = False
     deny: bool = False
-    left: list[str] = field(default_factory=list)
+    not_covered: list[str] = field(default_factory=list)
 
     def data(self) -> dict[str, Any]:
         found = {
@@ -68,7 +68,7 @@ class _Effects:
         return given if self.replicas is None else given | {"replicas": self.replicas}
 
 
-def suggest(
+def suggest_override(
     path: str, texts: tuple[str, str | None], release: Release, config: Config, owner: str
 ) -> Suggestion | None:
     """Return the override for an edit, or nothing where none does any of it.
@@ -105,10 +105,10 @@ def suggest(
             **effects.data(),
         }
     )
-    return Suggestion(path, release.name, text, tuple(effects.left))
+    return Suggestion(path, release.name, text, tuple(effects.not_covered))
 
 
-def fits_too(release: Release, other: Release) -> bool:
+def same_override_fits(release: Release, other: Release) -> bool:
     """Tell whether the override for one release would fit another as well."""
     if not (isinstance(release, ServiceRelease) and isinstance(other, ServiceRelease)):
         return False
@@ -141,7 +141,7 @@ def _of_service(
         replicas = effects.values.get("replicas")
         if was.get("replicas") == release.replicas and type(replicas) is int and replicas >= 0:
             effects.replicas = effects.values.pop("replicas")
-    for path, left, right in leaves(old, new):
+    for path, left, right in leaf_differences(old, new):
         place = path.removeprefix("[0].")
         if place == "spec.chartRef.name":
             chart = release.service.chart
@@ -155,9 +155,9 @@ def _of_service(
             effects.hold = True
             continue
         if not any(place == one or place.startswith((f"{one}.", f"{one}[")) for one in done):
-            effects.left.append(place)
+            effects.not_covered.append(place)
     if effects.hold:  # what is held stays as it is rendered, so nothing else goes with it
-        effects.left += [name for name in effects.data() if name != "hold"]
+        effects.not_covered += [name for name in effects.data() if name != "hold"]
         effects.values, effects.images = {}, {}
         effects.version, effects.replicas = "", None
 
@@ -197,13 +197,13 @@ def _take_images(
 def _of_client(old: list[Any], new: list[Any], config: Config, effects: _Effects) -> None:
     """Read the edit of plain manifests: their image is all that an override changes there."""
     by_reference = {image.reference(): (name, image) for name, image in config.images.items()}
-    for path, left, right in leaves(old, new):
+    for path, left, right in leaf_differences(old, new):
         found = by_reference.get(left) if path.endswith(".image") else None
         pin = _pin(right, found[1]) if found else None
         if found and pin:
             effects.images[found[0]] = pin
         else:
-            effects.left.append(_place(path, old))
+            effects.not_covered.append(_place(path, old))
 
 
 def _place(path: str, documents: list[Any]) -> str:
@@ -224,6 +224,6 @@ def _pin(reference: object, image: Image) -> dict[str, str] | None:
     return pin if pin.keys() & {"tag", "digest"} else None
 
 
-def value_of(value: object) -> str:
+def short_value(value: object) -> str:
     """Return a value of a manifest in few words, for a person."""
     return "nothing" if value is ABSENT else strict_yaml.brief(value)

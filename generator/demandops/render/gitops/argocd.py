@@ -48,7 +48,7 @@ def render(
     )
 
 
-def standing_files(config: Config, engine: Engine) -> dict[str, str]:
+def base_files(config: Config, engine: Engine) -> dict[str, str]:
     """Return bootstrap files, and for each access domain a placeholder."""
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)

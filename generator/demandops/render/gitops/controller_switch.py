@@ -26,28 +26,28 @@ class Step:
     """One thing to do, and the commands that do it on one cluster."""
 
     cluster: str
-    what: str
+    description: str
     commands: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Handover:
+class SwitchSteps:
     """What to do on the clusters before the state repo changes, and after."""
 
     before: tuple[Step, ...] = ()
     after: tuple[Step, ...] = ()
 
 
-def handover(old: Config, new: Config) -> Handover:
+def switch_steps(old: Config, new: Config) -> SwitchSteps:
     """Return what is to be done for a state repo to go from one controller to the other.
 
     Nothing is deleted on the way: docs/argocd.md has the reasons, and the end-to-end tests do it.
     """
     if old.repository.gitops == new.repository.gitops:
-        return Handover()
+        return SwitchSteps()
     if new.repository.gitops == "argocd":
-        return Handover(tuple(_suspend_flux(new)), tuple(_from_flux(new)))
-    return Handover(tuple(_let_argocd_go(old)), tuple(_from_argocd(new)))
+        return SwitchSteps(tuple(_suspend_flux(new)), tuple(_from_flux(new)))
+    return SwitchSteps(tuple(_let_argocd_go(old)), tuple(_from_argocd(new)))
 
 
 def _suspend_flux(config: Config) -> Iterator[Step]:

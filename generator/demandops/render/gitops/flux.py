@@ -40,7 +40,7 @@ def chart_object(name: str, chart: ChartSource) -> str:
     return f"{name}-{chart.version}".lower()
 
 
-def standing_files(config: Config, engine: Engine) -> dict[str, str]:
+def base_files(config: Config, engine: Engine) -> dict[str, str]:
     """Return bootstrap files, and for each access domain a placeholder and the chart sources."""
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)

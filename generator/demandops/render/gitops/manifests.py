@@ -29,7 +29,7 @@ def render(release: Release, config: Config, engine: Engine) -> str:
     return flux.render(release, values, engine)
 
 
-def standing_files(config: Config, engine: Engine) -> dict[str, str]:
+def base_files(config: Config, engine: Engine) -> dict[str, str]:
     """Return the files that stay when nothing is demanded.
 
     For each cluster what makes its controller follow the repo; for each access domain on it a
@@ -37,5 +37,5 @@ def standing_files(config: Config, engine: Engine) -> dict[str, str]:
     of pruning.
     """
     if config.repository.gitops == "argocd":
-        return argocd.standing_files(config, engine)
-    return flux.standing_files(config, engine)
+        return argocd.base_files(config, engine)
+    return flux.base_files(config, engine)
