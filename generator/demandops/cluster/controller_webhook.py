@@ -26,20 +26,20 @@ _UNKNOWN = "0" * 40
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class WebhookCall:
     """A request that is to be sent: which header carries the signature of ``body``."""
 
     body: bytes
-    signed_by: str
+    signature_header: str
     headers: dict[str, str] = field(default_factory=dict)
 
 
-def to_flux() -> Call:
+def flux_call() -> WebhookCall:
     """Return what a Receiver of Flux takes: the fact of the call is all that it says."""
-    return Call(b"{}", "X-Signature")
+    return WebhookCall(b"{}", "X-Signature")
 
 
-def to_argocd(repo: str, before: str, after: str, paths: Iterable[str] | None) -> Call:
+def argocd_call(repo: str, before: str, after: str, paths: Iterable[str] | None) -> WebhookCall:
     """Return what Argo CD takes: that a repository's main branch moved.
 
     Args:
@@ -58,7 +58,9 @@ def to_argocd(repo: str, before: str, after: str, paths: Iterable[str] | None) -
         "repository": {"html_url": web_address(repo), "default_branch": MAIN_BRANCH},
         "commits": [] if paths is None else [{"id": after, "modified": sorted(paths)}],
     }
-    return Call(json.dumps(event).encode(), "X-Hub-Signature-256", {"X-GitHub-Event": "push"})
+    return WebhookCall(
+        json.dumps(event).encode(), "X-Hub-Signature-256", {"X-GitHub-Event": "push"}
+    )
 
 
 def web_address(repo: str) -> str:
@@ -85,7 +87,7 @@ def signature(secret: bytes, body: bytes) -> str:
     return f"sha256={hmac.new(secret, body, hashlib.sha256).hexdigest()}"
 
 
-def send(url: str, call: Call, secret: bytes | None, timeout: float) -> None:
+def send(url: str, call: WebhookCall, secret: bytes | None, timeout: float) -> None:
     """Send a call.
 
     Raises:
@@ -94,7 +96,7 @@ def send(url: str, call: Call, secret: bytes | None, timeout: float) -> None:
     """
     headers = {"Content-Type": "application/json", "User-Agent": "demandops", **call.headers}
     if secret is not None:
-        headers[call.signed_by] = signature(secret, call.body)
+        headers[call.signature_header] = signature(secret, call.body)
     request = urllib.request.Request(url, data=call.body, headers=headers, method="POST")  # noqa: S310
     _OPENER.open(request, timeout=timeout).close()
 

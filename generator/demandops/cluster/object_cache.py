@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from demandops.cluster.access import ClusterAccess
-from demandops.cluster.health import Key, Watched
+from demandops.cluster.health import Key, ObjectSelector
 
 log = logging.getLogger("demandops")
 
@@ -36,19 +36,19 @@ class ObjectCache:
         self._on_change = on_change
         self._lock = threading.Lock()
         self._objects: dict[Key, dict[str, Any]] = {}
-        self._watched: set[Watched] = set()
-        self._read: set[Watched] = set()
-        self._troubles: dict[Watched, str] = {}
+        self._watched: set[ObjectSelector] = set()
+        self._read: set[ObjectSelector] = set()
+        self._troubles: dict[ObjectSelector, str] = {}
         self._closed = threading.Event()
         self._client: Any = None
 
     @property
-    def trouble(self) -> str:
+    def read_error(self) -> str:
         """Why something that is watched cannot be read; empty where all can."""
         with self._lock:
             return next((self._troubles[one] for one in sorted(self._troubles)), "")
 
-    def watch(self, wanted: Iterable[Watched]) -> None:
+    def watch(self, wanted: Iterable[ObjectSelector]) -> None:
         """Watch further objects; those watched already stay so."""
         for one in wanted:
             with self._lock:
@@ -67,7 +67,7 @@ class ObjectCache:
         with self._lock:
             return dict(self._objects)
 
-    def unread(self, wanted: Iterable[Watched]) -> str:
+    def why_unknown(self, wanted: Iterable[ObjectSelector]) -> str:
         """Return why what is wanted is not known at present; empty where it is."""
         with self._lock:
             for one in wanted:
@@ -77,7 +77,7 @@ class ObjectCache:
                     return "it was not read yet"
         return ""
 
-    def read(self, wanted: Iterable[Watched]) -> None:
+    def read_once(self, wanted: Iterable[ObjectSelector]) -> None:
         """Read some objects once, without a watch; ``trouble`` says what went wrong."""
         everything = list(wanted)
         for one in everything:
@@ -89,7 +89,7 @@ class ObjectCache:
                     return
                 self._troubles[one] = _told(one, error)
 
-    def refresh(self, wanted: Iterable[Watched]) -> None:
+    def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
         """Read some objects anew, in this order: watches may lag behind each other.
 
         Raises:
@@ -98,7 +98,7 @@ class ObjectCache:
         for one in wanted:
             self._put(one, self._list(one)["items"])
 
-    def why_not_available(self, namespace: str, deployment: str) -> str:
+    def why_unavailable(self, namespace: str, deployment: str) -> str:
         """Return what keeps a Deployment's pods from running, or nothing that is known.
 
         Raises:
@@ -128,7 +128,7 @@ class ObjectCache:
         """Watch no more."""
         self._closed.set()
 
-    def _follow(self, watched: Watched) -> None:
+    def _follow(self, watched: ObjectSelector) -> None:
         pause = _FIRST_PAUSE_S
         while not self._closed.is_set():
             try:
@@ -139,7 +139,7 @@ class ObjectCache:
                 self._closed.wait(pause)
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
 
-    def _list_and_watch(self, watched: Watched) -> None:
+    def _list_and_watch(self, watched: ObjectSelector) -> None:
         from kubernetes import watch  # noqa: PLC0415 - half a second; only when used
 
         listed = self._list(watched)
@@ -170,7 +170,7 @@ class ObjectCache:
                 self._client = client.CustomObjectsApi(self._reached.client())
             return self._client
 
-    def _list(self, watched: Watched) -> Any:  # noqa: ANN401
+    def _list(self, watched: ObjectSelector) -> Any:  # noqa: ANN401
         group, version, plural = _KINDS[watched.kind]
         return self._api().list_namespaced_custom_object(
             group,
@@ -181,7 +181,7 @@ class ObjectCache:
             **_selected(watched),
         )
 
-    def _put(self, watched: Watched, items: Iterable[dict[str, Any]]) -> None:
+    def _put(self, watched: ObjectSelector, items: Iterable[dict[str, Any]]) -> None:
         """Make what is watched what was listed."""
         kind, namespace, name = watched
         with self._lock:
@@ -192,7 +192,7 @@ class ObjectCache:
                 self._objects[kind, namespace, item["metadata"]["name"]] = item
             self._read.add(watched)
 
-    def _take(self, watched: Watched, event: dict[str, Any]) -> None:
+    def _take(self, watched: ObjectSelector, event: dict[str, Any]) -> None:
         item = event["object"]
         if event["type"] not in ("ADDED", "MODIFIED", "DELETED"):
             return
@@ -207,7 +207,7 @@ class ObjectCache:
                 self._objects[key] = item
         self._on_change()
 
-    def _say(self, watched: Watched, trouble: str) -> None:
+    def _say(self, watched: ObjectSelector, trouble: str) -> None:
         with self._lock:
             told = trouble and trouble not in self._troubles.values()
             if trouble:
@@ -219,7 +219,7 @@ class ObjectCache:
         self._on_change()
 
 
-def _selected(watched: Watched) -> dict[str, str]:
+def _selected(watched: ObjectSelector) -> dict[str, str]:
     """Return what narrows a request to one object, which a right to that one alone permits."""
     return {"field_selector": f"metadata.name={watched.name}"} if watched.name else {}
 
@@ -229,7 +229,7 @@ def _answered(error: Exception) -> bool:
     return bool(getattr(error, "status", None))
 
 
-def _told(watched: Watched, error: Exception) -> str:
+def _told(watched: ObjectSelector, error: Exception) -> str:
     if _answered(error):  # it speaks of these objects; else it is the whole cluster that is away
         plural = _KINDS[watched.kind][2]
         reason = getattr(error, "reason", None) or type(error).__name__

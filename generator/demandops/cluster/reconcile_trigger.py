@@ -113,7 +113,7 @@ class ReconcileTrigger:
             self._tell(name, reached.webhook, reached, config, argocd.url)
         elif reached.receiver and not argocd:
             controller_webhook.send(
-                reached.receiver, controller_webhook.to_flux(), reached.secret(), _TIMEOUT_S
+                reached.receiver, controller_webhook.flux_call(), reached.secret(), _TIMEOUT_S
             )
         elif reached.kubeconfig:
             self._ask(name, reached, config)
@@ -133,7 +133,7 @@ class ReconcileTrigger:
             own = (f"{domain_folder(name, domain)}/" for domain in _domains(name, config))
             paths = [path for path in paths if _concerns(path, name)]
             paths += [f"{folder}_domain.yaml" for folder in own]
-        call = controller_webhook.to_argocd(repo, before, commit, paths)
+        call = controller_webhook.argocd_call(repo, before, commit, paths)
         controller_webhook.send(url, call, reached.secret(), _TIMEOUT_S)
         self._told[name] = commit
 

@@ -16,12 +16,21 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from demandops.cluster.access import ClusterAccess
-from demandops.cluster.health import Health, History, Level, Objects, Place, Target, reading, worst
+from demandops.cluster.health import (
+    ClusterDomain,
+    Health,
+    History,
+    Level,
+    Objects,
+    Target,
+    health_reader,
+    worst,
+)
 from demandops.cluster.object_cache import ObjectCache
 
 log = logging.getLogger("demandops")
 
-Told = Callable[[str, str], None]
+OnProgress = Callable[[str, str], None]
 """Called with a state (``reconciled``, ``healthy``, ``failing``) and a text, once for each news."""
 
 _QUIET_S = 0.05
@@ -31,11 +40,11 @@ _LONGEST_S = 1.0
 @dataclass(eq=False)
 class _Followed:
     commit: str
-    places: tuple[Place, ...]
+    domains: tuple[ClusterDomain, ...]
     targets: tuple[Target, ...]
     level: Level
     deadline: float
-    told: Told
+    told: OnProgress
     future: Future[Health] = field(default_factory=Future)
     said: set[str] = field(default_factory=set)
     failed: Health | None = None
@@ -43,7 +52,7 @@ class _Followed:
     busy: bool = False
 
 
-class RolloutStatus:
+class RolloutWatcher:
     """Watches clusters, as many as the operator's file names."""
 
     def __init__(self, clusters: Mapping[str, ClusterAccess], history: History) -> None:
@@ -66,9 +75,9 @@ class RolloutStatus:
         self._thread = threading.Thread(target=self._run, name="demandops-status", daemon=True)
         self._thread.start()
 
-    def reaches(self, places: Iterable[Place]) -> str:
-        """Return why something at these places cannot be followed; empty where it can."""
-        missing = sorted({place.cluster for place in places} - set(self._stores))
+    def why_unreachable(self, domains: Iterable[ClusterDomain]) -> str:
+        """Return why something at these domains cannot be followed; empty where it can."""
+        missing = sorted({domain.cluster for domain in domains} - set(self._stores))
         return f"no access to cluster {', '.join(missing)}" if missing else ""
 
     def follow(
@@ -77,13 +86,13 @@ class RolloutStatus:
         targets: Iterable[Target],
         level: Level,
         timeout: float,
-        told: Told = lambda state, text: None,
+        told: OnProgress = lambda state, text: None,
     ) -> Future[Health]:
         """Follow releases of a published commit; returns at once.
 
         Args:
             commit: the commit that holds what is asked.
-            targets: the releases; all at places that :meth:`reaches`.
+            targets: the releases; all at domains that :meth:`reaches`.
             level: how far they must be.
             timeout: seconds until it is answered anyway.
             told: called with each news, from the status thread.
@@ -93,10 +102,10 @@ class RolloutStatus:
             with the reason why it did not.
         """
         targets = tuple(targets)
-        places = tuple(dict.fromkeys(target.place for target in targets))
-        followed = _Followed(commit, places, targets, level, time.monotonic() + timeout, told)
-        for place in places:
-            self._stores[place.cluster].watch(reading(place).watched(place))
+        domains = tuple(dict.fromkeys(target.domain for target in targets))
+        followed = _Followed(commit, domains, targets, level, time.monotonic() + timeout, told)
+        for domain in domains:
+            self._stores[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
         with self._lock:
             self._open.append(followed)
         self._news.set()
@@ -153,8 +162,8 @@ class RolloutStatus:
         threading.Thread(target=run, name="demandops-status-ask", daemon=True).start()
 
     def _confirm(self, one: _Followed) -> None:
-        for place in one.places:
-            self._stores[place.cluster].refresh(reading(place).confirmed_by(place))
+        for domain in one.domains:
+            self._stores[domain.cluster].refresh(health_reader(domain).objects_to_confirm(domain))
         one.confirmed = True
 
     def _give_up(self, one: _Followed, health: Health) -> None:
@@ -170,9 +179,9 @@ class RolloutStatus:
             namespace, _, deployment = name.partition("/")
             with suppress(Exception):
                 for target in one.targets:
-                    if target.place.namespace == namespace:
-                        store = self._stores[target.place.cluster]
-                        why = store.why_not_available(namespace, deployment)
+                    if target.domain.namespace == namespace:
+                        store = self._stores[target.domain.cluster]
+                        why = store.why_unavailable(namespace, deployment)
                         if why:
                             health = replace(health, reason=f"{health.reason}; {why}")
                             break
@@ -186,22 +195,24 @@ class RolloutStatus:
         one.future.set_result(health)
 
     def _health(self, one: _Followed, objects: Mapping[str, Objects]) -> Health:
-        places = [self._of_place(place, one.commit, objects) for place in one.places]
-        found = worst(places)
-        if found.state == "waiting" or not one.places:
+        domains = [self._of_place(domain, one.commit, objects) for domain in one.domains]
+        found = worst(domains)
+        if found.state == "waiting" or not one.domains:
             return found
         return worst([self._of_target(target, one.commit, objects) for target in one.targets])
 
-    def _of_place(self, place: Place, commit: str, objects: Mapping[str, Objects]) -> Health:
-        read = reading(place)
-        unread = self._stores[place.cluster].unread(read.watched(place))
+    def _of_place(
+        self, domain: ClusterDomain, commit: str, objects: Mapping[str, Objects]
+    ) -> Health:
+        read = health_reader(domain)
+        unread = self._stores[domain.cluster].why_unknown(read.objects_to_watch(domain))
         if unread:
-            return Health("waiting", f"cannot be read: {unread}", f"cluster {place.cluster}")
-        return read.of_place(place, commit, objects[place.cluster], self._history)
+            return Health("waiting", f"cannot be read: {unread}", f"cluster {domain.cluster}")
+        return read.domain_health(domain, commit, objects[domain.cluster], self._history)
 
     def _of_target(self, target: Target, commit: str, objects: Mapping[str, Objects]) -> Health:
-        found = objects[target.place.cluster]
-        return reading(target.place).of_target(target, commit, found, self._history)
+        found = objects[target.domain.cluster]
+        return health_reader(target.domain).release_health(target, commit, found, self._history)
 
     @staticmethod
     def _tell(one: _Followed, health: Health) -> None:

@@ -7,12 +7,12 @@ from urllib.parse import quote
 
 from demandops.forge.api import ForgeError
 from demandops.forge.pull_request import PullRequest
-from demandops.forge.pull_request_api import Pulls
+from demandops.forge.pull_request_api import PullRequestApi
 
 _NOT_FOUND = 404
 
 
-class Gitea(Pulls):
+class Gitea(PullRequestApi):
     """A repository on Gitea or Forgejo."""
 
     NAME = "Gitea"

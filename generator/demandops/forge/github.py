@@ -9,10 +9,10 @@ from typing import Any
 from urllib.parse import urlencode
 
 from demandops.forge.pull_request import PullRequest
-from demandops.forge.pull_request_api import Pulls
+from demandops.forge.pull_request_api import PullRequestApi
 
 
-class GitHub(Pulls):
+class GitHub(PullRequestApi):
     """A repository on GitHub."""
 
     NAME = "GitHub"

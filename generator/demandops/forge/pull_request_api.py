@@ -10,7 +10,7 @@ from demandops.forge.api import Api, ForgeError
 from demandops.forge.pull_request import PullRequest, RequestState
 
 
-class Pulls(ABC):
+class PullRequestApi(ABC):
     """The pull requests of a repository."""
 
     NAME: ClassVar[str]

@@ -1,4 +1,4 @@
-"""What the objects of a cluster say about releases: by Flux's reading, or Argo CD's. Pure.
+"""What the objects of a cluster say about releases: by Flux's health_reader, or Argo CD's. Pure.
 
 What is asked here is asked of any place; each knows by which controller it is kept, so a state
 repo may go over from one to the other while demands are followed.
@@ -8,37 +8,37 @@ from __future__ import annotations
 
 from demandops.cluster.health import argocd, flux
 from demandops.cluster.health.model import (
+    ClusterDomain,
     Health,
+    HealthReader,
     History,
     Key,
     Level,
-    Named,
     Object,
+    ObjectName,
     Objects,
-    Place,
-    Reading,
+    ObjectSelector,
     Target,
-    Watched,
     worst,
 )
 
 __all__ = [
+    "ClusterDomain",
     "Health",
+    "HealthReader",
     "History",
     "Key",
     "Level",
-    "Named",
     "Object",
+    "ObjectName",
+    "ObjectSelector",
     "Objects",
-    "Place",
-    "Reading",
     "Target",
-    "Watched",
-    "reading",
+    "health_reader",
     "worst",
 ]
 
 
-def reading(place: Place) -> Reading:
+def health_reader(domain: ClusterDomain) -> HealthReader:
     """Return how the objects of a place are read."""
-    return argocd if place.application else flux
+    return argocd if domain.application else flux

@@ -7,16 +7,16 @@ form: ``status.sync.comparedTo`` says of which.
 
 from __future__ import annotations
 
-from demandops.cluster.health.deployment import condition, of_client, of_deployment
+from demandops.cluster.health.deployment import client_health, condition, deployment_health
 from demandops.cluster.health.model import (
+    ClusterDomain,
     Health,
     History,
-    Named,
     Object,
+    ObjectName,
     Objects,
-    Place,
+    ObjectSelector,
     Target,
-    Watched,
 )
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
@@ -24,19 +24,21 @@ _DETAILS = 3
 """Of a sync that failed, so many objects are told one by one."""
 
 
-def watched(place: Place) -> tuple[Watched, ...]:
-    """Return what must be known to tell how things are at a place."""
-    return Watched("Application", *_over(place)), *confirmed_by(place)
+def objects_to_watch(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+    """Return what must be known to tell how things are at a domain."""
+    return ObjectSelector("Application", *_over(domain)), *objects_to_confirm(domain)
 
 
-def confirmed_by(place: Place) -> tuple[Watched, ...]:
+def objects_to_confirm(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
     """Return what is read once more before something is healthy: releases, then what they own."""
-    return Watched("Application", place.namespace), Watched("Deployment", place.namespace)
+    return ObjectSelector("Application", domain.namespace), ObjectSelector(
+        "Deployment", domain.namespace
+    )
 
 
-def of_place(place: Place, commit: str, objects: Objects, history: History) -> Health:
+def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history: History) -> Health:
     """Return whether the Application over an access domain's folder has applied a commit."""
-    over = _over(place)
+    over = _over(domain)
     name = f"Application {over.namespace}/{over.name}"
     found = objects.get(("Application", *over))
     if found is None:
@@ -52,19 +54,19 @@ def of_place(place: Place, commit: str, objects: Objects, history: History) -> H
     return Health("waiting", message, name, failing=True)
 
 
-def of_target(target: Target, commit: str, objects: Objects, history: History) -> Health:
+def release_health(target: Target, commit: str, objects: Objects, history: History) -> Health:
     """Return whether a release of an applied commit runs, or is gone where it is to be gone."""
     if not target.wanted:
         return _gone(target, objects)
     if not target.by_helm:
-        return of_client(target, objects)
-    name = f"Application {target.place.namespace}/{target.name}"
-    found = objects.get(("Application", target.place.namespace, target.name))
+        return client_health(target, objects)
+    name = f"Application {target.domain.namespace}/{target.name}"
+    found = objects.get(("Application", target.domain.namespace, target.name))
     if found is None:
         return Health("reconciled", "is not there yet", name)
     if found["metadata"].get("deletionTimestamp"):
         return Health("reconciled", "is still being removed, and made anew then", name)
-    behind = _behind(target.place, found, commit, objects, history)
+    behind = _behind(target.domain, found, commit, objects, history)
     if not behind and _status(found, "sync").get("status") == "Synced":
         return _of_synced(found, name, objects)
     message, _ = _trouble(found)
@@ -74,25 +76,25 @@ def of_target(target: Target, commit: str, objects: Objects, history: History) -
     return Health("reconciled", behind or running, name)
 
 
-def since(target: Target, objects: Objects) -> str:
+def last_transition(target: Target, objects: Objects) -> str:
     """Return since when a release is as it is, as the cluster says it; empty where it does not."""
     kind = "Application" if target.by_helm else "Deployment"
-    found = objects.get((kind, target.place.namespace, target.name)) or {}
+    found = objects.get((kind, target.domain.namespace, target.name)) or {}
     said = condition(found.get("status") or {}, "Available")
     if target.by_helm:
         said = _status(found, "health")
     return str(said.get("lastTransitionTime", ""))
 
 
-def applied(place: Place, objects: Objects) -> str:
+def applied_commit(domain: ClusterDomain, objects: Objects) -> str:
     """Return the commit that an access domain's folder was last seen to be applied from."""
-    found = objects.get(("Application", *_over(place)))
+    found = objects.get(("Application", *_over(domain)))
     return next(iter(_applied(found)), "") if found else ""
 
 
-def _over(place: Place) -> Named:
-    assert place.application is not None  # noqa: S101 - or Flux's reading would be asked
-    return place.application
+def _over(domain: ClusterDomain) -> ObjectName:
+    assert domain.application is not None  # noqa: S101 - or Flux's reading would be asked
+    return domain.application
 
 
 def _applied(found: Object) -> list[str]:
@@ -118,14 +120,16 @@ def _applied(found: Object) -> list[str]:
     return [revision for revision in revisions if revision]
 
 
-def _behind(place: Place, found: Object, commit: str, objects: Objects, history: History) -> str:
+def _behind(
+    domain: ClusterDomain, found: Object, commit: str, objects: Objects, history: History
+) -> str:
     """Return why the status of a service's Application is not about what is wanted of it."""
     sync, source = _status(found, "sync"), (found.get("spec") or {}).get("source") or {}
     if not sync:
         return "was not looked at yet"
     if not _same((sync.get("comparedTo") or {}).get("source"), source):
         return "was not compared in its present form yet"
-    over = objects.get(("Application", *_over(place))) or {}
+    over = objects.get(("Application", *_over(domain))) or {}
     folder = (over.get("spec") or {}).get("source") or {}
     if source.get("repoURL") != folder.get("repoURL"):
         return ""  # the chart is in a registry, and its version part of the source
@@ -145,7 +149,7 @@ def _of_synced(found: Object, name: str, objects: Objects) -> Health:
         key = ("Deployment", str(item.get("namespace", "")), str(item.get("name", "")))
         if key not in objects:
             return Health("reconciled", "is not there yet", f"Deployment {key[1]}/{key[2]}")
-        health = of_deployment(objects[key])
+        health = deployment_health(objects[key])
         if health.state != "healthy":
             return health
     said = _status(found, "health")
@@ -156,7 +160,7 @@ def _of_synced(found: Object, name: str, objects: Objects) -> Health:
 
 
 def _gone(target: Target, objects: Objects) -> Health:
-    namespace = target.place.namespace
+    namespace = target.domain.namespace
     kind = "Application" if target.by_helm else "Deployment"
     name = f"{kind} {namespace}/{target.name}"
     found = objects.get((kind, namespace, target.name))
@@ -170,11 +174,11 @@ def _gone(target: Target, objects: Objects) -> Health:
 
 def _left(target: Target, objects: Objects) -> bool:
     """Tell whether something that an Application made is there without it."""
-    tracked = f"{target.place.namespace}_{target.name}:"
+    tracked = f"{target.domain.namespace}_{target.name}:"
     return any(
         str((found["metadata"].get("annotations") or {}).get(_TRACKED_BY, "")).startswith(tracked)
         for (kind, namespace, _), found in objects.items()
-        if kind == "Deployment" and namespace == target.place.namespace
+        if kind == "Deployment" and namespace == target.domain.namespace
     )
 
 

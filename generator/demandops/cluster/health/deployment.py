@@ -5,7 +5,7 @@ from __future__ import annotations
 from demandops.cluster.health.model import Health, Object, Objects, Target
 
 
-def of_deployment(found: Object) -> Health:
+def deployment_health(found: Object) -> Health:
     """Return whether all replicas of a Deployment are there in its present form."""
     metadata, status = found["metadata"], found.get("status") or {}
     name = f"Deployment {metadata.get('namespace')}/{metadata.get('name')}"
@@ -22,13 +22,13 @@ def of_deployment(found: Object) -> Health:
     return Health("reconciled", f"{available} of {wanted} replicas are available", name)
 
 
-def of_client(target: Target, objects: Objects) -> Health:
+def client_health(target: Target, objects: Objects) -> Health:
     """Return whether a connection end runs: plain manifests, so its Deployment is all there is."""
-    namespace = target.place.namespace
+    namespace = target.domain.namespace
     found = objects.get(("Deployment", namespace, target.name))
     if found is None:
         return Health("reconciled", "is not there yet", f"Deployment {namespace}/{target.name}")
-    return of_deployment(found)
+    return deployment_health(found)
 
 
 def condition(status: Object, kind: str) -> Object:

@@ -6,27 +6,37 @@ Objects are plain data as the Kubernetes API gives them. Field names as of Flux 
 
 from __future__ import annotations
 
-from demandops.cluster.health.deployment import condition, of_client, of_deployment
-from demandops.cluster.health.model import Health, History, Object, Objects, Place, Target, Watched
+from demandops.cluster.health.deployment import client_health, condition, deployment_health
+from demandops.cluster.health.model import (
+    ClusterDomain,
+    Health,
+    History,
+    Object,
+    Objects,
+    ObjectSelector,
+    Target,
+)
 
 _HELM_NAME = "helm.toolkit.fluxcd.io/name"
 
 
-def watched(place: Place) -> tuple[Watched, ...]:
-    """Return what must be known to tell how things are at a place."""
+def objects_to_watch(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+    """Return what must be known to tell how things are at a domain."""
     kinds = ("Kustomization", "GitRepository", "HelmRelease", "Deployment")
-    return tuple(Watched(kind, place.namespace) for kind in kinds)
+    return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
 
 
-def confirmed_by(place: Place) -> tuple[Watched, ...]:
+def objects_to_confirm(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
     """Return what is read once more before something is healthy: releases, then what they own."""
-    return Watched("HelmRelease", place.namespace), Watched("Deployment", place.namespace)
+    return ObjectSelector("HelmRelease", domain.namespace), ObjectSelector(
+        "Deployment", domain.namespace
+    )
 
 
-def of_place(place: Place, commit: str, objects: Objects, history: History) -> Health:
+def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history: History) -> Health:
     """Return whether an access domain's Kustomization has applied a commit."""
-    found = objects.get(("Kustomization", place.namespace, place.domain))
-    name = f"Kustomization {place.namespace}/{place.domain}"
+    found = objects.get(("Kustomization", domain.namespace, domain.name))
+    name = f"Kustomization {domain.namespace}/{domain.name}"
     if found is None:
         return Health("waiting", "is not there; apply bootstrap/ to the cluster", name)
     status = found.get("status") or {}
@@ -37,22 +47,22 @@ def of_place(place: Place, commit: str, objects: Objects, history: History) -> H
     ready = condition(status, "Ready")
     if ready.get("status") == "False" and attempted and history.includes(attempted, commit):
         return Health("waiting", str(ready.get("message", "")), name, failing=True)
-    source = objects.get(("GitRepository", place.namespace, _source(found)))
+    source = objects.get(("GitRepository", domain.namespace, _source(found)))
     fetched = condition((source or {}).get("status") or {}, "Ready")
     if fetched.get("status") == "False":
-        at = f"GitRepository {place.namespace}/{_source(found)}"
+        at = f"GitRepository {domain.namespace}/{_source(found)}"
         return Health("waiting", str(fetched.get("message", "")), at, failing=True)
     return Health("waiting", "has not applied the commit yet", name)
 
 
-def of_target(target: Target, commit: str, objects: Objects, history: History) -> Health:
+def release_health(target: Target, commit: str, objects: Objects, history: History) -> Health:
     """Return whether a release of an applied commit runs, or is gone where it is to be gone."""
     if not target.wanted:
         return _gone(target, objects)
     if not target.by_helm:
-        return of_client(target, objects)
-    release = objects.get(("HelmRelease", target.place.namespace, target.name))
-    name = f"HelmRelease {target.place.namespace}/{target.name}"
+        return client_health(target, objects)
+    release = objects.get(("HelmRelease", target.domain.namespace, target.name))
+    name = f"HelmRelease {target.domain.namespace}/{target.name}"
     if release is None:
         return Health("reconciled", "is not there yet", name)
     status = release.get("status") or {}
@@ -63,27 +73,27 @@ def of_target(target: Target, commit: str, objects: Objects, history: History) -
     if not current or ready.get("status") != "True":
         return Health("reconciled", str(ready.get("message") or "is being installed"), name)
     for deployment in _deployments(target, objects):
-        health = of_deployment(deployment)
+        health = deployment_health(deployment)
         if health.state != "healthy":
             return health
     return Health("healthy")
 
 
-def since(target: Target, objects: Objects) -> str:
+def last_transition(target: Target, objects: Objects) -> str:
     """Return since when a release is as it is, as the cluster says it; empty where it does not."""
     kind, ready = ("HelmRelease", "Ready") if target.by_helm else ("Deployment", "Available")
-    found = objects.get((kind, target.place.namespace, target.name)) or {}
+    found = objects.get((kind, target.domain.namespace, target.name)) or {}
     return str(condition(found.get("status") or {}, ready).get("lastTransitionTime", ""))
 
 
-def applied(place: Place, objects: Objects) -> str:
+def applied_commit(domain: ClusterDomain, objects: Objects) -> str:
     """Return the commit that an access domain's Kustomization has applied, or nothing."""
-    found = objects.get(("Kustomization", place.namespace, place.domain)) or {}
+    found = objects.get(("Kustomization", domain.namespace, domain.name)) or {}
     return _commit((found.get("status") or {}).get("lastAppliedRevision"))
 
 
 def _gone(target: Target, objects: Objects) -> Health:
-    namespace = target.place.namespace
+    namespace = target.domain.namespace
     kind = "HelmRelease" if target.by_helm else "Deployment"
     if (kind, namespace, target.name) in objects or _deployments(target, objects):
         return Health("reconciled", "is still being removed", f"{kind} {namespace}/{target.name}")
@@ -98,7 +108,7 @@ def _deployments(target: Target, objects: Objects) -> list[Object]:
         found
         for (kind, namespace, _), found in objects.items()
         if kind == "Deployment"
-        and namespace == target.place.namespace
+        and namespace == target.domain.namespace
         and (found["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
     ]
 

@@ -12,14 +12,14 @@ State = Literal["waiting", "reconciled", "healthy"]
 _ORDER: dict[str, int] = {"waiting": 0, "pushed": 0, "reconciled": 1, "healthy": 2}
 
 
-class Named(NamedTuple):
+class ObjectName(NamedTuple):
     """Where an object is."""
 
     namespace: str
     name: str
 
 
-class Watched(NamedTuple):
+class ObjectSelector(NamedTuple):
     """Objects of a kind that are watched: all of a namespace, or the one with this name."""
 
     kind: str
@@ -28,23 +28,23 @@ class Watched(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ClusterDomain:
     """An access domain on a cluster.
 
     ``application`` is the Application over its folder where Argo CD follows, else Flux does.
     """
 
     cluster: str
-    domain: str
+    name: str
     namespace: str
-    application: Named | None = None
+    application: ObjectName | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
     """One release and whether it is to be there. ``by_helm``: a service, else one Deployment."""
 
-    place: Place
+    domain: ClusterDomain
     name: str
     by_helm: bool
     wanted: bool = True
@@ -85,30 +85,34 @@ class History(Protocol):
         ...
 
 
-class Reading(Protocol):
+class HealthReader(Protocol):
     """How the objects of one GitOps controller are read."""
 
-    def watched(self, place: Place) -> tuple[Watched, ...]:
-        """Return what must be known to tell how things are at a place."""
+    def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+        """Return what must be known to tell how things are at a domain."""
         ...
 
-    def confirmed_by(self, place: Place) -> tuple[Watched, ...]:
+    def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
         """Return what is read once more before something is healthy, in this order."""
         ...
 
-    def of_place(self, place: Place, commit: str, objects: Objects, history: History) -> Health:
+    def domain_health(
+        self, domain: ClusterDomain, commit: str, objects: Objects, history: History
+    ) -> Health:
         """Return whether a commit is applied in an access domain."""
         ...
 
-    def of_target(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
+    def release_health(
+        self, target: Target, commit: str, objects: Objects, history: History
+    ) -> Health:
         """Return whether a release of an applied commit runs, or is gone where it is to be."""
         ...
 
-    def since(self, target: Target, objects: Objects) -> str:
+    def last_transition(self, target: Target, objects: Objects) -> str:
         """Return since when a release is as it is, as the cluster says it; empty if it does not."""
         ...
 
-    def applied(self, place: Place, objects: Objects) -> str:
+    def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
         """Return the commit that an access domain was seen to have applied, or nothing."""
         ...
 
