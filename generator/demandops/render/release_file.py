@@ -1,7 +1,7 @@
-"""The comment lines that say which overrides shaped a file, and files that an override holds.
+"""The file of a release: comment lines that name the overrides, then the rendered body.
 
-A held file keeps its body byte for byte; only the comment above it may change. What shaped the body
-when it was frozen stays named there.
+A ``hold`` override keeps the body of a file byte for byte; only the comments above it may change.
+They go on naming the overrides that shaped the body when it was frozen.
 """
 
 from __future__ import annotations
@@ -17,43 +17,45 @@ from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 
 _START = "# override overrides/"
-_OF_NOW = frozenset({"hold", "keep"})
-"""Effects that are not in a file's body, and so are told as they are even where it is held."""
-_TOLD_ANEW = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
+_OUTSIDE_BODY = frozenset({"hold", "keep"})
+"""Effects that do not change the body, so their comments are updated even if it is held."""
+_UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
-def release_text(release: Release, config: Config, engine: Engine, standing: str | None) -> str:
-    """Return the file of a release: rendered, or as it stands where an override holds it.
+def release_text(release: Release, config: Config, engine: Engine, current: str | None) -> str:
+    """Return the text of a release's file; a held file keeps its current body.
 
     Args:
-        standing: the file as it is in the state repo, or nothing.
+        release: the release.
+        config: the configuration that it was planned with.
+        engine: the engine of that configuration.
+        current: the file's text in the state repo; ``None`` if there is no file.
 
     Raises:
-        Refused, InvalidInput: where it cannot be rendered.
+        Refused, InvalidInput: if it cannot be rendered.
     """
     shaping = release.shaping
     if not shaping.held:
-        body = manifests.render(release, config, engine)
-        return _commented([override_comment(one, effects) for one, effects in shaping.by], body)
-    now = [override_comment(one, effects) for one, effects in shaping.by if _OF_NOW & {*effects}]
-    if standing is None:
-        then = [
-            override_comment(one, effects)
-            for one, effects in shaping.by
-            if not _OF_NOW & {*effects}
-        ]
-        return _commented([*now, *then], manifests.render(release, config, engine))
-    then, body = split_comments(standing)
-    return _commented([*now, *(one for one in then if not _TOLD_ANEW.match(one))], body)
+        comments = [override_comment(override, effects) for override, effects in shaping.by]
+        return _join(comments, manifests.render(release, config, engine))
+    outside, of_body = list[str](), list[str]()
+    for override, effects in shaping.by:
+        comments = outside if _OUTSIDE_BODY & {*effects} else of_body
+        comments.append(override_comment(override, effects))
+    if current is None:
+        return _join([*outside, *of_body], manifests.render(release, config, engine))
+    comments, body = split_comments(current)
+    frozen = [comment for comment in comments if not _UPDATED_COMMENT.match(comment)]
+    return _join([*outside, *frozen], body)
 
 
-def _commented(lines: list[str], body: str) -> str:
-    return "".join(f"{one}\n" for one in lines) + body
+def _join(comments: list[str], body: str) -> str:
+    return "".join(f"{comment}\n" for comment in comments) + body
 
 
 def override_comment(override: Override, effects: tuple[str, ...]) -> str:
-    """Return the comment line for an override."""
+    """Return the comment that names an override and its effects."""
     until = f"until {written(override.end)}; " if override.end else ""
     return (
         f"# override {override.path}: {', '.join(effects)}; priority {override.priority}; {until}"
@@ -67,20 +69,26 @@ def split_comments(text: str) -> tuple[list[str], str]:
     count = 0
     while count < len(lines) and lines[count].startswith(_START):
         count += 1
-    return [one.rstrip("\n") for one in lines[:count]], "".join(lines[count:])
+    return [line.rstrip("\n") for line in lines[:count]], "".join(lines[count:])
 
 
 def kept_charts(
-    files: Mapping[str, str], standing: Mapping[str, str], config: Config
+    files: Mapping[str, str], current: Mapping[str, str], config: Config
 ) -> dict[str, str]:
-    """Return the chart sources that would go although a held release may still be from them.
+    """Return the chart sources to keep because a held release may still use them.
 
-    Not those from a folder of this repo: under their old name they would fetch the new chart.
+    Sources of charts in this repo are not kept: under its old name such a source would fetch the
+    new chart.
+
+    Args:
+        files: the generated files as they will be.
+        current: the generated files in the state repo.
+        config: the configuration.
     """
     if not any(override.hold for override in config.in_force):
         return {}
     return {
         path: text
-        for path, text in standing.items()
+        for path, text in current.items()
         if _CHART.fullmatch(path) and path not in files and "kind: GitRepository" not in text
     }

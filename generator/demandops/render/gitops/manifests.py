@@ -1,7 +1,6 @@
-"""The controller that the state repo is written for: Flux or Argo CD, as ``demandops.yaml`` says.
+"""The manifests of the state repo, for the controller that ``demandops.yaml`` names.
 
-What is the same for both is here: a service's Helm values, and connections, which are plain
-manifests.
+A service's Helm values and the plain manifests of connections are the same for Flux and Argo CD.
 """
 
 from __future__ import annotations
@@ -15,10 +14,11 @@ from demandops.render.helm_values import values_of
 
 
 def render(release: Release, config: Config, engine: Engine) -> str:
-    """Return the one file of a release.
+    """Return the manifests of a release as the text of one file.
 
     Raises:
-        InvalidInput: where an appdef's values template fails or its values break the chart's
+        Refused: if the registry has no image for a communication client.
+        InvalidInput: if an appdef's values template fails or its values do not match the chart's
             schema.
     """
     if not isinstance(release, ServiceRelease):
@@ -30,11 +30,11 @@ def render(release: Release, config: Config, engine: Engine) -> str:
 
 
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return the files that stay when nothing is demanded.
+    """Return the files that exist even without demands.
 
-    For each cluster what makes its controller follow the repo; for each access domain on it a
-    placeholder: Git drops empty folders, and a missing folder makes Flux and Argo CD fail instead
-    of pruning.
+    Each cluster has a bootstrap file, with which its controller follows the repo. Each access
+    domain on it has a placeholder: Git drops empty folders, and on a missing folder Flux and Argo
+    CD fail instead of pruning.
     """
     if config.repository.gitops == "argocd":
         return argocd.base_files(config, engine)
