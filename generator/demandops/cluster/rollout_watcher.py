@@ -1,7 +1,7 @@
-"""What came of demands: follows releases on their clusters until they are as far as asked.
+"""Follows releases on their clusters until they reach the requested level.
 
-One thread looks at what is followed whenever a watch brings news. A cluster that is away holds up
-those who wait for it and nobody else.
+One thread evaluates the rollouts whenever a watch reports a change. A cluster that is away delays
+only the rollouts on it.
 """
 
 from __future__ import annotations
@@ -31,53 +31,53 @@ from demandops.cluster.object_cache import ObjectCache
 log = logging.getLogger("demandops")
 
 OnProgress = Callable[[str, str], None]
-"""Called with a state (``reconciled``, ``healthy``, ``failing``) and a text, once for each news."""
+"""Called with a state (``reconciled``, ``healthy``, ``failing``) and a text, once for each text."""
 
-_QUIET_S = 0.05
-_LONGEST_S = 1.0
+_PAUSE_S = 0.05
+_LONGEST_WAIT_S = 1.0
 
 
 @dataclass(eq=False)
-class _Followed:
+class _Rollout:
     commit: str
     domains: tuple[ClusterDomain, ...]
     targets: tuple[Target, ...]
     level: Level
     deadline: float
-    told: OnProgress
+    on_progress: OnProgress
     future: Future[Health] = field(default_factory=Future)
-    said: set[str] = field(default_factory=set)
+    reported: set[str] = field(default_factory=set)
     failed: Health | None = None
     confirmed: bool = False
     busy: bool = False
 
 
 class RolloutWatcher:
-    """Watches clusters, as many as the operator's file names."""
+    """Follows releases on the clusters that the operator's file names."""
 
     def __init__(self, clusters: Mapping[str, ClusterAccess], history: History) -> None:
-        """Start with no watch; those of a place begin when something there is followed.
+        """Start without watches; the watches of a domain start with its first rollout.
 
         Args:
-            clusters: how each cluster is reached; those without a kubeconfig tell nothing.
-            history: the commits of the state repo; asked from the status thread.
+            clusters: the access to each cluster; clusters without a kubeconfig are ignored.
+            history: the commits of the state repo; called from the status thread.
         """
         self._history = history
-        self._news = threading.Event()
+        self._changed = threading.Event()
         self._closed = False
         self._lock = threading.Lock()
-        self._open: list[_Followed] = []
-        self._stores = {
-            name: ObjectCache(name, reached, self._news.set)
-            for name, reached in clusters.items()
-            if reached.kubeconfig
+        self._open: list[_Rollout] = []
+        self._caches = {
+            name: ObjectCache(name, access, self._changed.set)
+            for name, access in clusters.items()
+            if access.kubeconfig
         }
         self._thread = threading.Thread(target=self._run, name="demandops-status", daemon=True)
         self._thread.start()
 
     def why_unreachable(self, domains: Iterable[ClusterDomain]) -> str:
-        """Return why something at these domains cannot be followed; empty where it can."""
-        missing = sorted({domain.cluster for domain in domains} - set(self._stores))
+        """Return why releases in these domains cannot be followed; empty if they can."""
+        missing = sorted({domain.cluster for domain in domains} - set(self._caches))
         return f"no access to cluster {', '.join(missing)}" if missing else ""
 
     def follow(
@@ -86,141 +86,144 @@ class RolloutWatcher:
         targets: Iterable[Target],
         level: Level,
         timeout: float,
-        told: OnProgress = lambda state, text: None,
+        on_progress: OnProgress = lambda state, text: None,
     ) -> Future[Health]:
         """Follow releases of a published commit; returns at once.
 
         Args:
-            commit: the commit that holds what is asked.
-            targets: the releases; all at domains that :meth:`reaches`.
-            level: how far they must be.
-            timeout: seconds until it is answered anyway.
-            told: called with each news, from the status thread.
+            commit: the published commit.
+            targets: the releases; :meth:`why_unreachable` must be empty for their domains.
+            level: the level that they have to reach.
+            timeout: seconds until the future is resolved in any case.
+            on_progress: called with each new state, from the status thread.
 
         Returns:
-            A future that gives the health once it reaches ``level``, or at the end of the timeout
-            with the reason why it did not.
+            A future of the health. It is resolved when the health reaches ``level``, or after the
+            timeout with the reason.
         """
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))
-        followed = _Followed(commit, domains, targets, level, time.monotonic() + timeout, told)
+        deadline = time.monotonic() + timeout
+        rollout = _Rollout(commit, domains, targets, level, deadline, on_progress)
         for domain in domains:
-            self._stores[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
+            self._caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
         with self._lock:
-            self._open.append(followed)
-        self._news.set()
-        return followed.future
+            self._open.append(rollout)
+        self._changed.set()
+        return rollout.future
 
     def close(self) -> None:
-        """Stop; what is still followed is answered with what is known."""
+        """Stop; open futures are resolved with the current health."""
         self._closed = True
-        self._news.set()
+        self._changed.set()
         self._thread.join(5)
-        for store in self._stores.values():
-            store.close()
+        for cache in self._caches.values():
+            cache.close()
 
     def _run(self) -> None:
         while not self._closed:
-            self._news.wait(_LONGEST_S)
-            self._news.clear()
-            self._look()
-            time.sleep(_QUIET_S)  # news come in swarms
-        self._look(last=True)
+            self._changed.wait(_LONGEST_WAIT_S)
+            self._changed.clear()
+            self._evaluate()
+            time.sleep(_PAUSE_S)  # changes come in bursts
+        self._evaluate(last=True)
 
-    def _look(self, last: bool = False) -> None:
+    def _evaluate(self, last: bool = False) -> None:
         with self._lock:
-            followed = list(self._open)
-        if not followed:
+            rollouts = list(self._open)
+        if not rollouts:
             return
-        objects = {name: store.objects() for name, store in self._stores.items()}
-        for one in followed:
-            if one.busy and not last:
+        objects = {name: cache.objects() for name, cache in self._caches.items()}
+        for rollout in rollouts:
+            if rollout.busy and not last:
                 continue
-            health = self._health(one, objects)
-            if health.reaches("healthy") and not (one.confirmed or last):
-                self._beside(one, self._confirm)
+            health = self._health(rollout, objects)
+            if health.reaches("healthy") and not (rollout.confirmed or last):
+                self._in_background(rollout, self._confirm)
                 continue
-            self._tell(one, health)
-            one.failed = health if health.failing else one.failed
-            if health.reaches(one.level) or last:
-                self._answer(one, health)
-            elif time.monotonic() > one.deadline:
-                self._beside(one, partial(self._give_up, health=health))
+            self._report(rollout, health)
+            rollout.failed = health if health.failing else rollout.failed
+            if health.reaches(rollout.level) or last:
+                self._resolve(rollout, health)
+            elif time.monotonic() > rollout.deadline:
+                self._in_background(rollout, partial(self._time_out, health=health))
 
-    def _beside(self, one: _Followed, work: Callable[[_Followed], None]) -> None:
-        """Ask a cluster in a thread of its own, for it may not answer."""
-        one.busy = True
+    def _in_background(self, rollout: _Rollout, work: Callable[[_Rollout], None]) -> None:
+        """Run work that queries a cluster in its own thread, because it may not answer."""
+        rollout.busy = True
 
         def run() -> None:
             try:
-                work(one)
+                work(rollout)
             except Exception as error:
                 log.debug("a cluster did not answer: %s", error)
-            one.busy = False
-            self._news.set()
+            rollout.busy = False
+            self._changed.set()
 
         threading.Thread(target=run, name="demandops-status-ask", daemon=True).start()
 
-    def _confirm(self, one: _Followed) -> None:
-        for domain in one.domains:
-            self._stores[domain.cluster].refresh(health_reader(domain).objects_to_confirm(domain))
-        one.confirmed = True
+    def _confirm(self, rollout: _Rollout) -> None:
+        for domain in rollout.domains:
+            self._caches[domain.cluster].refresh(health_reader(domain).objects_to_confirm(domain))
+        rollout.confirmed = True
 
-    def _give_up(self, one: _Followed, health: Health) -> None:
-        """Answer at the end of the timeout, with what the pods say where a Deployment hangs.
+    def _time_out(self, rollout: _Rollout, health: Health) -> None:
+        """Resolve a rollout after its timeout; add the reason of pods that do not run.
 
-        Where it is just being tried again, what failed before is the reason.
+        If the controller is just retrying, add the reason of the earlier failure.
         """
-        failed = one.failed
+        failed = rollout.failed
         if failed and not health.failing and failed.object == health.object:
             health = replace(health, reason=f"{health.reason}; before: {failed.reason}")
         kind, _, name = health.object.partition(" ")
         if kind == "Deployment":
             namespace, _, deployment = name.partition("/")
             with suppress(Exception):
-                for target in one.targets:
+                for target in rollout.targets:
                     if target.domain.namespace == namespace:
-                        store = self._stores[target.domain.cluster]
-                        why = store.why_unavailable(namespace, deployment)
-                        if why:
-                            health = replace(health, reason=f"{health.reason}; {why}")
+                        cache = self._caches[target.domain.cluster]
+                        reason = cache.why_unavailable(namespace, deployment)
+                        if reason:
+                            health = replace(health, reason=f"{health.reason}; {reason}")
                             break
-        self._answer(one, health)
+        self._resolve(rollout, health)
 
-    def _answer(self, one: _Followed, health: Health) -> None:
+    def _resolve(self, rollout: _Rollout, health: Health) -> None:
         with self._lock:
-            if one not in self._open:
+            if rollout not in self._open:
                 return
-            self._open.remove(one)
-        one.future.set_result(health)
+            self._open.remove(rollout)
+        rollout.future.set_result(health)
 
-    def _health(self, one: _Followed, objects: Mapping[str, Objects]) -> Health:
-        domains = [self._of_place(domain, one.commit, objects) for domain in one.domains]
-        found = worst(domains)
-        if found.state == "waiting" or not one.domains:
-            return found
-        return worst([self._of_target(target, one.commit, objects) for target in one.targets])
+    def _health(self, rollout: _Rollout, objects: Mapping[str, Objects]) -> Health:
+        commit = rollout.commit
+        health = worst([self._domain_health(domain, commit, objects) for domain in rollout.domains])
+        if health.state == "waiting" or not rollout.domains:
+            return health
+        return worst([self._release_health(target, commit, objects) for target in rollout.targets])
 
-    def _of_place(
+    def _domain_health(
         self, domain: ClusterDomain, commit: str, objects: Mapping[str, Objects]
     ) -> Health:
-        read = health_reader(domain)
-        unread = self._stores[domain.cluster].why_unknown(read.objects_to_watch(domain))
-        if unread:
-            return Health("waiting", f"cannot be read: {unread}", f"cluster {domain.cluster}")
-        return read.domain_health(domain, commit, objects[domain.cluster], self._history)
+        reader = health_reader(domain)
+        reason = self._caches[domain.cluster].why_unknown(reader.objects_to_watch(domain))
+        if reason:
+            return Health("waiting", f"cannot be read: {reason}", f"cluster {domain.cluster}")
+        return reader.domain_health(domain, commit, objects[domain.cluster], self._history)
 
-    def _of_target(self, target: Target, commit: str, objects: Mapping[str, Objects]) -> Health:
-        found = objects[target.domain.cluster]
-        return health_reader(target.domain).release_health(target, commit, found, self._history)
+    def _release_health(
+        self, target: Target, commit: str, objects: Mapping[str, Objects]
+    ) -> Health:
+        reader = health_reader(target.domain)
+        return reader.release_health(target, commit, objects[target.domain.cluster], self._history)
 
     @staticmethod
-    def _tell(one: _Followed, health: Health) -> None:
+    def _report(rollout: _Rollout, health: Health) -> None:
         reached = [level for level in ("reconciled", "healthy") if health.reaches(level)]
-        news = [(level, level) for level in reached]
+        states = [(level, level) for level in reached]
         if health.failing:
-            news.append(("failing", f"{health.object}: {health.reason}"))
-        for state, text in news:
-            if text not in one.said:
-                one.said.add(text)
-                one.told(state, text)
+            states.append(("failing", f"{health.object}: {health.reason}"))
+        for state, text in states:
+            if text not in rollout.reported:
+                rollout.reported.add(text)
+                rollout.on_progress(state, text)

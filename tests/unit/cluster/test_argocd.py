@@ -105,7 +105,7 @@ FAILED = {"kind": "Application", "name": "od-edge", "status": "SyncFailed", "mes
               finishedAt=AT, resources=[FAILED])),
          "waiting", "one failed. Retrying; Application od-edge: forbidden", True),
         (over(sync="OutOfSync", at="a", operation=synced("Running", "a", "no", finishedAt=AT)),
-         "waiting", "has not applied the commit yet; of a it says: no", False),
+         "waiting", "has not applied the commit yet; for a it reports: no", False),
         (over(sync="Unknown", at="", conditions=(condition("ComparisonError", "", "no route"),)),
          "waiting", "ComparisonError: no route", True),
         (over(sync="Synced", at="a", conditions=(condition("OrphanedResourceWarning", "", "w"),)),
@@ -130,11 +130,11 @@ BAD = condition("Progressing", "False", "timed out")
     ("child", "made", "state", "reason", "failing"),
     [
         (None, None, "reconciled", "is not there yet", False),
-        (application(NEW), None, "reconciled", "was not looked at yet", False),
+        (application(NEW), None, "reconciled", "has not been compared yet", False),
         (application(NEW, sync="Synced", at="b"), None, "healthy", "", False),
         # Healthy as it was before the change
         (application(NEW, sync="Synced", at="b", compared=OLD), None, "reconciled",
-         "was not compared in its present form yet", False),
+         "has not been compared with its current spec yet", False),
         (application(NEW, sync="OutOfSync", at="b"), None, "reconciled", "is being synced", False),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "waiting for "
                      "healthy state", of=NEW)), None, "reconciled", "waiting for healthy", False),
@@ -157,12 +157,12 @@ BAD = condition("Progressing", "False", "timed out")
                      ), None, "reconciled", "ComparisonError: no chart", True),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
                      of=NEW)), None, "reconciled", "denied", True),
-        # a failure of its former form: past, unless it still holds the new one up
+        # a failure of its previous spec counts only while it is still retried
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
                      of=OLD)), None, "reconciled", "denied", False),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "denied",
                      of=OLD, finishedAt=AT)), None, "reconciled",
-         "its former form is still tried: denied", True),
+         "its previous spec is still being retried: denied", True),
     ],
 )  # fmt: skip
 def test_a_service_is_healthy_when_it_is_synced_as_it_stands_now_and_all_is_there(
@@ -207,7 +207,7 @@ def test_a_chart_that_changed_in_its_folder_is_waited_for(
     }
     health = ARGOCD.release_health(SERVICE, "b", objects, Letters(changing))
     assert health.state == state
-    assert health.reason == ("" if state == "healthy" else "has not taken the commit's chart yet")
+    assert health.reason == ("" if state == "healthy" else "has not applied the commit's chart yet")
 
 
 def test_a_chart_of_a_registry_has_its_version_in_the_source() -> None:
@@ -252,7 +252,7 @@ def test_one_that_is_being_removed_is_not_what_is_wanted_anew() -> None:
     child = application(NEW, sync="Synced", at="b")
     child["metadata"]["deletionTimestamp"] = AT
     health = ARGOCD.release_health(SERVICE, "b", {CHILD: child}, COMMITS)
-    assert health.state == "reconciled" and "made anew" in health.reason
+    assert health.state == "reconciled" and "created again" in health.reason
 
 
 def test_seen_and_since_when_are_the_cluster_s_to_say() -> None:

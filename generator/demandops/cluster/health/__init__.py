@@ -1,7 +1,7 @@
-"""What the objects of a cluster say about releases: by Flux's health_reader, or Argo CD's. Pure.
+"""The health of releases, computed from a cluster's objects. Pure.
 
-What is asked here is asked of any place; each knows by which controller it is kept, so a state
-repo may go over from one to the other while demands are followed.
+Flux and Argo CD each have a reader. Every :class:`ClusterDomain` knows its controller, so a state
+repo may switch controllers while rollouts are followed.
 """
 
 from __future__ import annotations
@@ -40,5 +40,5 @@ __all__ = [
 
 
 def health_reader(domain: ClusterDomain) -> HealthReader:
-    """Return how the objects of a place are read."""
+    """Return the reader for the controller of a domain."""
     return argocd if domain.application else flux

@@ -1,4 +1,4 @@
-"""What Deployments say of themselves (apps/v1), and conditions in general. Pure."""
+"""The health of Deployments (apps/v1), and how to find a condition. Pure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from demandops.cluster.health.model import Health, Object, Objects, Target
 
 
 def deployment_health(found: Object) -> Health:
-    """Return whether all replicas of a Deployment are there in its present form."""
+    """Return whether all replicas of a Deployment are available with its current spec."""
     metadata, status = found["metadata"], found.get("status") or {}
     name = f"Deployment {metadata.get('namespace')}/{metadata.get('name')}"
     wanted = (found.get("spec") or {}).get("replicas", 1)
@@ -23,7 +23,7 @@ def deployment_health(found: Object) -> Health:
 
 
 def client_health(target: Target, objects: Objects) -> Health:
-    """Return whether a connection end runs: plain manifests, so its Deployment is all there is."""
+    """Return whether a communication client runs; its Deployment decides."""
     namespace = target.domain.namespace
     found = objects.get(("Deployment", namespace, target.name))
     if found is None:
@@ -32,6 +32,6 @@ def client_health(target: Target, objects: Objects) -> Health:
 
 
 def condition(status: Object, kind: str) -> Object:
-    """Return the condition of a type, empty where there is none."""
-    found = (item for item in status.get("conditions") or () if item.get("type") == kind)
-    return next(found, {})
+    """Return the condition of a type; empty if there is none."""
+    conditions = status.get("conditions") or ()
+    return next((item for item in conditions if item.get("type") == kind), {})

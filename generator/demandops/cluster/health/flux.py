@@ -1,6 +1,6 @@
-"""What Flux's objects say about releases. Pure: objects in, health out.
+"""The health of releases, from Flux's objects. Pure.
 
-Objects are plain data as the Kubernetes API gives them. Field names as of Flux 2.9
+Objects are plain data as the Kubernetes API returns them. Field names as of Flux 2.9
 (kustomize.toolkit.fluxcd.io/v1, helm.toolkit.fluxcd.io/v2).
 """
 
@@ -21,20 +21,20 @@ _HELM_NAME = "helm.toolkit.fluxcd.io/name"
 
 
 def objects_to_watch(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-    """Return what must be known to tell how things are at a domain."""
+    """Return the objects that the health of a domain and its releases depends on."""
     kinds = ("Kustomization", "GitRepository", "HelmRelease", "Deployment")
     return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
 
 
 def objects_to_confirm(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-    """Return what is read once more before something is healthy: releases, then what they own."""
+    """Return the objects to read again before a release counts as healthy: owners come first."""
     return ObjectSelector("HelmRelease", domain.namespace), ObjectSelector(
         "Deployment", domain.namespace
     )
 
 
 def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether an access domain's Kustomization has applied a commit."""
+    """Return whether a domain's Kustomization has applied a commit."""
     found = objects.get(("Kustomization", domain.namespace, domain.name))
     name = f"Kustomization {domain.namespace}/{domain.name}"
     if found is None:
@@ -56,9 +56,9 @@ def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history:
 
 
 def release_health(target: Target, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether a release of an applied commit runs, or is gone where it is to be gone."""
+    """Return whether a release of an applied commit runs, or is removed if unwanted."""
     if not target.wanted:
-        return _gone(target, objects)
+        return _removal_health(target, objects)
     if not target.by_helm:
         return client_health(target, objects)
     release = objects.get(("HelmRelease", target.domain.namespace, target.name))
@@ -80,19 +80,19 @@ def release_health(target: Target, commit: str, objects: Objects, history: Histo
 
 
 def last_transition(target: Target, objects: Objects) -> str:
-    """Return since when a release is as it is, as the cluster says it; empty where it does not."""
+    """Return when the state of a release last changed; empty if the cluster does not say."""
     kind, ready = ("HelmRelease", "Ready") if target.by_helm else ("Deployment", "Available")
     found = objects.get((kind, target.domain.namespace, target.name)) or {}
     return str(condition(found.get("status") or {}, ready).get("lastTransitionTime", ""))
 
 
 def applied_commit(domain: ClusterDomain, objects: Objects) -> str:
-    """Return the commit that an access domain's Kustomization has applied, or nothing."""
+    """Return the commit that a domain's Kustomization has applied; empty if it is not known."""
     found = objects.get(("Kustomization", domain.namespace, domain.name)) or {}
     return _commit((found.get("status") or {}).get("lastAppliedRevision"))
 
 
-def _gone(target: Target, objects: Objects) -> Health:
+def _removal_health(target: Target, objects: Objects) -> Health:
     namespace = target.domain.namespace
     kind = "HelmRelease" if target.by_helm else "Deployment"
     if (kind, namespace, target.name) in objects or _deployments(target, objects):
@@ -101,7 +101,7 @@ def _gone(target: Target, objects: Objects) -> Health:
 
 
 def _deployments(target: Target, objects: Objects) -> list[Object]:
-    """Return a release's Deployments; helm-controller labels all that it installs."""
+    """Return a release's Deployments; helm-controller labels everything that it installs."""
     if not target.by_helm:
         return []
     return [

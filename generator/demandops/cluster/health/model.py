@@ -1,4 +1,4 @@
-"""The words in which it is told what a cluster says of releases, by whichever controller. Pure."""
+"""The types that describe the health of releases, the same for all controllers. Pure."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _ORDER: dict[str, int] = {"waiting": 0, "pushed": 0, "reconciled": 1, "healthy":
 
 
 class ObjectName(NamedTuple):
-    """Where an object is."""
+    """The namespace and name of an object."""
 
     namespace: str
     name: str
 
 
 class ObjectSelector(NamedTuple):
-    """Objects of a kind that are watched: all of a namespace, or the one with this name."""
+    """Selects objects of a kind: all in a namespace, or the one with this name."""
 
     kind: str
     namespace: str
@@ -31,7 +31,7 @@ class ObjectSelector(NamedTuple):
 class ClusterDomain:
     """An access domain on a cluster.
 
-    ``application`` is the Application over its folder where Argo CD follows, else Flux does.
+    ``application`` is the Argo CD Application of its folder; with Flux it is ``None``.
     """
 
     cluster: str
@@ -42,7 +42,10 @@ class ClusterDomain:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """One release and whether it is to be there. ``by_helm``: a service, else one Deployment."""
+    """A release, and whether it should run.
+
+    With ``by_helm`` it is a service, otherwise the single Deployment of a communication client.
+    """
 
     domain: ClusterDomain
     name: str
@@ -52,9 +55,10 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """How far something is. ``reason`` says why not further, in the controller's words where it
+    """The state of a domain or a release.
 
-    has some; ``object`` names the object that says so, ``failing`` whether it speaks of a failure.
+    ``reason`` says why it is not further, if possible in the controller's words. ``object`` is the
+    object that the reason comes from. ``failing`` says whether the reason is a failure.
     """
 
     state: State
@@ -63,7 +67,7 @@ class Health:
     failing: bool = False
 
     def reaches(self, level: Level) -> bool:
-        """Tell whether it is as far as ``level``."""
+        """Report whether the state is at least ``level``."""
         return _ORDER[self.state] >= _ORDER[level]
 
 
@@ -74,51 +78,51 @@ Objects = Mapping[Key, Object]
 
 
 class History(Protocol):
-    """What is asked of the state repo's commits."""
+    """Questions about the state repo's commits."""
 
     def includes(self, commit: str, other: str) -> bool:
-        """Tell whether ``commit`` is ``other`` or comes after it."""
+        """Report whether ``commit`` is ``other`` or comes after it."""
         ...
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Tell whether two commits hold the same under ``path``."""
+        """Report whether two commits have the same content under ``path``."""
         ...
 
 
 class HealthReader(Protocol):
-    """How the objects of one GitOps controller are read."""
+    """Reads the health of releases from the objects of a GitOps controller."""
 
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return what must be known to tell how things are at a domain."""
+        """Return the objects that the health of a domain and its releases depends on."""
         ...
 
     def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return what is read once more before something is healthy, in this order."""
+        """Return the objects to read again, in this order, before a release counts as healthy."""
         ...
 
     def domain_health(
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return whether a commit is applied in an access domain."""
+        """Return whether a commit is applied in a domain."""
         ...
 
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return whether a release of an applied commit runs, or is gone where it is to be."""
+        """Return whether a release of an applied commit runs, or is removed if unwanted."""
         ...
 
     def last_transition(self, target: Target, objects: Objects) -> str:
-        """Return since when a release is as it is, as the cluster says it; empty if it does not."""
+        """Return when the state of a release last changed; empty if the cluster does not say."""
         ...
 
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the commit that an access domain was seen to have applied, or nothing."""
+        """Return the commit that a domain has applied; empty if it is not known."""
         ...
 
 
 def worst(healths: list[Health]) -> Health:
-    """Return the health of the whole: the least far, one that fails before one that waits."""
+    """Return the least advanced health; of several, one that is failing."""
     return min(
         healths,
         key=lambda health: (_ORDER[health.state], not health.failing),
