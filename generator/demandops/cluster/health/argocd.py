@@ -40,13 +40,13 @@ def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history:
     """Return whether the Application of a domain's folder has applied a commit."""
     application = _folder_application(domain)
     name = f"Application {application.namespace}/{application.name}"
-    found = objects.get(("Application", *application))
-    if found is None:
+    app = objects.get(("Application", *application))
+    if app is None:
         return Health("waiting", "is not there; apply bootstrap/ to the cluster", name)
-    if any(history.includes(revision, commit) for revision in _applied_commits(found)):
+    if any(history.includes(revision, commit) for revision in _applied_commits(app)):
         return Health("reconciled")
     waiting = "has not applied the commit yet"
-    message, revision = _failure(found)
+    message, revision = _failure(app)
     if not message:
         return Health("waiting", waiting, name)
     if revision and not history.includes(revision, commit):
@@ -61,36 +61,36 @@ def release_health(target: Target, commit: str, objects: Objects, history: Histo
     if not target.by_helm:
         return client_health(target, objects)
     name = f"Application {target.domain.namespace}/{target.name}"
-    found = objects.get(("Application", target.domain.namespace, target.name))
-    if found is None:
+    app = objects.get(("Application", target.domain.namespace, target.name))
+    if app is None:
         return Health("reconciled", "is not there yet", name)
-    if found["metadata"].get("deletionTimestamp"):
+    if app["metadata"].get("deletionTimestamp"):
         return Health("reconciled", "is being removed and will then be created again", name)
-    outdated = _why_outdated(target.domain, found, commit, objects, history)
-    if not outdated and _status(found, "sync").get("status") == "Synced":
-        return _synced_health(found, name, objects)
-    message, _ = _failure(found)
+    outdated = _why_outdated(target.domain, app, commit, objects, history)
+    if not outdated and _status(app, "sync").get("status") == "Synced":
+        return _synced_health(app, name, objects)
+    message, _ = _failure(app)
     if message:
         return Health("reconciled", message, name, failing=True)
-    running = str(_status(found, "operationState").get("message") or "is being synced")
+    running = str(_status(app, "operationState").get("message") or "is being synced")
     return Health("reconciled", outdated or running, name)
 
 
 def last_transition(target: Target, objects: Objects) -> str:
     """Return when the state of a release last changed; empty if the cluster does not say."""
     kind = "Application" if target.by_helm else "Deployment"
-    found = objects.get((kind, target.domain.namespace, target.name)) or {}
+    item = objects.get((kind, target.domain.namespace, target.name)) or {}
     if target.by_helm:
-        state = _status(found, "health")
+        state = _status(item, "health")
     else:
-        state = condition(found.get("status") or {}, "Available")
+        state = condition(item.get("status") or {}, "Available")
     return str(state.get("lastTransitionTime", ""))
 
 
 def applied_commit(domain: ClusterDomain, objects: Objects) -> str:
     """Return the commit that a domain's Application has applied; empty if it is not known."""
-    found = objects.get(("Application", *_folder_application(domain)))
-    return next(iter(_applied_commits(found)), "") if found else ""
+    app = objects.get(("Application", *_folder_application(domain)))
+    return next(iter(_applied_commits(app)), "") if app else ""
 
 
 def _folder_application(domain: ClusterDomain) -> ObjectName:
@@ -98,14 +98,14 @@ def _folder_application(domain: ClusterDomain) -> ObjectName:
     return domain.application
 
 
-def _applied_commits(found: Object) -> list[str]:
+def _applied_commits(app: Object) -> list[str]:
     """Return the commits that an Application is known to have applied, the newest first.
 
     If it is Synced, that is the commit that it was compared with. If commits come fast, it may
     never be Synced, so the last successful sync of all resources counts too.
     """
-    source = (found.get("spec") or {}).get("source")
-    sync, operation = _status(found, "sync"), _status(found, "operationState")
+    source = (app.get("spec") or {}).get("source")
+    sync, operation = _status(app, "sync"), _status(app, "operationState")
     revisions = []
     compared = (sync.get("comparedTo") or {}).get("source")
     if sync.get("status") == "Synced" and _same(compared, source):
@@ -122,10 +122,10 @@ def _applied_commits(found: Object) -> list[str]:
 
 
 def _why_outdated(
-    domain: ClusterDomain, found: Object, commit: str, objects: Objects, history: History
+    domain: ClusterDomain, app: Object, commit: str, objects: Objects, history: History
 ) -> str:
     """Return why a status is not about the current spec and commit; empty if it is."""
-    sync, source = _status(found, "sync"), (found.get("spec") or {}).get("source") or {}
+    sync, source = _status(app, "sync"), (app.get("spec") or {}).get("source") or {}
     if not sync:
         return "has not been compared yet"
     if not _same((sync.get("comparedTo") or {}).get("source"), source):
@@ -142,9 +142,9 @@ def _why_outdated(
     return "has not applied the commit's chart yet"
 
 
-def _synced_health(found: Object, name: str, objects: Objects) -> Health:
+def _synced_health(app: Object, name: str, objects: Objects) -> Health:
     """Return the health of a service whose Application is synced, from its Deployments."""
-    for item in (found.get("status") or {}).get("resources") or ():
+    for item in (app.get("status") or {}).get("resources") or ():
         if item.get("kind") != "Deployment":
             continue
         key = ("Deployment", str(item.get("namespace", "")), str(item.get("name", "")))
@@ -153,7 +153,7 @@ def _synced_health(found: Object, name: str, objects: Objects) -> Health:
         health = deployment_health(objects[key])
         if health.state != "healthy":
             return health
-    reported = _status(found, "health")
+    reported = _status(app, "health")
     if reported.get("status") == "Healthy":
         return Health("healthy")
     reason = str(
@@ -166,10 +166,10 @@ def _removal_health(target: Target, objects: Objects) -> Health:
     namespace = target.domain.namespace
     kind = "Application" if target.by_helm else "Deployment"
     name = f"{kind} {namespace}/{target.name}"
-    found = objects.get((kind, namespace, target.name))
-    if found is None and not (target.by_helm and _has_leftovers(target, objects)):
+    item = objects.get((kind, namespace, target.name))
+    if item is None and not (target.by_helm and _has_leftovers(target, objects)):
         return Health("healthy")
-    message = _error(found or {}) if target.by_helm else ""
+    message = _error(item or {}) if target.by_helm else ""
     if message:
         return Health("reconciled", f"is still being removed; {message}", name, failing=True)
     return Health("reconciled", "is still being removed", name)
@@ -179,19 +179,19 @@ def _has_leftovers(target: Target, objects: Objects) -> bool:
     """Report whether a Deployment of a removed Application still exists."""
     tracked = f"{target.domain.namespace}_{target.name}:"
     return any(
-        str((found["metadata"].get("annotations") or {}).get(_TRACKED_BY, "")).startswith(tracked)
-        for (kind, namespace, _), found in objects.items()
+        str((item["metadata"].get("annotations") or {}).get(_TRACKED_BY, "")).startswith(tracked)
+        for (kind, namespace, _), item in objects.items()
         if kind == "Deployment" and namespace == target.domain.namespace
     )
 
 
-def _failure(found: Object) -> tuple[str, str]:
+def _failure(app: Object) -> tuple[str, str]:
     """Return why an Application fails and, if known, for which commit."""
-    operation = _status(found, "operationState")
+    operation = _status(app, "operationState")
     result = operation.get("syncResult") or {}
     revision = str(result.get("revision") or _requested_sync(operation).get("revision") or "")
     synced = result.get("source")
-    stale = synced and not _same(synced, (found.get("spec") or {}).get("source"))
+    stale = synced and not _same(synced, (app.get("spec") or {}).get("source"))
     phase = operation.get("phase")
     # A failed sync that will be retried has the phase Running, but also an end.
     if phase == "Running" and operation.get("finishedAt"):
@@ -199,7 +199,7 @@ def _failure(found: Object) -> tuple[str, str]:
         return prefix + _sync_message(operation), revision
     if phase in ("Failed", "Error") and not stale:
         return _sync_message(operation), revision
-    return _error(found), ""
+    return _error(app), ""
 
 
 def _sync_message(operation: Object) -> str:
@@ -218,16 +218,16 @@ def _sync_message(operation: Object) -> str:
     return "; ".join([message, *details[:_DETAILS]])
 
 
-def _error(found: Object) -> str:
+def _error(app: Object) -> str:
     """Return the first condition that is an error; other conditions are warnings."""
-    for item in (found.get("status") or {}).get("conditions") or ():
+    for item in (app.get("status") or {}).get("conditions") or ():
         if str(item.get("type", "")).endswith("Error"):
             return f"{item['type']}: {item.get('message', '')}"
     return ""
 
 
-def _status(found: Object, part: str) -> Object:
-    return (found.get("status") or {}).get(part) or {}
+def _status(app: Object, part: str) -> Object:
+    return (app.get("status") or {}).get(part) or {}
 
 
 def _requested_sync(operation: Object) -> Object:

@@ -5,19 +5,19 @@ from __future__ import annotations
 from demandops.cluster.health.model import Health, Object, Objects, Target
 
 
-def deployment_health(found: Object) -> Health:
+def deployment_health(deployment: Object) -> Health:
     """Return whether all replicas of a Deployment are available with its current spec."""
-    metadata, status = found["metadata"], found.get("status") or {}
+    metadata, status = deployment["metadata"], deployment.get("status") or {}
     name = f"Deployment {metadata.get('namespace')}/{metadata.get('name')}"
-    wanted = (found.get("spec") or {}).get("replicas", 1)
+    wanted = (deployment.get("spec") or {}).get("replicas", 1)
     current = status.get("observedGeneration", 0) >= metadata.get("generation", 0)
     updated, available = status.get("updatedReplicas", 0), status.get("availableReplicas", 0)
     if current and updated >= wanted and available >= wanted:
         return Health("healthy")
     for kind, bad in (("ReplicaFailure", "True"), ("Progressing", "False")):
-        found_condition = condition(status, kind)
-        if found_condition.get("status") == bad:
-            message = str(found_condition.get("message", ""))
+        problem = condition(status, kind)
+        if problem.get("status") == bad:
+            message = str(problem.get("message", ""))
             return Health("reconciled", message, name, failing=True)
     return Health("reconciled", f"{available} of {wanted} replicas are available", name)
 
@@ -25,10 +25,10 @@ def deployment_health(found: Object) -> Health:
 def client_health(target: Target, objects: Objects) -> Health:
     """Return whether a communication client runs; its Deployment decides."""
     namespace = target.domain.namespace
-    found = objects.get(("Deployment", namespace, target.name))
-    if found is None:
+    deployment = objects.get(("Deployment", namespace, target.name))
+    if deployment is None:
         return Health("reconciled", "is not there yet", f"Deployment {namespace}/{target.name}")
-    return deployment_health(found)
+    return deployment_health(deployment)
 
 
 def condition(status: Object, kind: str) -> Object:

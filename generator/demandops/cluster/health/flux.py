@@ -35,11 +35,11 @@ def objects_to_confirm(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
 
 def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history: History) -> Health:
     """Return whether a domain's Kustomization has applied a commit."""
-    found = objects.get(("Kustomization", domain.namespace, domain.name))
+    kustomization = objects.get(("Kustomization", domain.namespace, domain.name))
     name = f"Kustomization {domain.namespace}/{domain.name}"
-    if found is None:
+    if kustomization is None:
         return Health("waiting", "is not there; apply bootstrap/ to the cluster", name)
-    status = found.get("status") or {}
+    status = kustomization.get("status") or {}
     reached = _commit(status.get("lastAppliedRevision"))
     if reached and history.includes(reached, commit):
         return Health("reconciled")
@@ -47,10 +47,10 @@ def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history:
     ready = condition(status, "Ready")
     if ready.get("status") == "False" and attempted and history.includes(attempted, commit):
         return Health("waiting", str(ready.get("message", "")), name, failing=True)
-    source = objects.get(("GitRepository", domain.namespace, _source(found)))
+    source = objects.get(("GitRepository", domain.namespace, _source(kustomization)))
     fetched = condition((source or {}).get("status") or {}, "Ready")
     if fetched.get("status") == "False":
-        at = f"GitRepository {domain.namespace}/{_source(found)}"
+        at = f"GitRepository {domain.namespace}/{_source(kustomization)}"
         return Health("waiting", str(fetched.get("message", "")), at, failing=True)
     return Health("waiting", "has not applied the commit yet", name)
 
@@ -82,14 +82,14 @@ def release_health(target: Target, commit: str, objects: Objects, history: Histo
 def last_transition(target: Target, objects: Objects) -> str:
     """Return when the state of a release last changed; empty if the cluster does not say."""
     kind, ready = ("HelmRelease", "Ready") if target.by_helm else ("Deployment", "Available")
-    found = objects.get((kind, target.domain.namespace, target.name)) or {}
-    return str(condition(found.get("status") or {}, ready).get("lastTransitionTime", ""))
+    item = objects.get((kind, target.domain.namespace, target.name)) or {}
+    return str(condition(item.get("status") or {}, ready).get("lastTransitionTime", ""))
 
 
 def applied_commit(domain: ClusterDomain, objects: Objects) -> str:
     """Return the commit that a domain's Kustomization has applied; empty if it is not known."""
-    found = objects.get(("Kustomization", domain.namespace, domain.name)) or {}
-    return _commit((found.get("status") or {}).get("lastAppliedRevision"))
+    kustomization = objects.get(("Kustomization", domain.namespace, domain.name)) or {}
+    return _commit((kustomization.get("status") or {}).get("lastAppliedRevision"))
 
 
 def _removal_health(target: Target, objects: Objects) -> Health:
@@ -105,11 +105,11 @@ def _deployments(target: Target, objects: Objects) -> list[Object]:
     if not target.by_helm:
         return []
     return [
-        found
-        for (kind, namespace, _), found in objects.items()
+        item
+        for (kind, namespace, _), item in objects.items()
         if kind == "Deployment"
         and namespace == target.domain.namespace
-        and (found["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
+        and (item["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
     ]
 
 
