@@ -11,7 +11,7 @@ from typing import Any
 
 from demandops import decision
 from demandops.decision import State
-from demandops.render.changes.changeset import Changeset, Read
+from demandops.render.changes.changeset import Changeset, FileReader
 
 
 def document(demand: Mapping[str, Any]) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def document(demand: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def decide(
-    state: State, demand: Mapping[str, Any], now: datetime, read: Read
+    state: State, demand: Mapping[str, Any], now: datetime, read: FileReader
 ) -> tuple[State, Changeset]:
     """Judge a demand; raises :class:`Refused`."""
     made = decision.decide(state, document(demand), now, read)

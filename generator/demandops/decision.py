@@ -39,7 +39,7 @@ from demandops.plan.overrides.claims_in_force import in_force
 from demandops.plan.release_keys import affected, all_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
-from demandops.render.changes.changeset import Read, ReleaseChange
+from demandops.render.changes.changeset import FileReader, ReleaseChange
 from demandops.render.engine import Engine
 
 _SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
@@ -103,7 +103,7 @@ def decide(
     state: State,
     goal: object,
     now: datetime,
-    read: Read,
+    read: FileReader,
     on_stage: Callable[[Stage], None] = lambda stage: None,
     throttle: Throttle = lambda request, config: (),
 ) -> Decision:
@@ -132,7 +132,7 @@ def decide(
     try:
         ledger, changes = _booked(state, request, now)
         keys = affected(state.ledger, ledger, state.config, changes.subjects())
-        made = changeset.of_change(
+        made = changeset.build_changeset(
             state.ledger, ledger, changes.claims, keys, (state.config, state.engine, read)
         )
     except Refused as error:
@@ -151,7 +151,7 @@ def decide(
         warnings=(
             *_uncarried(request, ledger, state.config),
             *_bridged(request, state.config),
-            *made.waiting,
+            *made.blocked,
             *denial.warnings(request, ledger, state.config),
         ),
         approval=approval_rule.asked_by(
@@ -221,11 +221,13 @@ def form_faults(goal: object) -> list[Fault]:
 
 
 def consequence(
-    state: State, before: Ledger, subjects: Iterable[Subject], read: Read
+    state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
     """Return what a change of the books that a person made asks of the rendered files."""
     keys = affected(before, state.ledger, state.config, subjects)
-    return changeset.of_change(before, state.ledger, (), keys, (state.config, state.engine, read))
+    return changeset.build_changeset(
+        before, state.ledger, (), keys, (state.config, state.engine, read)
+    )
 
 
 def rendered(state: State, standing: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
@@ -307,4 +309,4 @@ def rehearse(state: State) -> None:
     Raises:
         Refused, InvalidInput: naming the template, the values or the override that does not work.
     """
-    trial_render.rehearse(state.config, state.engine)
+    trial_render.render_trial_demands(state.config, state.engine)

@@ -16,7 +16,7 @@ from threading import Thread
 from typing import Any
 
 from demandops.cluster.health import Level
-from demandops.cluster.rollout_status import RolloutStatus
+from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.errors import NotReached, QueueFull, ShuttingDown, Withdrawn
 from demandops.service import Generator, Receipt
 from demandops_interfaces.srv import GetBookkeeping
@@ -50,7 +50,7 @@ class Answers:
 
     level: Level = "pushed"
     timeout_s: float = 120.0
-    status: RolloutStatus | None = None
+    status: RolloutWatcher | None = None
 
 
 class DemandNode(Node):  # type: ignore[misc]
@@ -176,7 +176,7 @@ class DemandNode(Node):  # type: ignore[misc]
         """Return why it cannot be told what comes of a demand; empty where it can."""
         if self._answers.status is None:
             return "answered at pushed: this node has no access to the clusters"
-        problem = self._answers.status.reaches(target.place for target in receipt.targets)
+        problem = self._answers.status.why_unreachable(target.domain for target in receipt.targets)
         return f"answered at pushed: {problem}" if problem else ""
 
     async def _followed(

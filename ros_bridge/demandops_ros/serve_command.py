@@ -16,7 +16,7 @@ import click
 import rclpy
 from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
-from demandops.cluster.rollout_status import RolloutStatus
+from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.service import Generator
 from demandops.service.push_listener import Webhook, read_secret
 from demandops.service.timing.polling import DEFAULT_INTERVAL, interval_s
@@ -133,7 +133,7 @@ def serve(
         generator.watch(waker)
         waker(generator.snapshot.state.config)  # an earlier run may have ended right after a push
         hook = Webhook(webhook, secret, generator.look) if webhook else None
-        status = RolloutStatus(clusters, generator) if clusters else None
+        status = RolloutWatcher(clusters, generator) if clusters else None
         _run(generator, settings, status, hook)
         waker.close()
     finally:
@@ -189,7 +189,7 @@ def _as_told(value: object) -> str:
 def _run(
     generator: Generator,
     settings: dict[str, Any],
-    status: RolloutStatus | None,
+    status: RolloutWatcher | None,
     hook: Webhook | None,
 ) -> None:
     node = DemandNode(
@@ -232,7 +232,7 @@ def _drain(
     executor: SingleThreadedExecutor,
     node: DemandNode,
     generator: Generator,
-    status: RolloutStatus | None,
+    status: RolloutWatcher | None,
 ) -> None:
     """Finish what is in hand: goals under way get their results before the node goes."""
     node.stop_accepting()

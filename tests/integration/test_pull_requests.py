@@ -119,7 +119,7 @@ def test_edited_values_image_and_replicas_become_an_override_to_paste(
         "\n"
         "apiVersion: demandops/v1\n"
         "kind: Override\n"
-        'reason: "Say here why; this stands for an edit of a generated file by hand"\n'
+        'reason: "Say here why; this replaces a manual edit of a generated file"\n'
         "owner: Petra\n"
         "select:\n"
         "- applications:\n"

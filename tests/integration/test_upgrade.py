@@ -195,7 +195,7 @@ def test_a_dry_run_tells_all_and_writes_nothing(
         "\n  write  demandops.yaml\n"
         "\n"
         "before this, on the clusters:\n"
-        "- c-its: suspend Flux, which would remove what it no longer finds\n"
+        "- c-its: suspend Flux, so that it does not prune the workloads\n"
         "      kubectl -n perception patch kustomization perception --type merge -p "
         '\'{"spec":{"suspend":true}}\'\n'
         "      kubectl -n perception get helmrelease -l "
@@ -203,9 +203,9 @@ def test_a_dry_run_tells_all_and_writes_nothing(
         'patch --type merge -p \'{"spec":{"suspend":true}}\'\n'
         "\n"
         "after it, on the clusters:\n"
-        "- c-its: have the cluster follow the repo again; wait until all Applications are Synced\n"
+        "- c-its: make the cluster follow the repo again; wait until all Applications are Synced\n"
         "      git show main:bootstrap/c-its.yaml | kubectl apply -f -\n"
-        "- c-its: delete what Flux had; suspended, it removes nothing\n"
+        "- c-its: delete Flux's objects; because Flux is suspended, no workload is removed\n"
         "      kubectl -n perception get helmrelease -l "
         "kustomize.toolkit.fluxcd.io/name=perception -o name | sed s,.*/,, | xargs -r -I NAME "
         "kubectl -n perception delete secret -l owner=helm,name=NAME\n"

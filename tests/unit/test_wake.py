@@ -85,7 +85,7 @@ def test_a_receiver_is_called_after_a_push(receiver: tuple[str, list[str]]) -> N
     url, heard = receiver
     state, _ = start("experiment")
     waker = reconcile_trigger.ReconcileTrigger(
-        changed=unknown, clusters={"c-its": access.ClusterAccess(receiver=url)}
+        changes_since=unknown, clusters={"c-its": access.ClusterAccess(receiver=url)}
     )
     waker(state.config)
     waker.close()
@@ -149,7 +149,7 @@ def test_the_object_that_fetches_is_annotated(
     kubeconfig, heard = api
     state, _ = start(case)
     waker = reconcile_trigger.ReconcileTrigger(
-        changed=unknown, clusters={"c-its": access.ClusterAccess(kubeconfig=kubeconfig)}
+        changes_since=unknown, clusters={"c-its": access.ClusterAccess(kubeconfig=kubeconfig)}
     )
     waker(state.config)
     waker.close()
@@ -160,7 +160,7 @@ def test_the_object_that_fetches_is_annotated(
 def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:
     url, heard = receiver
     reconcile_trigger.ReconcileTrigger(
-        changed=unknown, clusters={"c-its": access.ClusterAccess(receiver=url)}
+        changes_since=unknown, clusters={"c-its": access.ClusterAccess(receiver=url)}
     ).close()
     assert heard == []
 
@@ -172,7 +172,7 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
     state, _ = start("experiment")
     away = access.ClusterAccess(receiver="http://127.0.0.1:1/hook/secret")
     waker = reconcile_trigger.ReconcileTrigger(
-        changed=unknown, clusters={"away": away, "here": access.ClusterAccess(receiver=url)}
+        changes_since=unknown, clusters={"away": away, "here": access.ClusterAccess(receiver=url)}
     )
     waker(state.config)
     waker.close()
@@ -186,7 +186,7 @@ def test_a_cluster_that_did_not_answer_is_tried_again(receiver: tuple[str, list[
     url, heard = receiver
     state, _ = start("experiment")
     waker = reconcile_trigger.ReconcileTrigger(
-        changed=unknown, clusters={"c-its": access.ClusterAccess(receiver=f"{url}?fail=1")}
+        changes_since=unknown, clusters={"c-its": access.ClusterAccess(receiver=f"{url}?fail=1")}
     )
     try:
         waker(state.config)

@@ -1,8 +1,8 @@
-"""How the clusters are reached: a file of the operator's that is not part of the state repo.
+"""The operator's file with the access to each cluster. It is optional and not in the state repo.
 
-Optional. With a kubeconfig a cluster tells what became of a demand, and is woken after a push; the
-webhook of its Flux or Argo CD can only wake. What signs the calls of a webhook stands in a file of
-its own, never in this one.
+With a kubeconfig, the generator reads a cluster's objects and wakes its controller after a push.
+With a webhook of Flux or Argo CD, it can only wake the controller. The secret that signs webhook
+calls is in a separate file.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from demandops.errors import Fault, InvalidInput, fault
 
 
 class NoAccess(ValueError):
-    """A cluster cannot be called, for a reason in the operator's files; it names no secret."""
+    """Raised when the operator's files give no usable access; the message contains no secret."""
 
 
 class ClusterAccess(Frozen):
-    """How one cluster is reached: through its API, by a webhook of its controller, or both.
+    """The access to a cluster: its API, a webhook of its controller, or both.
 
-    ``receiver`` is the URL of a Flux Receiver, ``webhook`` that of an Argo CD; ``secret_file``
-    holds what signs calls of them. ``wake``: whether it is told to fetch after a push.
+    ``receiver`` is the URL of a Flux Receiver and ``webhook`` that of an Argo CD. ``secret_file``
+    holds the secret that signs calls to them. ``wake`` says whether the controller is woken after
+    a push.
     """
 
     kubeconfig: Path | None = Field(default=None, strict=False)
@@ -35,27 +36,27 @@ class ClusterAccess(Frozen):
     wake: bool = True
 
     @model_validator(mode="after")
-    def _some_way(self) -> ClusterAccess:
-        called = self.receiver or self.webhook
-        if not (self.kubeconfig or called):
+    def _check_complete(self) -> ClusterAccess:
+        url = self.receiver or self.webhook
+        if not (self.kubeconfig or url):
             raise ValueError("needs a kubeconfig, a receiver or a webhook")
-        if self.secret_file and not called:
-            raise ValueError("has a secret_file and nothing it signs; add a receiver or a webhook")
+        if self.secret_file and not url:
+            raise ValueError("has a secret_file but no URL; add a receiver or a webhook")
         return self
 
     def secret(self) -> bytes | None:
-        """Read what signs calls of the webhook, anew each time, so that it can be replaced.
+        """Return the secret of the webhook without a final line break.
 
-        A line end at its end is no part of it.
+        Each call reads the file again, so that the secret can be replaced.
 
         Raises:
-            OSError: where it cannot be read.
-            NoWay: where it is empty, or others may read it.
+            OSError: if the file cannot be read.
+            NoAccess: if the file is empty or readable by other users.
         """
         if self.secret_file is None:
             return None
         if self.secret_file.stat().st_mode & 0o007:
-            raise NoAccess("may be read by everybody on this machine; chmod o= it")
+            raise NoAccess("may be read by everybody on this machine; run chmod o= on it")
         text = self.secret_file.read_bytes().removesuffix(b"\n").removesuffix(b"\r")
         if not text:
             raise NoAccess("is empty")
@@ -65,7 +66,7 @@ class ClusterAccess(Frozen):
         """Return a client of the cluster's API.
 
         Raises:
-            ConfigException, OSError: of the library, where the kubeconfig cannot be used.
+            ConfigException, OSError: by the library, if the kubeconfig cannot be used.
         """
         from kubernetes import config  # noqa: PLC0415 - half a second; only when used
 
@@ -73,7 +74,7 @@ class ClusterAccess(Frozen):
 
 
 class AccessFile(FileModel):
-    """The operator's file: cluster name → how it is reached."""
+    """The operator's file: the access to each cluster, by its name."""
 
     kind: Literal["ClusterAccess"]
     clusters: dict[DnsLabel, ClusterAccess]
@@ -83,27 +84,31 @@ def read(path: Path) -> AccessFile:
     """Read the operator's file.
 
     Raises:
-        InvalidInput: with every fault.
+        InvalidInput: with all faults.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         reason = error.strerror or str(error)
         raise InvalidInput([fault("", f"cannot be read: {reason}").within(str(path))]) from None
-    found = parse_file(AccessFile, text, str(path))
-    faults = [told for name, one in found.clusters.items() for told in _of_secret(name, one)]
+    content = parse_file(AccessFile, text, str(path))
+    faults = [
+        problem.within(str(path))
+        for name, access in content.clusters.items()
+        for problem in _secret_faults(name, access)
+    ]
     if faults:
-        raise InvalidInput([told.within(str(path)) for told in faults])
-    return found
+        raise InvalidInput(faults)
+    return content
 
 
-def _of_secret(cluster: str, reached: ClusterAccess) -> list[Fault]:
+def _secret_faults(cluster: str, access: ClusterAccess) -> list[Fault]:
     field = f"clusters.{cluster}.secret_file"
     try:
-        reached.secret()
+        access.secret()
     except OSError as error:
         reason = error.strerror or type(error).__name__
-        return [fault(field, f"{reached.secret_file} cannot be read: {reason}")]
+        return [fault(field, f"{access.secret_file} cannot be read: {reason}")]
     except NoAccess as error:
-        return [fault(field, f"{reached.secret_file} {error}")]
+        return [fault(field, f"{access.secret_file} {error}")]
     return []

@@ -1,7 +1,7 @@
-"""What is sent to a controller's webhook after a push, and the signature that it goes by.
+"""Signed calls to a controller's webhook after a push.
 
-Flux: a Receiver of type `generic-hmac`, or `generic` where there is no secret. Argo CD: a push
-event in GitHub's form, which it holds against the source of each of its Applications.
+Flux: a Receiver of type ``generic-hmac``, or ``generic`` without a secret. Argo CD: a push event in
+GitHub's format, which Argo CD compares with the source of each Application.
 """
 
 from __future__ import annotations
@@ -22,52 +22,54 @@ from demandops.cluster.access import NoAccess
 from demandops.settings import MAIN_BRANCH
 
 _SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")
-_UNKNOWN = "0" * 40
+_NO_COMMIT = "0" * 40
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
-    """A request that is to be sent: which header carries the signature of ``body``."""
+class WebhookCall:
+    """A request to a webhook; ``signature_header`` names the header for the body's signature."""
 
     body: bytes
-    signed_by: str
+    signature_header: str
     headers: dict[str, str] = field(default_factory=dict)
 
 
-def to_flux() -> Call:
-    """Return what a Receiver of Flux takes: the fact of the call is all that it says."""
-    return Call(b"{}", "X-Signature")
+def flux_call() -> WebhookCall:
+    """Return the call for a Receiver of Flux, which ignores the body."""
+    return WebhookCall(b"{}", "X-Signature")
 
 
-def to_argocd(repo: str, before: str, after: str, paths: Iterable[str] | None) -> Call:
-    """Return what Argo CD takes: that a repository's main branch moved.
+def argocd_call(repo: str, before: str, after: str, paths: Iterable[str] | None) -> WebhookCall:
+    """Return the call for Argo CD: it reports that a repository's main branch moved.
 
     Args:
-        repo: the URL by which Argo CD fetches the state repo.
-        before: the commit that it was told of last; empty where there was none.
+        repo: the URL from which Argo CD fetches the state repo.
+        before: the commit of the last call; empty if there was none.
         after: the commit that was pushed.
-        paths: what changed; None has every Application of the repo looked at.
+        paths: the changed files; with ``None``, Argo CD refreshes all Applications of the repo.
 
     Raises:
-        NoWay: where the URL names no host, for Argo CD could not tell the repo by it.
+        NoAccess: if the URL names no host, by which Argo CD identifies the repo.
     """
     event = {
         "ref": f"refs/heads/{MAIN_BRANCH}",
-        "before": before or _UNKNOWN,
+        "before": before or _NO_COMMIT,
         "after": after,
         "repository": {"html_url": web_address(repo), "default_branch": MAIN_BRANCH},
         "commits": [] if paths is None else [{"id": after, "modified": sorted(paths)}],
     }
-    return Call(json.dumps(event).encode(), "X-Hub-Signature-256", {"X-GitHub-Event": "push"})
+    return WebhookCall(
+        json.dumps(event).encode(), "X-Hub-Signature-256", {"X-GitHub-Event": "push"}
+    )
 
 
 def web_address(repo: str) -> str:
-    """Return the web page that a forge would name for a repository, without user or password.
+    """Return the address of a repository's web page, without user and password.
 
-    Argo CD compares host and path of it with each source's URL, whatever the scheme and port.
+    Argo CD compares its host and path with those of each source's URL; it ignores scheme and port.
 
     Raises:
-        NoWay: where the URL names no host.
+        NoAccess: if the URL names no host.
     """
     short = None if "://" in repo else _SCP.fullmatch(repo)
     if short:
@@ -81,20 +83,20 @@ def web_address(repo: str) -> str:
 
 
 def signature(secret: bytes, body: bytes) -> str:
-    """Return the HMAC of a body as both controllers take it."""
+    """Return the HMAC of a body in the format of both controllers."""
     return f"sha256={hmac.new(secret, body, hashlib.sha256).hexdigest()}"
 
 
-def send(url: str, call: Call, secret: bytes | None, timeout: float) -> None:
+def send(url: str, call: WebhookCall, secret: bytes | None, timeout: float) -> None:
     """Send a call.
 
     Raises:
-        HTTPError: where it is not taken; a redirection is none, for it would lose the body.
-        OSError: where nobody answers.
+        HTTPError: if the controller rejects it or redirects, since a redirect would lose the body.
+        OSError: if the controller does not answer.
     """
     headers = {"Content-Type": "application/json", "User-Agent": "demandops", **call.headers}
     if secret is not None:
-        headers[call.signed_by] = signature(secret, call.body)
+        headers[call.signature_header] = signature(secret, call.body)
     request = urllib.request.Request(url, data=call.body, headers=headers, method="POST")  # noqa: S310
     _OPENER.open(request, timeout=timeout).close()
 
@@ -109,7 +111,7 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
         headers: HTTPMessage,
         newurl: str,
     ) -> None:
-        """Follow nothing."""
+        """Follow no redirect."""
 
 
 _OPENER = urllib.request.build_opener(_NoRedirect)

@@ -1,4 +1,4 @@
-"""A cluster's objects, kept current by watches: nothing is polled, and nobody waits for it."""
+"""A cache of a cluster's objects. Background watches keep it current, so reading it never waits."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from demandops.cluster.access import ClusterAccess
-from demandops.cluster.health import Key, Watched
+from demandops.cluster.health import Key, ObjectSelector
 
 log = logging.getLogger("demandops")
 
@@ -25,89 +25,86 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 
 class ObjectCache:
-    """Objects of one cluster: those that somebody asked to know.
+    """The objects of one cluster that callers asked for."""
 
-    ``trouble`` says why some of them cannot be read at present; empty where all can.
-    """
-
-    def __init__(self, name: str, reached: ClusterAccess, on_change: Callable[[], None]) -> None:
+    def __init__(self, name: str, access: ClusterAccess, on_change: Callable[[], None]) -> None:
         self.name = name
-        self._reached = reached
+        self._access = access
         self._on_change = on_change
         self._lock = threading.Lock()
         self._objects: dict[Key, dict[str, Any]] = {}
-        self._watched: set[Watched] = set()
-        self._read: set[Watched] = set()
-        self._troubles: dict[Watched, str] = {}
+        self._watched: set[ObjectSelector] = set()
+        self._known: set[ObjectSelector] = set()
+        self._errors: dict[ObjectSelector, str] = {}
         self._closed = threading.Event()
         self._client: Any = None
 
     @property
-    def trouble(self) -> str:
-        """Why something that is watched cannot be read; empty where all can."""
+    def read_error(self) -> str:
+        """Why some objects cannot be read at present; empty if all can."""
         with self._lock:
-            return next((self._troubles[one] for one in sorted(self._troubles)), "")
+            return next((self._errors[selector] for selector in sorted(self._errors)), "")
 
-    def watch(self, wanted: Iterable[Watched]) -> None:
-        """Watch further objects; those watched already stay so."""
-        for one in wanted:
+    def watch(self, wanted: Iterable[ObjectSelector]) -> None:
+        """Watch these objects too."""
+        for selector in wanted:
             with self._lock:
-                if one in self._watched or self._closed.is_set():
+                if selector in self._watched or self._closed.is_set():
                     continue
-                self._watched.add(one)
+                self._watched.add(selector)
             threading.Thread(
-                target=self._follow,
-                args=(one,),
-                name=f"demandops-watch-{self.name}-{one.kind}",
+                target=self._keep_watching,
+                args=(selector,),
+                name=f"demandops-watch-{self.name}-{selector.kind}",
                 daemon=True,
             ).start()
 
     def objects(self) -> dict[Key, dict[str, Any]]:
-        """Return what is there now."""
+        """Return the objects that are known now."""
         with self._lock:
             return dict(self._objects)
 
-    def unread(self, wanted: Iterable[Watched]) -> str:
-        """Return why what is wanted is not known at present; empty where it is."""
+    def why_unknown(self, wanted: Iterable[ObjectSelector]) -> str:
+        """Return why some of these objects are not known at present; empty if all are."""
         with self._lock:
-            for one in wanted:
-                if one in self._troubles:
-                    return self._troubles[one]
-                if one not in self._read:
-                    return "it was not read yet"
+            for selector in wanted:
+                if selector in self._errors:
+                    return self._errors[selector]
+                if selector not in self._known:
+                    return "it has not been read yet"
         return ""
 
-    def read(self, wanted: Iterable[Watched]) -> None:
-        """Read some objects once, without a watch; ``trouble`` says what went wrong."""
-        everything = list(wanted)
-        for one in everything:
+    def read_once(self, wanted: Iterable[ObjectSelector]) -> None:
+        """Read these objects once, without a watch; sets ``read_error`` if that fails."""
+        selectors = list(wanted)
+        for selector in selectors:
             try:
-                self._put(one, self._list(one)["items"])
+                self._replace(selector, self._list(selector)["items"])
             except Exception as error:
-                if not _answered(error):  # the others would be waited for in vain
-                    self._troubles |= dict.fromkeys(everything, _told(one, error))
+                if not _is_answer(error):  # the cluster is away, so do not wait for the others
+                    self._errors |= dict.fromkeys(selectors, _reason(selector, error))
                     return
-                self._troubles[one] = _told(one, error)
+                self._errors[selector] = _reason(selector, error)
 
-    def refresh(self, wanted: Iterable[Watched]) -> None:
-        """Read some objects anew, in this order: watches may lag behind each other.
+    def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
+        """Read these objects again, in this order: one watch may lag behind another.
 
         Raises:
-            Exception: of the library, where the cluster does not answer.
+            Exception: by the library, if the cluster does not answer.
         """
-        for one in wanted:
-            self._put(one, self._list(one)["items"])
+        for selector in wanted:
+            self._replace(selector, self._list(selector)["items"])
 
-    def why_not_available(self, namespace: str, deployment: str) -> str:
-        """Return what keeps a Deployment's pods from running, or nothing that is known.
+    def why_unavailable(self, namespace: str, deployment: str) -> str:
+        """Return why a Deployment's pods do not run; empty if that is not known.
 
         Raises:
-            Exception: of the library, where the cluster does not answer.
+            Exception: by the library, if the cluster does not answer.
         """
         from kubernetes import client  # noqa: PLC0415 - half a second; only when used
 
-        found = self.objects().get(("Deployment", namespace, deployment)) or {}
-        labels = ((found.get("spec") or {}).get("selector") or {}).get("matchLabels") or {}
+        item = self.objects().get(("Deployment", namespace, deployment)) or {}
+        labels = ((item.get("spec") or {}).get("selector") or {}).get("matchLabels") or {}
         pods = client.CoreV1Api(self._api().api_client).list_namespaced_pod(
             namespace,
             label_selector=",".join(f"{key}={value}" for key, value in labels.items()),
@@ -117,127 +114,127 @@ class ObjectCache:
             for container in pod.status.container_statuses or ():
                 waiting = container.state.waiting if container.state else None
                 if waiting and waiting.reason not in (None, "ContainerCreating"):
-                    told = f": {waiting.message}" if waiting.message else ""
-                    return f"container {container.name}: {waiting.reason}{told}"
+                    message = f": {waiting.message}" if waiting.message else ""
+                    return f"container {container.name}: {waiting.reason}{message}"
             for condition in pod.status.conditions or ():
                 if condition.type == "PodScheduled" and condition.status == "False":
                     return f"not scheduled: {condition.message}"
         return ""
 
     def close(self) -> None:
-        """Watch no more."""
+        """Stop all watches."""
         self._closed.set()
 
-    def _follow(self, watched: Watched) -> None:
+    def _keep_watching(self, selector: ObjectSelector) -> None:
         pause = _FIRST_PAUSE_S
         while not self._closed.is_set():
             try:
-                self._list_and_watch(watched)
+                self._list_and_watch(selector)
                 pause = _FIRST_PAUSE_S
-            except Exception as error:  # whatever the library meets on its way to the server
-                self._say(watched, _told(watched, error))
+            except Exception as error:  # the library raises errors of many kinds
+                self._set_error(selector, _reason(selector, error))
                 self._closed.wait(pause)
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
 
-    def _list_and_watch(self, watched: Watched) -> None:
+    def _list_and_watch(self, selector: ObjectSelector) -> None:
         from kubernetes import watch  # noqa: PLC0415 - half a second; only when used
 
-        listed = self._list(watched)
-        self._put(watched, listed["items"])
-        self._say(watched, "")
-        group, version, plural = _KINDS[watched.kind]
+        listed = self._list(selector)
+        self._replace(selector, listed["items"])
+        self._set_error(selector, "")
+        group, version, plural = _KINDS[selector.kind]
         watcher = watch.Watch()
         for event in watcher.stream(
             self._api().list_namespaced_custom_object,
             group,
             version,
-            watched.namespace,
+            selector.namespace,
             plural,
             resource_version=listed["metadata"]["resourceVersion"],
             timeout_seconds=_WATCH_S,
             _request_timeout=(_CONNECT_S, _WATCH_S + 30),
-            **_selected(watched),
+            **_name_filter(selector),
         ):
             if self._closed.is_set():
                 return
-            self._take(watched, event)
+            self._apply(selector, event)
 
     def _api(self) -> Any:  # noqa: ANN401 - the library has no types
         from kubernetes import client  # noqa: PLC0415 - half a second; only when used
 
         with self._lock:
             if self._client is None:
-                self._client = client.CustomObjectsApi(self._reached.client())
+                self._client = client.CustomObjectsApi(self._access.client())
             return self._client
 
-    def _list(self, watched: Watched) -> Any:  # noqa: ANN401
-        group, version, plural = _KINDS[watched.kind]
+    def _list(self, selector: ObjectSelector) -> Any:  # noqa: ANN401
+        group, version, plural = _KINDS[selector.kind]
         return self._api().list_namespaced_custom_object(
             group,
             version,
-            watched.namespace,
+            selector.namespace,
             plural,
             _request_timeout=(_CONNECT_S, _WATCH_S),
-            **_selected(watched),
+            **_name_filter(selector),
         )
 
-    def _put(self, watched: Watched, items: Iterable[dict[str, Any]]) -> None:
-        """Make what is watched what was listed."""
-        kind, namespace, name = watched
+    def _replace(self, selector: ObjectSelector, items: Iterable[dict[str, Any]]) -> None:
+        """Replace the selected objects by ``items``."""
+        kind, namespace, name = selector
         with self._lock:
             for key in list(self._objects):
                 if key[:2] == (kind, namespace) and name in ("", key[2]):
                     del self._objects[key]
             for item in items:
                 self._objects[kind, namespace, item["metadata"]["name"]] = item
-            self._read.add(watched)
+            self._known.add(selector)
 
-    def _take(self, watched: Watched, event: dict[str, Any]) -> None:
+    def _apply(self, selector: ObjectSelector, event: dict[str, Any]) -> None:
         item = event["object"]
         if event["type"] not in ("ADDED", "MODIFIED", "DELETED"):
             return
-        key = (watched.kind, watched.namespace, item["metadata"]["name"])
+        key = (selector.kind, selector.namespace, item["metadata"]["name"])
         with self._lock:
             known = self._objects.get(key)
             if known is not None and _version(item) < _version(known):
-                return  # what a refresh read is newer
+                return  # a refresh read a newer version
             if event["type"] == "DELETED":
                 self._objects.pop(key, None)
             else:
                 self._objects[key] = item
         self._on_change()
 
-    def _say(self, watched: Watched, trouble: str) -> None:
+    def _set_error(self, selector: ObjectSelector, reason: str) -> None:
         with self._lock:
-            told = trouble and trouble not in self._troubles.values()
-            if trouble:
-                self._troubles[watched] = trouble
+            is_new = reason and reason not in self._errors.values()
+            if reason:
+                self._errors[selector] = reason
             else:
-                self._troubles.pop(watched, None)
-        if told:
-            log.warning("cluster '%s' cannot be read (%s); trying on", self.name, trouble)
+                self._errors.pop(selector, None)
+        if is_new:
+            log.warning("cluster '%s' cannot be read (%s); retrying", self.name, reason)
         self._on_change()
 
 
-def _selected(watched: Watched) -> dict[str, str]:
-    """Return what narrows a request to one object, which a right to that one alone permits."""
-    return {"field_selector": f"metadata.name={watched.name}"} if watched.name else {}
+def _name_filter(selector: ObjectSelector) -> dict[str, str]:
+    """Return the arguments that limit a request to one object, which needs fewer rights."""
+    return {"field_selector": f"metadata.name={selector.name}"} if selector.name else {}
 
 
-def _answered(error: Exception) -> bool:
-    """Tell whether the cluster answered, if only to refuse."""
+def _is_answer(error: Exception) -> bool:
+    """Report whether the cluster answered the request, with an error or a refusal."""
     return bool(getattr(error, "status", None))
 
 
-def _told(watched: Watched, error: Exception) -> str:
-    if _answered(error):  # it speaks of these objects; else it is the whole cluster that is away
-        plural = _KINDS[watched.kind][2]
+def _reason(selector: ObjectSelector, error: Exception) -> str:
+    if _is_answer(error):  # an answer is about these objects; without one the cluster is away
+        plural = _KINDS[selector.kind][2]
         reason = getattr(error, "reason", None) or type(error).__name__
-        return f"{plural} in {watched.namespace}: {reason}"
+        return f"{plural} in {selector.namespace}: {reason}"
     reason = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
     return reason.splitlines()[0][:300]
 
 
 def _version(item: dict[str, Any]) -> int:
-    """Return an object's resource version; those of one kind can be compared."""
+    """Return an object's resource version, which can be compared within a kind."""
     return int(item["metadata"]["resourceVersion"])

@@ -1,6 +1,6 @@
-"""Forges: where a person is asked to approve a proposal, by the API of GitHub or Gitea (Forgejo).
+"""Forges: opens pull requests for proposals, with the API of GitHub or Gitea (Forgejo).
 
-Knows pull requests and HTTP; nothing of demands, and nothing of Git: the branch is there already.
+Knows pull requests and HTTP, and nothing of demands or Git: the branch has already been pushed.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ __all__ = ["Forge", "ForgeError", "PullRequest", "forge_for"]
 
 
 def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:
-    """Return the forge that ``demandops.yaml`` names; nothing where it has no API to be asked.
+    """Return the forge that ``demandops.yaml`` names, or ``None`` if its API is not supported.
 
-    The token is read anew each time, so that it may be replaced while the generator runs.
+    Each call reads the token again, so that it can be replaced while the generator runs.
 
     Raises:
-        ForgeError: where there is no token to be read.
+        ForgeError: if the token cannot be read.
     """
     if proposals.forge not in ("github", "gitea") or proposals.url is None:
         return None
@@ -43,14 +43,14 @@ def _github_api(url: str) -> str:
 def _token(file: Path | None, forge: str) -> str:
     if file is None:
         raise ForgeError(
-            f"proposals.forge is {forge}, and there is no token for it; name a file that holds one "
-            "by DEMANDOPS_FORGE_TOKEN_FILE"
+            f"proposals.forge is {forge}, but there is no token for it; set "
+            "DEMANDOPS_FORGE_TOKEN_FILE to a file that holds one"
         )
     try:
         token = file.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
+        reason = getattr(error, "strerror", None) or "it is not text"
         raise ForgeError(f"the token file {file} cannot be read: {reason}") from None
     if not token.isascii() or not token.isprintable() or not token:
-        raise ForgeError(f"the token file {file} holds no token: one line of plain text")
+        raise ForgeError(f"the token file {file} must hold a token: one line of plain text")
     return token

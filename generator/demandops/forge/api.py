@@ -1,4 +1,4 @@
-"""Calls to a forge's API: JSON over HTTP with a token, which no message ever shows."""
+"""Calls to a forge's API: JSON over HTTP with a token. No message contains the token."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOST_BYTES = 4_000_000
 
 
 class ForgeError(DemandOpsError):
-    """The forge did not do what it was asked; ``status`` is its HTTP status, if it answered."""
+    """Raised when a forge fails or refuses; ``status`` is its HTTP status, if it answered."""
 
     def __init__(self, message: str, status: int | None = None) -> None:
         super().__init__(message)
@@ -25,7 +25,7 @@ class ForgeError(DemandOpsError):
 
 
 class _NoRedirects(urllib.request.HTTPRedirectHandler):
-    """Follow none: the token must not reach another host."""
+    """Follows no redirect: the token must not reach another host."""
 
     def redirect_request(
         self,
@@ -40,7 +40,7 @@ class _NoRedirects(urllib.request.HTTPRedirectHandler):
 
 
 class Api:
-    """An API at one address."""
+    """The API of a forge at one address."""
 
     def __init__(self, address: str, token: str, timeout: float = _TIMEOUT_S) -> None:
         self._address = address.rstrip("/")
@@ -55,10 +55,16 @@ class Api:
         headers: Mapping[str, str],
         body: Mapping[str, object] | None = None,
     ) -> Any:  # noqa: ANN401 - the caller knows the answer's form
-        """Send a request and return the answer's JSON; ``headers`` may hold ``{token}``.
+        """Send a request and return the answer's JSON.
+
+        Args:
+            method: the HTTP method.
+            path: the path below the API's address.
+            headers: the HTTP headers; ``{token}`` in a value is replaced by the token.
+            body: the JSON to send.
 
         Raises:
-            ForgeError: where the forge is away, refuses, or answers with something else.
+            ForgeError: if the forge does not answer, refuses, or answers without JSON.
         """
         where = f"{method} {self._address}{path}"
         request = urllib.request.Request(  # noqa: S310 - https, or http on this machine
@@ -76,11 +82,11 @@ class Api:
                 return _json(answer, where)
         except urllib.error.HTTPError as error:
             with error:
-                said = _said(error)
-            raise ForgeError(f"{where}: {error.code} {said}", error.code) from None
+                reason = _reason(error)
+            raise ForgeError(f"{where}: {error.code} {reason}", error.code) from None
         except (OSError, HTTPException) as error:
-            reason = getattr(error, "reason", None) or error
-            raise ForgeError(f"{where}: {reason}") from None
+            cause = getattr(error, "reason", None) or error
+            raise ForgeError(f"{where}: {cause}") from None
 
 
 def _json(answer: HTTPResponse, where: str) -> Any:  # noqa: ANN401
@@ -88,17 +94,17 @@ def _json(answer: HTTPResponse, where: str) -> Any:  # noqa: ANN401
     try:
         return json.loads(data) if data.strip() else None
     except ValueError:
-        raise ForgeError(f"{where}: the answer is no JSON; is this the API's address?") from None
+        raise ForgeError(f"{where}: the answer is not JSON; check the API's address") from None
 
 
-def _said(error: urllib.error.HTTPError) -> str:
-    """Return what a forge says of a refusal: its ``message``, and those of ``errors``."""
+def _reason(error: urllib.error.HTTPError) -> str:
+    """Return a forge's reason for a refusal: its ``message``, and those of ``errors``."""
     try:
         data = json.loads(error.read(_MOST_BYTES))
     except (ValueError, OSError):
         data = None
-    said = data if isinstance(data, dict) else {"message": str(error.reason)}
-    more = said.get("errors")
-    texts = [said.get("message"), *(more if isinstance(more, list) else ())]
+    answer = data if isinstance(data, dict) else {"message": str(error.reason)}
+    details = answer.get("errors")
+    texts = [answer.get("message"), *(details if isinstance(details, list) else ())]
     texts = [text.get("message") if isinstance(text, dict) else text for text in texts]
     return shown("; ".join(text for text in texts if isinstance(text, str) and text), 300)

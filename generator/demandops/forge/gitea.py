@@ -1,4 +1,4 @@
-"""Pull requests of Gitea and Forgejo, by their API v1 (``/api/swagger`` of every instance)."""
+"""Pull requests of Gitea and Forgejo, with their API v1 (``/api/swagger`` of each instance)."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from urllib.parse import quote
 
 from demandops.forge.api import ForgeError
 from demandops.forge.pull_request import PullRequest
-from demandops.forge.pull_request_api import Pulls
+from demandops.forge.pull_request_api import PullRequestApi
 
 _NOT_FOUND = 404
 
 
-class Gitea(Pulls):
-    """A repository on Gitea or Forgejo."""
+class Gitea(PullRequestApi):
+    """The pull requests of a repository on Gitea or Forgejo."""
 
     NAME = "Gitea"
     HEADERS = {"Accept": "application/json", "Authorization": "token {token}"}  # noqa: RUF012
@@ -21,7 +21,7 @@ class Gitea(Pulls):
 
     def find(self, branch: str, target: str) -> PullRequest | None:
         """Return the pull request for a branch."""
-        try:  # the branch is the rest of the path, its slash as it is
+        try:  # the branch ends the path, so its slash stays unquoted
             path = f"{self._pulls}/{quote(target, safe='')}/{quote(branch, safe='/')}"
             return self._read(self._api.call("GET", path, self.HEADERS))
         except ForgeError as error:

@@ -1,4 +1,4 @@
-"""GitHub's pull requests, by its REST API in version 2022-11-28.
+"""GitHub's pull requests, with its REST API in version 2022-11-28.
 
 https://docs.github.com/en/rest/pulls/pulls
 """
@@ -9,11 +9,11 @@ from typing import Any
 from urllib.parse import urlencode
 
 from demandops.forge.pull_request import PullRequest
-from demandops.forge.pull_request_api import Pulls
+from demandops.forge.pull_request_api import PullRequestApi
 
 
-class GitHub(Pulls):
-    """A repository on GitHub."""
+class GitHub(PullRequestApi):
+    """The pull requests of a repository on GitHub."""
 
     NAME = "GitHub"
     HEADERS = {  # noqa: RUF012
@@ -33,8 +33,8 @@ class GitHub(Pulls):
             "direction": "desc",
             "per_page": "1",
         }
-        found = self._api.call("GET", f"{self._pulls}?{urlencode(query)}", self.HEADERS)
-        return self._read(found[0]) if isinstance(found, list) and found else None
+        answer = self._api.call("GET", f"{self._pulls}?{urlencode(query)}", self.HEADERS)
+        return self._read(answer[0]) if isinstance(answer, list) and answer else None
 
     def _is_merged(self, data: Any) -> bool:  # noqa: ANN401
         return data["merged_at"] is not None

@@ -1,4 +1,4 @@
-"""What all forges have in common: a request to merge a branch, and what can be done with it."""
+"""The interface of a forge: pull requests, and the operations on them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ RequestState = Literal["open", "merged", "closed"]
 
 @dataclass(frozen=True, slots=True)
 class PullRequest:
-    """A request to merge a branch: its number, where a person finds it, what became of it."""
+    """A request to merge a branch: its number, its web page and its state."""
 
     number: int
     link: str
@@ -18,16 +18,16 @@ class PullRequest:
 
 
 class Forge(Protocol):
-    """A project on a forge. Every method raises ``ForgeError`` where the forge does not comply."""
+    """A project on a forge. Every method raises ``ForgeError`` if the forge fails or refuses."""
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the request for a branch, or a new one where there was none.
+        """Return the pull request for a branch; open one if there is none.
 
-        A branch is never proposed twice, so one that was closed is not opened again.
+        A branch gets only one pull request, so a closed one is not opened again.
         """
 
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the newest request for a branch, whatever became of it."""
+        """Return the newest pull request for a branch in any state, or ``None``."""
 
     def close(self, request: PullRequest) -> None:
-        """Close a request without merging it."""
+        """Close a pull request without merging it."""

@@ -1,4 +1,4 @@
-"""What GitHub's API and Gitea's, which was modelled on it, have in common."""
+"""The pull request API that GitHub and Gitea share."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from demandops.forge.api import Api, ForgeError
 from demandops.forge.pull_request import PullRequest, RequestState
 
 
-class Pulls(ABC):
-    """The pull requests of a repository."""
+class PullRequestApi(ABC):
+    """The pull requests of a repository on a forge."""
 
     NAME: ClassVar[str]
     HEADERS: ClassVar[dict[str, str]]
     EXISTS: ClassVar[int]
-    """The status of the answer where there is a request for the branch already."""
+    """The HTTP status of a refusal because the branch already has a pull request."""
 
     def __init__(self, api: Api, owner: str, name: str) -> None:
         self._api = api
@@ -25,25 +25,25 @@ class Pulls(ABC):
 
     @abstractmethod
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the newest pull request for a branch."""
+        """Return the newest pull request for a branch, or ``None``."""
 
     @abstractmethod
     def _is_merged(self, data: Any) -> bool:  # noqa: ANN401 - any JSON
-        """Tell whether a pull request was merged; any lookup error where it is none."""
+        """Report whether a pull request was merged; raises a lookup error for other data."""
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the pull request for a branch, or a new one where there was none."""
-        found = self.find(branch, target)
-        if found is not None:
-            return found
+        """Return the pull request for a branch; open one if there is none."""
+        existing = self.find(branch, target)
+        if existing is not None:
+            return existing
         content = {"title": title, "head": branch, "base": target, "body": body}
         try:
             return self._read(self._api.call("POST", self._pulls, self.HEADERS, content))
         except ForgeError as error:
-            found = self.find(branch, target) if error.status == self.EXISTS else None
-            if found is None:
+            existing = self.find(branch, target) if error.status == self.EXISTS else None
+            if existing is None:
                 raise
-            return found  # the answer to an earlier call was lost
+            return existing  # the answer to an earlier call was lost
 
     def close(self, request: PullRequest) -> None:
         """Close a pull request."""
@@ -56,5 +56,5 @@ class Pulls(ABC):
             state = "open" if closed == "closed" and data["state"] == "open" else closed
             return PullRequest(int(data["number"]), str(data["html_url"]), state)
         except (KeyError, TypeError, ValueError):
-            message = f"the answer is no pull request; is this {self.NAME}'s API?"
+            message = f"the answer is not a pull request; check that this is {self.NAME}'s API"
             raise ForgeError(message) from None

@@ -1,4 +1,4 @@
-"""Stage 5, how it is written: releases become files, as text by path. Never writes them.
+"""Stage 5: turns releases into the text of files, by path. It writes no file.
 
-Same input, same bytes. Knows the plan and the configuration; nothing of Git.
+The same input gives the same bytes. Knows the plan and the configuration, and nothing of Git.
 """

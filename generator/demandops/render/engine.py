@@ -1,8 +1,8 @@
-"""The template engine: Jinja2, strict, with every value written as JSON.
+"""The template engine: strict Jinja2 that writes every value as JSON.
 
-``{{ x }}`` never glues text into YAML: whatever it holds is emitted as one JSON value, undefined
-names fail, and templates from the state repo run in Jinja's sandbox. Templates of the program
-come from its ``templates`` folder, those of appdefs from the configuration's files.
+``{{ x }}`` writes one JSON value, so a value cannot change the structure of the YAML. Undefined
+names fail. The program's templates come from its ``templates`` folder. Templates of appdefs come
+from the configuration and run in a sandbox.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ _TEMPLATE_FAULTS = (
     ArithmeticError,
     LookupError,
     RecursionError,
-)  # what a template can make happen: its author's to mend, whatever it is
+)  # errors that a template can cause; its author has to mend them
 
 
 class _Verbatim(str):
-    """Text that is YAML already: the result of a filter of ours."""
+    """The YAML that one of our filters returns; it is written unchanged."""
 
 
 class _FilesLoader(BaseLoader):
-    """Finds templates in the configuration's files, under their path in the state repo."""
+    """Loads templates from the configuration, by their path in the state repo."""
 
     def __init__(self, files: Mapping[str, str]) -> None:
         self._files = files
 
     def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        """Return the template's text; its path stands in for a file name in tracebacks."""
+        """Return the template's text, its path for tracebacks, and that it never changes."""
         if template not in self._files:
             raise TemplateNotFound(template)
         return self._files[template], template, lambda: True
@@ -54,7 +54,7 @@ def _finalize(value: object) -> object:
     if isinstance(value, _Verbatim):
         return value
     if isinstance(value, Undefined):
-        str(value)  # StrictUndefined raises here, naming what is missing
+        str(value)  # StrictUndefined raises here and names what is missing
     return strict_yaml.scalar(_plain(value))
 
 
@@ -83,14 +83,14 @@ def _literal(value: str, indent: int) -> _Verbatim:
 
 
 def _bare(value: str) -> _Verbatim:
-    """Return ``value`` without quotes, for comments: it must be a plain path."""
+    """Return a plain path without quotes, for comments."""
     if not re.fullmatch(r"[A-Za-z0-9._/-]+", value):
-        raise ValueError(f"'{value}' cannot stand in a comment")
+        raise ValueError(f"'{value}' is not a plain path, so it cannot be written in a comment")
     return _Verbatim(value)
 
 
 def _configure(environment: Environment) -> Environment:
-    environment.filters.pop("tojson", None)  # everything is JSON already; twice would be text
+    environment.filters.pop("tojson", None)  # values become JSON anyway; twice would quote them
     environment.filters["block"] = _block
     environment.filters["literal"] = _literal
     environment.filters["bare"] = _bare
@@ -110,7 +110,7 @@ _OPTIONS: dict[str, Any] = {
 
 
 class Engine:
-    """Renders the program's templates and those of one configuration. Compiles each once."""
+    """Renders the program's templates and those of one configuration; compiles each once."""
 
     def __init__(self, files: Mapping[str, str]) -> None:
         self._own = _configure(
@@ -126,7 +126,7 @@ class Engine:
         """Render a values template of the configuration and parse it.
 
         Raises:
-            InvalidInput: naming the template and, where it is known, the line.
+            InvalidInput: if the template fails; it names the template and, if known, the line.
         """
         try:
             compiled: Template = self._config.get_template(template)
@@ -134,9 +134,9 @@ class Engine:
         except InvalidInput as error:
             raise InvalidInput(
                 fault(
-                    f"{found.field} of what is rendered", f"{found.message}; mend the template"
+                    f"{problem.field} of what is rendered", f"{problem.message}; mend the template"
                 ).within(template)
-                for found in error.faults
+                for problem in error.faults
             ) from None
         except TemplateNotFound as error:
             raise InvalidInput(

@@ -1,7 +1,7 @@
-"""The Helm values of a service, from its appdef's template, held against the chart's schema.
+"""The Helm values of a service: its appdef's template, rendered and checked against the chart.
 
-What the template is given is the interface of application definitions (docs/applications.md).
-Requesters are no part of it.
+The variables that the template gets are the interface of application definitions
+(docs/applications.md). Requesters are not among them.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from demandops.render.output_check import check_values
 
 
 def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[str, Any]:
-    """Return what the chart of a service is installed with, overrides' patches laid over.
+    """Return the Helm values of a service, with the patches of overrides merged in.
 
     Raises:
-        InvalidInput: where the template fails, or the values break the chart's schema; it names
-            the template or the override.
+        InvalidInput: if the template fails, or the values do not match the chart's schema; it
+            names the template or the override.
     """
     template = config.values_template(release.appdef, release.service)
     try:
         values = engine.data(template, **_context(release, config))
         check_values(values, release.chart, config, template)
     except InvalidInput as error:
-        raise InvalidInput(_told_of_overrides(error, release)) from None
+        raise InvalidInput(_name_overrides(error, release)) from None
     for file, patch in release.shaping.patches:
         values = merged(values, patch)
         check_values(values, release.chart, config, file)
     return values
 
 
-def _told_of_overrides(error: InvalidInput, release: ServiceRelease) -> Iterable[Fault]:
-    """Yield faults of a template, which may be an override's that gives it other things."""
-    giving = {"version", "images", "replicas", "node"}
-    files = [one.path for one, effects in release.shaping.by if giving & {*effects}]
-    note = f" (it is given what {' and '.join(files)} say; it may be for those to mend)"
-    for found in error.faults:
-        yield replace(found, message=found.message + note) if files else found
+def _name_overrides(error: InvalidInput, release: ServiceRelease) -> Iterable[Fault]:
+    """Yield the faults of a template; name the overrides that change its variables."""
+    changing = {"version", "images", "replicas", "node"}
+    files = [override.path for override, effects in release.shaping.by if changing & {*effects}]
+    note = f" (overrides change what the template gets, so check {' and '.join(files)} too)"
+    for fault in error.faults:
+        yield replace(fault, message=fault.message + note) if files else fault
 
 
 def _context(release: ServiceRelease, config: Config) -> dict[str, object]:

@@ -1,8 +1,8 @@
-"""The last look before a commit: is what was rendered valid, and is it ours to write?
+"""The last check of rendered files before a commit.
 
-Values are held against the chart's own ``values.schema.json``, built-in kinds against the schema
-of Kubernetes, and every path must lie in a folder that the generator owns. Validators are
-compiled once.
+Helm values must match the chart's ``values.schema.json``, built-in kinds must match the schemas of
+Kubernetes, and every path must be in a folder that the generator owns. Validators are compiled
+once.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from demandops.config.registry import ChartSource
 from demandops.errors import Fault, InvalidInput, fault
 
 KUBERNETES_VERSION = "1.36.0"
-"""The release whose schemas built-in kinds are held against."""
+"""The Kubernetes release whose schemas check built-in kinds."""
 
 OWN_ROOTS = ("bootstrap/", "clusters/", "ledger/")
 
@@ -34,13 +34,19 @@ _BUILT_IN = frozenset({"v1", "apps/v1", "networking.k8s.io/v1", "rbac.authorizat
 def check_values(
     values: Mapping[str, Any], chart: ChartSource, config: Config, template: str
 ) -> None:
-    """Hold Helm values against the chart's schema, where the chart is in the state repo.
+    """Check Helm values against the chart's schema, if the chart is in the state repo.
 
-    As Helm does it: laid over the chart's defaults, for a schema may require what has one.
+    Like Helm, this merges the values into the chart's defaults first: a schema may require a value
+    that has a default.
+
+    Args:
+        values: the values to check.
+        chart: where the chart comes from.
+        config: the configuration, which holds the chart's files.
+        template: the file that gives the values: a template or an override.
 
     Raises:
-        InvalidInput: naming the values template, or the override that patches them, and each value
-            that does not fit.
+        InvalidInput: naming ``template`` and each value that does not fit.
     """
     schema = config.files.get(f"{chart.folder}/values.schema.json") if chart.folder else None
     if schema is None:
@@ -48,34 +54,34 @@ def check_values(
     file = f"{chart.folder}/values.schema.json"
     try:
         validator = _values_validator(schema)
-    except ValueError as error:  # what JSON and the schema's own rules raise
+    except ValueError as error:  # invalid JSON, or an invalid schema
         reason = str(error).splitlines()[0]
-        message = f"is no JSON schema that can be used: {reason}; mend it"
+        message = f"is not a valid JSON schema: {reason}; mend it"
         raise InvalidInput([fault("", message).within(file)]) from None
     file = f"{chart.folder}/values.yaml"
     try:
         defaults = _defaults(config.files.get(file, ""))
     except InvalidInput as error:
         raise InvalidInput(strict_yaml.faults_in(error, file)) from None
-    whole = _laid_over(defaults, values)
+    merged = _merge_values(defaults, values)
     origin = "the override" if template.startswith(f"{OVERRIDES_ROOT}/") else "the template"
     faults = [
         fault(
             f"values.{path}" if path else "values",
             f"{message}; mend {origin} or {chart.folder}",
         ).within(template)
-        for path, message in _problems(validator, whole)
+        for path, message in _problems(validator, merged)
     ]
     if faults:
         raise InvalidInput(faults)
 
 
 def check_files(files: Mapping[str, str | None]) -> None:
-    """Check what is about to be committed (``None`` means that the file is removed).
+    """Check files that are about to be committed; ``None`` removes a file.
 
     Raises:
-        InvalidInput: with every fault of every file. One is a fault of the program or of a
-            template, never of a demand.
+        InvalidInput: with all faults. They are faults of the program or of a template, not of a
+            demand.
     """
     faults: list[Fault] = []
     seen: dict[tuple[str, str, str, str], str] = {}
@@ -98,7 +104,7 @@ def _documents(path: str, text: str, faults: list[Fault]) -> Iterable[dict[str, 
         return []
     for document in documents:
         if not isinstance(document, dict):
-            faults.append(fault("", "holds something that is no object").within(path))
+            faults.append(fault("", "has a document that is not a mapping").within(path))
     return [document for document in documents if isinstance(document, dict)]
 
 
@@ -112,8 +118,8 @@ def _check_object(
     identity = (cluster, kind, str(metadata.get("namespace")), name)
     other = seen.get(identity)
     if other is not None:
-        where = "here twice" if other == path else f"in {other} too"
-        yield fault("metadata.name", f"{kind} {name} stands {where}").within(path)
+        where = "twice in this file" if other == path else f"in {other} too"
+        yield fault("metadata.name", f"{kind} {name} is {where}").within(path)
     seen[identity] = path
     if api in _BUILT_IN:
         for where, message in _problems(_kind_validator(api, kind), document):
@@ -127,14 +133,14 @@ def _problems(validator: Any, instance: object) -> list[tuple[str, str]]:  # noq
     ]
 
 
-def _laid_over(defaults: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge values over defaults by Helm's rule: mappings merge, null removes, the rest wins."""
+def _merge_values(defaults: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge values into defaults by Helm's rules: mappings merge, null removes, others replace."""
     merged = dict(defaults)
     for key, value in values.items():
         if value is None:
             merged.pop(key, None)
         elif isinstance(value, dict) and isinstance(merged.get(key), dict):
-            merged[key] = _laid_over(merged[key], value)
+            merged[key] = _merge_values(merged[key], value)
         else:
             merged[key] = value
     return merged
@@ -153,7 +159,7 @@ def _values_validator(schema: str) -> Any:  # noqa: ANN401
 
 @lru_cache(maxsize=64)
 def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
-    """Compile the schema of one built-in kind from the definitions of one Kubernetes release."""
+    """Compile the schema of a built-in kind."""
     *group, version = api.split("/")
     prefix = f"{group[0].split('.')[0]}-" if group else ""
     folder = Path(kubernetes_validate.__file__).parent / "kubernetes-json-schema"

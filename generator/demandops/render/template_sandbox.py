@@ -1,7 +1,7 @@
-"""Jinja's sandbox for templates of the state repo, which also keeps them from eating the memory.
+"""A Jinja sandbox for templates of the state repo that also limits how much memory they use.
 
-A template is merged by people and may be wrong all the same: what no value of a chart needs, a
-product or a padding of millions of characters, is refused before it is made.
+A reviewed template may still be wrong. An expression that would make millions of characters, such
+as a product or a padding, is refused before it is evaluated. No chart value needs that much.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 MAX_LENGTH = 100_000
 _MAX_POWER = 64
 _WIDE = re.compile(r"\d{6,}|%[^a-zA-Z%]*\*|\{[^{}]*\{")
-"""A width of six digits and more, or one that is given as an argument."""
+"""A field width of six digits or more, or one that is passed as an argument."""
 _PADDING = ("format", "center", "indent", "batch", "slice", "wordwrap")
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja's sandbox with bounds on what one expression may make."""
+    """Jinja's sandbox with limits on the size of an expression's result."""
 
     intercepted_binops = frozenset({"*", "**", "%"})
 
@@ -33,7 +33,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
             self.filters[name] = _bounded(self.filters[name])
 
     def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:  # noqa: ANN401
-        """Refuse products, powers and paddings that no value of a chart needs."""
+        """Evaluate an operator; refuse products, powers and paddings that are too large."""
         sized = (str, list, tuple)
         if operator == "%":
             large = isinstance(left, str) and _WIDE.search(left) is not None
@@ -48,32 +48,32 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return super().call_binop(context, operator, left, right)
 
     def call(__self, __context: Context, __obj: Any, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
-        """Refuse methods of texts that are told to pad far (``'x'.ljust(10 ** 9)``)."""
+        """Call a function; refuse string methods that pad too far (``'x'.ljust(10 ** 9)``)."""
         if isinstance(getattr(__obj, "__self__", None), str):
             _refuse_large(__obj.__self__, args, kwargs)
         return super().call(__context, __obj, *args, **kwargs)
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:  # noqa: ANN401
-        """Refuse a format with a wide field; called for ``str.format`` alone."""
+        """Wrap ``str.format``; refuse a format with a wide field."""
         wrapped = super().wrap_str_format(value)
         if wrapped is not None and _WIDE.search(value.__self__):
             raise SecurityError("the result of 'format' is too large")
         return wrapped
 
 
-def _bounded(known: Callable[..., Any]) -> Callable[..., Any]:
-    @wraps(known)
+def _bounded(jinja_filter: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(jinja_filter)
     def bounded(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
         text = next((arg for arg in args if isinstance(arg, str)), "")
-        if known.__name__ == "do_format" and _WIDE.search(text):
+        if jinja_filter.__name__ == "do_format" and _WIDE.search(text):
             raise SecurityError("the result of 'format' is too large")
-        _refuse_large(known.__name__, args, kwargs)
-        return known(*args, **kwargs)
+        _refuse_large(jinja_filter.__name__, args, kwargs)
+        return jinja_filter(*args, **kwargs)
 
     return bounded
 
 
-def _refuse_large(of: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+def _refuse_large(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
     for number in (*args, *kwargs.values()):
         if isinstance(number, int) and number > MAX_LENGTH:
-            raise SecurityError(f"{number} is too large here, in '{of[:20]}'")
+            raise SecurityError(f"{number} is too large here, in '{name[:20]}'")

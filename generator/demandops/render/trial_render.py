@@ -1,4 +1,4 @@
-"""A rehearsal: what people merge is rendered for invented demands before a real one comes."""
+"""A check of new configuration: renders it for invented demands before a real one arrives."""
 
 from __future__ import annotations
 
@@ -9,37 +9,43 @@ from demandops.errors import Fault, InvalidInput
 from demandops.plan.checks import trial_demands
 from demandops.plan.release import ServiceRelease
 from demandops.render.engine import Engine
-from demandops.render.gitops import controller
+from demandops.render.gitops import manifests
 
 
-def rehearse(config: Config, engine: Engine) -> None:
-    """Render every service of every appdef once, for invented claims on a real node.
+def render_trial_demands(config: Config, engine: Engine) -> None:
+    """Render every service of every appdef once, with invented claims on a real node.
 
-    An appdef that nobody has demanded yet is checked before the first demand comes, and so is what
-    each override in force would make of it.
+    This checks an appdef before its first demand, without overrides and with each override that is
+    in effect. An override fails only if no appdef that it applies to renders with it.
 
     Raises:
         Refused, InvalidInput: naming the template, the values or the override that does not work.
     """
     invented = trial_demands.releases(config)
-    faults = [found for made in invented.values() for found in _tried(made, config, engine)]
+    faults = [
+        fault
+        for releases in invented.values()
+        for fault in _render_faults(releases, config, engine)
+    ]
     for override in () if faults else config.in_force:
-        tries = {
-            appdef: list(trial_demands.overridden(override, made, appdef, config))
-            for appdef, made in invented.items()
-        }
-        failed = [_tried(made, config, engine) for made in tries.values() if made]
-        if all(failed):  # else there is an application that it may be meant for
-            faults += [found for one in failed[:1] for found in one]
+        overridden = [
+            list(trial_demands.overridden(override, releases, appdef, config))
+            for appdef, releases in invented.items()
+        ]
+        failed = [_render_faults(releases, config, engine) for releases in overridden if releases]
+        if failed and all(failed):
+            faults += failed[0]
     if faults:
         raise InvalidInput(dict.fromkeys(faults))
 
 
-def _tried(releases: Iterable[ServiceRelease], config: Config, engine: Engine) -> list[Fault]:
+def _render_faults(
+    releases: Iterable[ServiceRelease], config: Config, engine: Engine
+) -> list[Fault]:
     faults: list[Fault] = []
     for release in releases:
         try:
-            controller.render(release, config, engine)
+            manifests.render(release, config, engine)
         except InvalidInput as error:
             faults += error.faults
     return faults

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from demandops.cluster.health import Named, Place, Target
+from demandops.cluster.health import ClusterDomain, ObjectName, Target
 from demandops.config.repo_settings import RepoSettings
 from demandops.decision import Decision, State
 from demandops.demand.claim import Subject, SubjectKind
@@ -46,7 +46,7 @@ def of_state(state: State) -> list[tuple[Release, Target]]:
         if release is not None:
             target = _target(release, state.config.repository, wanted=True)
             found.append((release, target))
-    return sorted(found, key=lambda pair: (pair[1].place.cluster, pair[1].name))
+    return sorted(found, key=lambda pair: (pair[1].domain.cluster, pair[1].name))
 
 
 def _asked(request: DemandRequest, ledger: Ledger) -> list[Subject]:
@@ -60,6 +60,6 @@ def _asked(request: DemandRequest, ledger: Ledger) -> list[Subject]:
 def _target(release: Release, repository: RepoSettings, *, wanted: bool) -> Target:
     domain, over = release.domain, None
     if repository.gitops == "argocd" and repository.argocd:
-        over = Named(repository.argocd.namespace, project_of(domain, repository))
-    place = Place(release.node.cluster, domain.name, domain.namespace, over)
+        over = ObjectName(repository.argocd.namespace, project_of(domain, repository))
+    place = ClusterDomain(release.node.cluster, domain.name, domain.namespace, over)
     return Target(place, release.name, isinstance(release, ServiceRelease), wanted)

@@ -14,7 +14,7 @@ from demandops import settings
 from demandops.config.config import Config
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger.restoration import Restoration
-from demandops.render.changes.changeset import Read
+from demandops.render.changes.changeset import FileReader
 from demandops.staterepo.audit import commit_signatures, verification
 from demandops.staterepo.audit.verification import Verdict
 from demandops.staterepo.git import connect
@@ -140,7 +140,7 @@ class Reader:
         except InvalidInput:
             return snapshots.load_last_valid(self._repository.objects, revision, progress)
 
-    def file_reader(self, revision: str | None = None) -> Read:
+    def file_reader(self, revision: str | None = None) -> FileReader:
         """Return a function that gives the text of a file at a commit."""
         tree = trees.commit_of(self._repository.objects, self.commit(revision)).tree
         return lambda path: trees.read_text(tree, path)

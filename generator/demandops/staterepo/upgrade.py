@@ -26,8 +26,8 @@ from demandops.errors import InvalidInput, StateRepoError, fault
 from demandops.ledger import ended_override_file
 from demandops.plan.overrides.lifecycle import TakenIn, taken_in
 from demandops.plan.release import ServiceRelease
-from demandops.render.changes.merge_preview import releases_of
-from demandops.render.gitops.handover import Handover, handover
+from demandops.render.changes.merge_preview import planned_releases
+from demandops.render.gitops.controller_switch import SwitchSteps, switch_steps
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo import reader
 from demandops.staterepo.git import tree as trees
@@ -63,9 +63,9 @@ class Upgrade:
     files: Mapping[str, str | None]
 
     @property
-    def handover(self) -> Handover:
+    def handover(self) -> SwitchSteps:
         """What to do on the clusters before and after."""
-        return handover(self.old, self.new)
+        return switch_steps(self.old, self.new)
 
 
 def plan(
@@ -170,7 +170,7 @@ def _refuse_held(state: State) -> None:
             f"keeps {release.name} as it is rendered for the other controller; remove it, and "
             "hold the release again afterwards",
         ).within(override.path)
-        for release in releases_of(state.ledger, state.config).values()
+        for release in planned_releases(state.ledger, state.config).values()
         if isinstance(release, ServiceRelease) and release.shaping.held
         for override, effects in release.shaping.by
         if "hold" in effects

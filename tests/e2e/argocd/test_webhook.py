@@ -106,7 +106,7 @@ def test_a_chart_edited_in_its_folder_is_what_healthy_is_of(
 def test_a_call_with_another_signature_or_none_is_refused(
     world: World, rig: Rig, secret: bytes | None
 ) -> None:
-    call = controller_webhook.to_argocd(rig.git_url(world.name), "", world.tip(), None)
+    call = controller_webhook.argocd_call(rig.git_url(world.name), "", world.tip(), None)
     url = f"{rig.url(SERVER)}/api/webhook"
     with pytest.raises(urllib.error.HTTPError) as caught:
         controller_webhook.send(url, call, secret, 5)

@@ -153,8 +153,7 @@ def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
     assert body(bare, path) == before
     (late,) = rig.book(generator, rig.goal(6))  # one more input for this fusion
     assert late.warnings[-1] == (
-        f"{fusion} is held by overrides/frozen.yaml, so what is asked of it waits until it is let "
-        "go"
+        f"{fusion} is held by overrides/frozen.yaml; its changes wait until the hold ends"
     )
     person.edit("registry/images.yaml", "2025-04", "2025-05")
     next_demand(generator, 3)

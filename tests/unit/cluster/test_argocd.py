@@ -5,15 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from demandops.cluster.health import Health, Named, Place, Target, Watched, reading
+from demandops.cluster.health import (
+    ClusterDomain,
+    Health,
+    ObjectName,
+    ObjectSelector,
+    Target,
+    health_reader,
+)
 
 from tests.unit.cluster.commits import Letters
 from tests.unit.cluster.test_flux import condition, deployment
 
 URL = "https://git.example/fleet.git"
 COMMITS = Letters()
-PLACE = Place("c-its", "perception", "ns", Named("argocd", "demandops-perception"))
-ARGOCD = reading(PLACE)
+PLACE = ClusterDomain("c-its", "perception", "ns", ObjectName("argocd", "demandops-perception"))
+ARGOCD = health_reader(PLACE)
 SERVICE = Target(PLACE, "od-edge", by_helm=True)
 CLIENT = Target(PLACE, "mqtt-a", by_helm=False)
 GONE = Target(PLACE, "od-edge", by_helm=True, wanted=False)
@@ -98,7 +105,7 @@ FAILED = {"kind": "Application", "name": "od-edge", "status": "SyncFailed", "mes
               finishedAt=AT, resources=[FAILED])),
          "waiting", "one failed. Retrying; Application od-edge: forbidden", True),
         (over(sync="OutOfSync", at="a", operation=synced("Running", "a", "no", finishedAt=AT)),
-         "waiting", "has not applied the commit yet; of a it says: no", False),
+         "waiting", "has not applied the commit yet; for a it reports: no", False),
         (over(sync="Unknown", at="", conditions=(condition("ComparisonError", "", "no route"),)),
          "waiting", "ComparisonError: no route", True),
         (over(sync="Synced", at="a", conditions=(condition("OrphanedResourceWarning", "", "w"),)),
@@ -108,7 +115,7 @@ FAILED = {"kind": "Application", "name": "od-edge", "status": "SyncFailed", "mes
 def test_an_access_domain_is_as_far_as_the_application_over_its_folder(
     found: dict[str, Any] | None, state: str, reason: str, failing: bool
 ) -> None:
-    health = ARGOCD.of_place(PLACE, "b", {OVER: found} if found else {}, COMMITS)
+    health = ARGOCD.domain_health(PLACE, "b", {OVER: found} if found else {}, COMMITS)
     assert (health.state, health.failing) == (state, failing)
     assert health.reason.startswith(reason)
     assert health.object in ("", "Application argocd/demandops-perception")
@@ -123,11 +130,11 @@ BAD = condition("Progressing", "False", "timed out")
     ("child", "made", "state", "reason", "failing"),
     [
         (None, None, "reconciled", "is not there yet", False),
-        (application(NEW), None, "reconciled", "was not looked at yet", False),
+        (application(NEW), None, "reconciled", "has not been compared yet", False),
         (application(NEW, sync="Synced", at="b"), None, "healthy", "", False),
         # Healthy as it was before the change
         (application(NEW, sync="Synced", at="b", compared=OLD), None, "reconciled",
-         "was not compared in its present form yet", False),
+         "has not been compared with its current spec yet", False),
         (application(NEW, sync="OutOfSync", at="b"), None, "reconciled", "is being synced", False),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "waiting for "
                      "healthy state", of=NEW)), None, "reconciled", "waiting for healthy", False),
@@ -150,12 +157,12 @@ BAD = condition("Progressing", "False", "timed out")
                      ), None, "reconciled", "ComparisonError: no chart", True),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
                      of=NEW)), None, "reconciled", "denied", True),
-        # a failure of its former form: past, unless it still holds the new one up
+        # a failure of its previous spec counts only while it is still retried
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
                      of=OLD)), None, "reconciled", "denied", False),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "denied",
                      of=OLD, finishedAt=AT)), None, "reconciled",
-         "its former form is still tried: denied", True),
+         "its previous spec is still being retried: denied", True),
     ],
 )  # fmt: skip
 def test_a_service_is_healthy_when_it_is_synced_as_it_stands_now_and_all_is_there(
@@ -167,7 +174,7 @@ def test_a_service_is_healthy_when_it_is_synced_as_it_stands_now_and_all_is_ther
 ) -> None:
     objects = {OVER: over(sync="Synced", at="b"), CHILD: child, ("Deployment", "ns", "x"): made}
     found = {key: item for key, item in objects.items() if item}
-    health = ARGOCD.of_target(SERVICE, "b", found, COMMITS)
+    health = ARGOCD.release_health(SERVICE, "b", found, COMMITS)
     assert (health.state, health.failing) == (state, failing)
     assert health.reason.startswith(reason)
 
@@ -177,7 +184,7 @@ def test_what_argo_cd_leaves_out_or_writes_out_makes_no_other_source() -> None:
     compared = {**source(port=1), "directory": {"recurse": True, "jsonnet": {}}}
     child = application(wanted, sync="Synced", at="b", compared=compared)
     objects = {OVER: over(sync="Synced", at="b"), CHILD: child}
-    assert ARGOCD.of_target(SERVICE, "b", objects, COMMITS).state == "healthy"
+    assert ARGOCD.release_health(SERVICE, "b", objects, COMMITS).state == "healthy"
 
 
 @pytest.mark.parametrize(
@@ -198,9 +205,9 @@ def test_a_chart_that_changed_in_its_folder_is_waited_for(
         OVER: over(sync="Synced", at="b"),
         CHILD: application(NEW, sync="Synced", at=at),
     }
-    health = ARGOCD.of_target(SERVICE, "b", objects, Letters(changing))
+    health = ARGOCD.release_health(SERVICE, "b", objects, Letters(changing))
     assert health.state == state
-    assert health.reason == ("" if state == "healthy" else "has not taken the commit's chart yet")
+    assert health.reason == ("" if state == "healthy" else "has not applied the commit's chart yet")
 
 
 def test_a_chart_of_a_registry_has_its_version_in_the_source() -> None:
@@ -210,13 +217,15 @@ def test_a_chart_of_a_registry_has_its_version_in_the_source() -> None:
         CHILD: application(chart, sync="Synced", at="1.2.0"),
     }
     history = Letters([("b", ".")])
-    assert ARGOCD.of_target(SERVICE, "b", objects, history).state == "healthy"
+    assert ARGOCD.release_health(SERVICE, "b", objects, history).state == "healthy"
 
 
 def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
     key = ("Deployment", "ns", "mqtt-a")
-    assert ARGOCD.of_target(CLIENT, "b", {}, COMMITS).state == "reconciled"
-    assert ARGOCD.of_target(CLIENT, "b", {key: deployment("mqtt-a")}, COMMITS).state == "healthy"
+    assert ARGOCD.release_health(CLIENT, "b", {}, COMMITS).state == "reconciled"
+    assert (
+        ARGOCD.release_health(CLIENT, "b", {key: deployment("mqtt-a")}, COMMITS).state == "healthy"
+    )
 
 
 def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
@@ -230,32 +239,34 @@ def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
         "argocd.argoproj.io/tracking-id": "ns_od-edge-2:apps/Deployment:ns/y"
     }
     removing = Health("reconciled", "is still being removed", "Application ns/od-edge")
-    assert ARGOCD.of_target(GONE, "b", {CHILD: child}, COMMITS) == removing
-    assert ARGOCD.of_target(GONE, "b", {("Deployment", "ns", "x"): left}, COMMITS) == removing
+    assert ARGOCD.release_health(GONE, "b", {CHILD: child}, COMMITS) == removing
+    assert ARGOCD.release_health(GONE, "b", {("Deployment", "ns", "x"): left}, COMMITS) == removing
     found = {("Deployment", "ns", "y"): other}
-    assert ARGOCD.of_target(GONE, "b", found, COMMITS) == Health("healthy")
+    assert ARGOCD.release_health(GONE, "b", found, COMMITS) == Health("healthy")
     child["status"]["conditions"] = [condition("DeletionError", "", "forbidden")]
-    health = ARGOCD.of_target(GONE, "b", {CHILD: child}, COMMITS)
+    health = ARGOCD.release_health(GONE, "b", {CHILD: child}, COMMITS)
     assert health.failing and health.reason.endswith("DeletionError: forbidden")
 
 
 def test_one_that_is_being_removed_is_not_what_is_wanted_anew() -> None:
     child = application(NEW, sync="Synced", at="b")
     child["metadata"]["deletionTimestamp"] = AT
-    health = ARGOCD.of_target(SERVICE, "b", {CHILD: child}, COMMITS)
-    assert health.state == "reconciled" and "made anew" in health.reason
+    health = ARGOCD.release_health(SERVICE, "b", {CHILD: child}, COMMITS)
+    assert health.state == "reconciled" and "created again" in health.reason
 
 
 def test_seen_and_since_when_are_the_cluster_s_to_say() -> None:
     objects = {OVER: over(sync="Synced", at="b"), CHILD: application(NEW)}
-    assert ARGOCD.applied(PLACE, objects) == "b"
-    assert ARGOCD.applied(PLACE, {}) == ""
+    assert ARGOCD.applied_commit(PLACE, objects) == "b"
+    assert ARGOCD.applied_commit(PLACE, {}) == ""
     under_way = over(sync="OutOfSync", at="c", operation=synced("Succeeded", "b"))
-    assert ARGOCD.applied(PLACE, {OVER: under_way}) == "b"
-    assert ARGOCD.since(SERVICE, objects) == AT
-    assert ARGOCD.since(CLIENT, objects) == ""
+    assert ARGOCD.applied_commit(PLACE, {OVER: under_way}) == "b"
+    assert ARGOCD.last_transition(SERVICE, objects) == AT
+    assert ARGOCD.last_transition(CLIENT, objects) == ""
 
 
 def test_of_argo_cd_s_own_namespace_one_object_is_asked_for() -> None:
     """An operator may keep the rest from the generator."""
-    assert ARGOCD.watched(PLACE)[0] == Watched("Application", "argocd", "demandops-perception")
+    assert ARGOCD.objects_to_watch(PLACE)[0] == ObjectSelector(
+        "Application", "argocd", "demandops-perception"
+    )

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from demandops.cluster.health import Health, Place, Target, reading, worst
+from demandops.cluster.health import ClusterDomain, Health, Target, health_reader, worst
 
 from tests.unit.cluster.commits import Letters
 
 COMMITS = Letters()
-PLACE = Place("c-its", "perception", "ns")
+PLACE = ClusterDomain("c-its", "perception", "ns")
 SERVICE = Target(PLACE, "od-edge", by_helm=True)
 CLIENT = Target(PLACE, "mqtt-a", by_helm=False)
 GONE = Target(PLACE, "od-edge", by_helm=True, wanted=False)
-FLUX = reading(PLACE)
+FLUX = health_reader(PLACE)
 
 
 def condition(kind: str, status: str, message: str = "") -> dict[str, str]:
@@ -59,7 +59,7 @@ def test_an_access_domain_is_as_far_as_its_kustomization(
     found: dict[str, Any] | None, state: str, reason: str, failing: bool
 ) -> None:
     objects = {("Kustomization", "ns", "perception"): found} if found else {}
-    health = FLUX.of_place(PLACE, "b", objects, COMMITS)
+    health = FLUX.domain_health(PLACE, "b", objects, COMMITS)
     assert (health.state, health.failing) == (state, failing)
     assert reason in health.reason
 
@@ -70,7 +70,7 @@ def test_a_source_that_cannot_be_fetched_is_the_reason() -> None:
         ("Kustomization", "ns", "perception"): kustomization("a", "a"),
         ("GitRepository", "ns", "demandops"): source,
     }
-    health = FLUX.of_place(PLACE, "b", objects, COMMITS)
+    health = FLUX.domain_health(PLACE, "b", objects, COMMITS)
     assert health == Health("waiting", "no route", "GitRepository ns/demandops", failing=True)
 
 
@@ -104,17 +104,19 @@ def test_a_service_is_healthy_when_helm_and_all_its_deployments_are(
 ) -> None:
     keys = {"r": ("HelmRelease", "ns", "od-edge"), "d": ("Deployment", "ns", "x")}
     found = {keys[short]: item for short, item in objects.items()}
-    health = FLUX.of_target(SERVICE, "b", found, COMMITS)
+    health = FLUX.release_health(SERVICE, "b", found, COMMITS)
     assert (health.state, health.failing) == (state, failing)
     assert reason in health.reason
 
 
 def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
     key = ("Deployment", "ns", "mqtt-a")
-    assert FLUX.of_target(CLIENT, "b", {}, COMMITS).state == "reconciled"
-    assert FLUX.of_target(CLIENT, "b", {key: deployment("mqtt-a")}, COMMITS).state == "healthy"
+    assert FLUX.release_health(CLIENT, "b", {}, COMMITS).state == "reconciled"
+    assert FLUX.release_health(CLIENT, "b", {key: deployment("mqtt-a")}, COMMITS).state == "healthy"
     assert (
-        FLUX.of_target(CLIENT, "b", {key: deployment("mqtt-a", availableReplicas=0)}, COMMITS).state
+        FLUX.release_health(
+            CLIENT, "b", {key: deployment("mqtt-a", availableReplicas=0)}, COMMITS
+        ).state
         == "reconciled"
     )
 
@@ -122,9 +124,9 @@ def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
 def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
     helm = {("HelmRelease", "ns", "od-edge"): release(READY)}
     left = {("Deployment", "ns", "x"): deployment("x", of="od-edge")}
-    assert FLUX.of_target(GONE, "b", helm, COMMITS).state == "reconciled"
-    assert FLUX.of_target(GONE, "b", left, COMMITS).state == "reconciled"
-    assert FLUX.of_target(GONE, "b", {}, COMMITS).state == "healthy"
+    assert FLUX.release_health(GONE, "b", helm, COMMITS).state == "reconciled"
+    assert FLUX.release_health(GONE, "b", left, COMMITS).state == "reconciled"
+    assert FLUX.release_health(GONE, "b", {}, COMMITS).state == "healthy"
 
 
 def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
@@ -136,8 +138,8 @@ def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
 
 def test_since_when_is_the_cluster_s_to_say() -> None:
     found = {("HelmRelease", "ns", "od-edge"): release(READY)}
-    assert FLUX.since(SERVICE, found) == "2026-05-04T12:00:00Z"
-    assert FLUX.since(CLIENT, found) == ""
+    assert FLUX.last_transition(SERVICE, found) == "2026-05-04T12:00:00Z"
+    assert FLUX.last_transition(CLIENT, found) == ""
 
 
 @pytest.mark.parametrize(

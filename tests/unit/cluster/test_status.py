@@ -6,8 +6,8 @@ import time
 from pathlib import Path
 
 from demandops.cluster.access import ClusterAccess
-from demandops.cluster.health import Place, Target
-from demandops.cluster.rollout_status import RolloutStatus
+from demandops.cluster.health import ClusterDomain, Target
+from demandops.cluster.rollout_watcher import RolloutWatcher
 
 from tests.unit.cluster.commits import Letters
 
@@ -24,9 +24,9 @@ current-context: x
 def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: Path) -> None:
     file = tmp_path / "kubeconfig"
     file.write_text(KUBECONFIG)
-    status = RolloutStatus({"away": ClusterAccess(kubeconfig=file)}, Letters())
+    status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
     try:
-        target = Target(Place("away", "d", "ns"), "r", by_helm=True)
+        target = Target(ClusterDomain("away", "d", "ns"), "r", by_helm=True)
         start = time.monotonic()
         health = status.follow("a" * 40, [target], "healthy", timeout=0.5).result(30)
         assert time.monotonic() - start >= 0.5
@@ -39,12 +39,12 @@ def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: P
 
 
 def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
-    status = RolloutStatus({"w": ClusterAccess(receiver="https://h/hook")}, Letters())
+    status = RolloutWatcher({"w": ClusterAccess(receiver="https://h/hook")}, Letters())
     try:
-        assert status.reaches([Place("w", "d", "n"), Place("x", "d", "n")]) == (
-            "no access to cluster w, x"
-        )
-        assert status.reaches([]) == ""
+        assert status.why_unreachable(
+            [ClusterDomain("w", "d", "n"), ClusterDomain("x", "d", "n")]
+        ) == ("no access to cluster w, x")
+        assert status.why_unreachable([]) == ""
     finally:
         status.close()
 
@@ -52,8 +52,8 @@ def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
 def test_closing_answers_what_is_still_followed(tmp_path: Path) -> None:
     file = tmp_path / "kubeconfig"
     file.write_text(KUBECONFIG)
-    status = RolloutStatus({"away": ClusterAccess(kubeconfig=file)}, Letters())
-    target = Target(Place("away", "d", "ns"), "r", by_helm=True)
+    status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
+    target = Target(ClusterDomain("away", "d", "ns"), "r", by_helm=True)
     followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
     status.close()
     assert followed.result(10).state == "waiting"

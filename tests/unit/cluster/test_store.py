@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 from demandops.cluster.access import ClusterAccess
-from demandops.cluster.health import Watched
+from demandops.cluster.health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 
-OVER = Watched("Application", "argocd", "demandops-perception")
-CHILDREN = Watched("Application", "perception")
-DEPLOYMENTS = Watched("Deployment", "perception")
+OVER = ObjectSelector("Application", "argocd", "demandops-perception")
+CHILDREN = ObjectSelector("Application", "perception")
+DEPLOYMENTS = ObjectSelector("Deployment", "perception")
 
 
 @dataclass
@@ -74,7 +74,7 @@ def store(api: Api) -> ObjectCache:
 
 def test_one_object_is_asked_for_by_its_name(api: Api) -> None:
     read = store(api)
-    read.read([OVER, CHILDREN])
+    read.read_once([OVER, CHILDREN])
     over, children = api.asked
     assert over.endswith(
         "/namespaces/argocd/applications?fieldSelector=metadata.name%3Ddemandops-perception"
@@ -89,11 +89,11 @@ def test_one_object_is_asked_for_by_its_name(api: Api) -> None:
 def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
     api.refused = "/argocd/"
     read = store(api)
-    read.read([OVER, CHILDREN])
-    assert read.trouble == "applications in argocd: Forbidden"
-    assert read.unread([OVER]) == "applications in argocd: Forbidden"
-    assert read.unread([CHILDREN]) == ""
-    assert read.unread([DEPLOYMENTS]) == "it was not read yet"
+    read.read_once([OVER, CHILDREN])
+    assert read.read_error == "applications in argocd: Forbidden"
+    assert read.why_unknown([OVER]) == "applications in argocd: Forbidden"
+    assert read.why_unknown([CHILDREN]) == ""
+    assert read.why_unknown([DEPLOYMENTS]) == "it has not been read yet"
 
 
 def test_a_cluster_that_is_away_is_asked_once(api: Api, tmp_path: Path) -> None:
@@ -101,6 +101,6 @@ def test_a_cluster_that_is_away_is_asked_once(api: Api, tmp_path: Path) -> None:
     text = Path(str(api.reached.kubeconfig)).read_text()
     nowhere.write_text(text.replace(text.split("127.0.0.1:")[1].split('"')[0], "1"))
     read = ObjectCache("away", ClusterAccess(kubeconfig=nowhere), lambda: None)
-    read.read([OVER, CHILDREN])
-    assert read.unread([OVER]).startswith("MaxRetryError")
-    assert read.unread([CHILDREN]) == read.unread([OVER])
+    read.read_once([OVER, CHILDREN])
+    assert read.why_unknown([OVER]).startswith("MaxRetryError")
+    assert read.why_unknown([CHILDREN]) == read.why_unknown([OVER])

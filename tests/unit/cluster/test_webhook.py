@@ -199,7 +199,7 @@ def test_a_repository_without_a_host_cannot_be_named() -> None:
         (None, 0, "{file} cannot be read: No such file or directory"),
         ("", 0o600, "{file} is empty"),
         ("\n", 0o600, "{file} is empty"),
-        (SECRET, 0o644, "{file} may be read by everybody on this machine; chmod o= it"),
+        (SECRET, 0o644, "{file} may be read by everybody on this machine; run chmod o= on it"),
     ],
 )
 def test_a_secret_that_cannot_be_used_is_told_at_the_start(
@@ -226,5 +226,5 @@ def test_a_secret_that_signs_nothing_is_a_fault(tmp_path: Path) -> None:
         "apiVersion: demandops/v1\nkind: ClusterAccess\n"
         "clusters: {a: {kubeconfig: /k, secret_file: /s}}\n"
     )
-    with pytest.raises(InvalidInput, match="nothing it signs; add a receiver or a webhook"):
+    with pytest.raises(InvalidInput, match="but no URL; add a receiver or a webhook"):
         access.read(clusters)

@@ -138,9 +138,9 @@ Write = Callable[[Path], object]
     ("write", "message"),
     [
         (lambda path: None, "cannot be read: No such file or directory"),
-        (lambda path: path.write_text("\n"), "holds no token: one line of plain text"),
-        (lambda path: path.write_text("two\nlines"), "holds no token: one line of plain text"),
-        (lambda path: path.write_bytes(b"\xff\xfe"), "cannot be read: it is no text"),
+        (lambda path: path.write_text("\n"), "must hold a token: one line of plain text"),
+        (lambda path: path.write_text("two\nlines"), "must hold a token: one line of plain text"),
+        (lambda path: path.write_bytes(b"\xff\xfe"), "cannot be read: it is not text"),
     ],
 )
 def test_a_token_file_that_is_none_is_told(tmp_path: Path, write: Write, message: str) -> None:

@@ -91,7 +91,7 @@ class TestZenoh:
             ("zenoh-vehicle00", "start"),
             ("zenoh-edge", "change"),
         ]
-        assert world.releases[1].details == ("+ connection c", "+ gives /a")
+        assert world.releases[1].details == ("+ connection c", "+ writes /a")
 
     def test_of_another_type_the_ends_are_affected(self) -> None:
         world = zenoh_world()

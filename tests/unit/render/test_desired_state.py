@@ -204,7 +204,7 @@ class TestLastLook:
             "clusters/c/d/n/y.yaml": self.CONFIG,
         }
         assert self.faults(files) == [
-            "clusters/c/d/n/y.yaml: metadata.name: ConfigMap a stands in clusters/c/d/n/x.yaml too"
+            "clusters/c/d/n/y.yaml: metadata.name: ConfigMap a is in clusters/c/d/n/x.yaml too"
         ]
 
     def test_one_object_twice_in_a_file_is_refused(self) -> None:

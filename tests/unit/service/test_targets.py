@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from demandops import strict_yaml
-from demandops.cluster.health import Named
+from demandops.cluster.health import ObjectName
 from demandops.decision import decide
 from demandops.service import rollout_targets
 
@@ -13,12 +13,14 @@ from tests.golden.cases import NOW, requests_of, start
 
 @pytest.mark.parametrize(
     ("case", "application"),
-    [("experiment", None), ("argocd-experiment", Named("argocd", "demandops-perception"))],
+    [("experiment", None), ("argocd-experiment", ObjectName("argocd", "demandops-perception"))],
 )
-def test_a_place_knows_by_which_controller_it_is_kept(case: str, application: Named | None) -> None:
+def test_a_place_knows_by_which_controller_it_is_kept(
+    case: str, application: ObjectName | None
+) -> None:
     state, files = start(case)
     goal = strict_yaml.load(requests_of(case)[0].read_text())
     found = rollout_targets.of_state(decide(state, goal, NOW, files.get).state)
     assert {target.name for release, target in found} == {release.name for release, _ in found}
-    assert {target.place.application for _, target in found} == {application}
+    assert {target.domain.application for _, target in found} == {application}
     assert {target.by_helm for _, target in found} == {True, False}

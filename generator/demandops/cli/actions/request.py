@@ -256,7 +256,7 @@ def show_releases(decision: Decision) -> None:
     """Print what a decision changes: releases, and the files that are written or removed."""
     out = console()
     for release in decision.releases:
-        out.print(f"  {SIGNS[release.change]} {release.name} ({release.what})")
+        out.print(f"  {SIGNS[release.change]} {release.name} ({release.description})")
         for detail in release.details:
             out.print(f"      {detail}")
     for path, text in sorted(decision.files.items()):

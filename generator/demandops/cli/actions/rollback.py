@@ -116,7 +116,12 @@ def _consequence(decision: Decision | None) -> dict[str, Any]:
             }
         )
     releases = [
-        {"name": one.name, "change": one.change, "what": one.what, "details": list(one.details)}
+        {
+            "name": one.name,
+            "change": one.change,
+            "what": one.description,
+            "details": list(one.details),
+        }
         for one in (decision.releases if decision else ())
     ]
     return {**claims, "releases": releases}

@@ -82,8 +82,8 @@ def _data(found: Checked) -> dict[str, Any]:
                 "instead_of": one.path,
                 "file": one.name,
                 "text": one.text,
-                "left": list(one.left),
-                "also": list(one.also),
+                "left": list(one.not_covered),
+                "also": list(one.other_releases),
             }
             for one in found.suggestions
         ],
@@ -116,7 +116,7 @@ def _release_data(one: ReleaseChange) -> dict[str, Any]:
     return {
         "name": one.name,
         "change": one.change,
-        "what": one.what,
+        "what": one.description,
         "details": list(one.details),
     }
 
@@ -171,8 +171,8 @@ def _lines(found: Checked) -> Iterator[str]:
     for one in found.suggestions:
         yield f"\ninstead of editing {one.path}, {one.name}:\n"
         yield from one.text.splitlines()
-        if one.also:
-            yield f"\n(it fits {', '.join(one.also)} too)"
+        if one.other_releases:
+            yield f"\n(it fits {', '.join(one.other_releases)} too)"
     known = found.consequence
     if known is None:
         if not found.suggestions:
@@ -187,7 +187,7 @@ def _lines(found: Checked) -> Iterator[str]:
     if known.releases:
         yield "\ndesired state:"
         for release in known.releases:
-            yield f"  {_SIGNS[release.change]} {release.name} ({release.what})"
+            yield f"  {_SIGNS[release.change]} {release.name} ({release.description})"
             yield from (f"      {detail}" for detail in release.details)
     if found.books:
         yield "\nbookkeeping:"

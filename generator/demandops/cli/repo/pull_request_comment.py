@@ -90,10 +90,10 @@ def _warnings(found: Checked) -> Iterator[str]:
 def _suggestions(found: Checked) -> Iterator[str]:
     for one in found.suggestions:
         body = f"Merge this as {code(one.name)}:\n\n{fence(one.text, 'yaml')}"
-        if one.left:
-            body += f"\nNo override changes {', '.join(map(code, one.left))}.\n"
-        if one.also:
-            body += f"\nIt fits {', '.join(map(code, one.also))} too.\n"
+        if one.not_covered:
+            body += f"\nNo override changes {', '.join(map(code, one.not_covered))}.\n"
+        if one.other_releases:
+            body += f"\nIt fits {', '.join(map(code, one.other_releases))} too.\n"
         yield _folded(f"Instead of editing {_plain(one.path)}", body)
 
 
@@ -139,7 +139,7 @@ def _counted(releases: Iterable[ReleaseChange]) -> str:
 
 
 def _release(one: ReleaseChange) -> str:
-    lines = [f"\n- {_VERBS[one.change]} {code(one.name)}: {code(one.what)}"]
+    lines = [f"\n- {_VERBS[one.change]} {code(one.name)}: {code(one.description)}"]
     lines += [f"\n  - {code(detail)}" for detail in one.details]
     return "".join(lines)
 

@@ -18,7 +18,7 @@ from demandops.cli.output import (
     signing_option,
     state_repo_option,
 )
-from demandops.render.gitops.handover import Step
+from demandops.render.gitops.controller_switch import Step
 from demandops.staterepo import upgrade as upgrading
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.upgrade import Upgrade, UpgradeRequest
@@ -97,7 +97,7 @@ def _data(made: Upgrade, dry_run: bool) -> dict[str, Any]:
 
 
 def _step_data(step: Step) -> dict[str, Any]:
-    return {"cluster": step.cluster, "what": step.what, "commands": list(step.commands)}
+    return {"cluster": step.cluster, "what": step.description, "commands": list(step.commands)}
 
 
 def _print(made: Upgrade, dry_run: bool) -> None:
@@ -146,6 +146,6 @@ def _print_steps(title: str, steps: Iterable[Step]) -> None:
     if clusters:
         out.print(f"\n{title}")
     for step in clusters:
-        out.print(f"- {step.cluster}: {step.what}", soft_wrap=True)
+        out.print(f"- {step.cluster}: {step.description}", soft_wrap=True)
         for command in step.commands:
             out.print(f"      {command}", soft_wrap=True)

@@ -89,7 +89,7 @@ def _releases(
 def _row(release: ReleaseDifference) -> dict[str, Any]:
     return {
         "name": release.name,
-        "what": release.what,
+        "what": release.description,
         "file": release.path,
         "details": list(release.details),
     }
@@ -97,7 +97,7 @@ def _row(release: ReleaseDifference) -> dict[str, Any]:
 
 def _release_lines(releases: Iterable[ReleaseDifference], others: Iterable[str]) -> Iterator[str]:
     for release in releases:
-        yield f"{SIGNS[release.change]} release {release.name} ({release.what})"
+        yield f"{SIGNS[release.change]} release {release.name} ({release.description})"
         yield from (f"    {detail}" for detail in release.details)
     yield from (f"~ file {path}" for path in others)
 

@@ -20,7 +20,7 @@ from demandops.cli.output import (
     state_repo_option,
 )
 from demandops.cluster import access
-from demandops.cluster.health import Health, Target, Watched, reading
+from demandops.cluster.health import Health, ObjectSelector, Target, health_reader
 from demandops.cluster.object_cache import ObjectCache
 from demandops.plan.release import Release, ServiceRelease
 from demandops.service import rollout_targets
@@ -81,17 +81,17 @@ def _read(
     clusters: Mapping[str, access.ClusterAccess], found: Iterable[Target]
 ) -> dict[str, ObjectCache]:
     """Read all clusters at once: one that is away holds up no other."""
-    wanted: dict[str, dict[Watched, None]] = {}
+    wanted: dict[str, dict[ObjectSelector, None]] = {}
     for target in found:
-        watched = reading(target.place).watched(target.place)
-        wanted.setdefault(target.place.cluster, {}).update(dict.fromkeys(watched))
+        watched = health_reader(target.domain).objects_to_watch(target.domain)
+        wanted.setdefault(target.domain.cluster, {}).update(dict.fromkeys(watched))
     stores = {
         name: ObjectCache(name, reached, lambda: None)
         for name, reached in clusters.items()
         if reached.kubeconfig and name in wanted
     }
     with ThreadPoolExecutor(max(len(stores), 1)) as pool:
-        list(pool.map(lambda store: store.read(wanted[store.name]), stores.values()))
+        list(pool.map(lambda store: store.read_once(wanted[store.name]), stores.values()))
     return stores
 
 
@@ -107,8 +107,8 @@ def _row(
         "release": target.name,
         "what": _what(release),
         "node": release.node.id,
-        "cluster": target.place.cluster,
-        "domain": target.place.domain,
+        "cluster": target.domain.cluster,
+        "domain": target.domain.name,
         "seen": seen or None,
         "health": health.state if seen or health.object else "unknown",
         "since": when or None,
@@ -121,19 +121,23 @@ def _row(
 def _seen(
     target: Target, commit: str, stores: Mapping[str, ObjectCache], repo: Reader
 ) -> tuple[Health, str, str]:
-    store = stores.get(target.place.cluster)
+    store = stores.get(target.domain.cluster)
     if store is None:
         return Health("waiting", "no access to this cluster"), "", ""
-    read = reading(target.place)
-    unread = store.unread(read.watched(target.place))
+    read = health_reader(target.domain)
+    unread = store.why_unknown(read.objects_to_watch(target.domain))
     if unread:
         reason = f"cannot be read: {unread}"
         return Health("waiting", reason, f"cluster {store.name}"), "", ""
     objects = store.objects()
-    health = read.of_place(target.place, commit, objects, repo)
+    health = read.domain_health(target.domain, commit, objects, repo)
     if health.state != "waiting":
-        health = read.of_target(target, commit, objects, repo)
-    return health, read.applied(target.place, objects), read.since(target, objects)
+        health = read.release_health(target, commit, objects, repo)
+    return (
+        health,
+        read.applied_commit(target.domain, objects),
+        read.last_transition(target, objects),
+    )
 
 
 def _what(release: Release) -> str:

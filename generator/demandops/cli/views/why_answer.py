@@ -12,7 +12,7 @@ from demandops.ledger import claim_file as ledger_format
 from demandops.plan.overrides.claims_in_force import in_force, suspended_by
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
-from demandops.render.changes.changeset import described
+from demandops.render.changes.changeset import describe_change
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load.snapshot import Snapshot
@@ -27,7 +27,7 @@ def release(snapshot: Snapshot, found: Release) -> dict[str, Any]:
     claims = explanation.claims_behind(in_force(ledger, config), found)
     return {
         "runs": True,
-        "what": described(None, found, stood=False).what,
+        "what": describe_change(None, found, existed=False).description,
         **_where(found),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
         "claims": [_claim(claim, config) for claim in claims],
@@ -43,7 +43,7 @@ def denied(found: Release, by: Override) -> dict[str, Any]:
     """Return what keeps a release from running that claims ask for."""
     return {
         "runs": False,
-        "what": described(None, found, stood=False).what,
+        "what": describe_change(None, found, existed=False).description,
         **_where(found),
         "denied_by": _override(by, ("deny",)),
     }

@@ -1,44 +1,44 @@
-"""What the objects of a cluster say about releases: by Flux's reading, or Argo CD's. Pure.
+"""The health of releases, computed from a cluster's objects. Pure.
 
-What is asked here is asked of any place; each knows by which controller it is kept, so a state
-repo may go over from one to the other while demands are followed.
+Flux and Argo CD each have a reader. Every :class:`ClusterDomain` knows its controller, so a state
+repo may switch controllers while rollouts are followed.
 """
 
 from __future__ import annotations
 
 from demandops.cluster.health import argocd, flux
-from demandops.cluster.health.health import (
+from demandops.cluster.health.model import (
+    ClusterDomain,
     Health,
+    HealthReader,
     History,
     Key,
     Level,
-    Named,
     Object,
+    ObjectName,
     Objects,
-    Place,
-    Reading,
+    ObjectSelector,
     Target,
-    Watched,
     worst,
 )
 
 __all__ = [
+    "ClusterDomain",
     "Health",
+    "HealthReader",
     "History",
     "Key",
     "Level",
-    "Named",
     "Object",
+    "ObjectName",
+    "ObjectSelector",
     "Objects",
-    "Place",
-    "Reading",
     "Target",
-    "Watched",
-    "reading",
+    "health_reader",
     "worst",
 ]
 
 
-def reading(place: Place) -> Reading:
-    """Return how the objects of a place are read."""
-    return argocd if place.application else flux
+def health_reader(domain: ClusterDomain) -> HealthReader:
+    """Return the reader for the controller of a domain."""
+    return argocd if domain.application else flux

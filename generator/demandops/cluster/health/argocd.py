@@ -1,114 +1,117 @@
-"""What Argo CD's objects say about releases. Pure: objects in, health out.
+"""The health of releases, from Argo CD's objects. Pure.
 
-Objects are plain data as the Kubernetes API gives them. Field names as of Argo CD 3.2
-(argoproj.io/v1alpha1). Status lags behind spec, so nothing is believed that was found of another
-form: ``status.sync.comparedTo`` says of which.
+Objects are plain data as the Kubernetes API returns them. Field names as of Argo CD 3.2
+(argoproj.io/v1alpha1). The status lags behind the spec, so it counts only if it is about the
+current spec: ``status.sync.comparedTo`` holds the source that it is about.
 """
 
 from __future__ import annotations
 
-from demandops.cluster.health.deployment import condition, of_client, of_deployment
-from demandops.cluster.health.health import (
+from demandops.cluster.health.deployment import client_health, condition, deployment_health
+from demandops.cluster.health.model import (
+    ClusterDomain,
     Health,
     History,
-    Named,
     Object,
+    ObjectName,
     Objects,
-    Place,
+    ObjectSelector,
     Target,
-    Watched,
 )
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
-"""Of a sync that failed, so many objects are told one by one."""
+"""How many objects of a failed sync a reason lists."""
 
 
-def watched(place: Place) -> tuple[Watched, ...]:
-    """Return what must be known to tell how things are at a place."""
-    return Watched("Application", *_over(place)), *confirmed_by(place)
+def objects_to_watch(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+    """Return the objects that the health of a domain and its releases depends on."""
+    return ObjectSelector("Application", *_folder_application(domain)), *objects_to_confirm(domain)
 
 
-def confirmed_by(place: Place) -> tuple[Watched, ...]:
-    """Return what is read once more before something is healthy: releases, then what they own."""
-    return Watched("Application", place.namespace), Watched("Deployment", place.namespace)
+def objects_to_confirm(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+    """Return the objects to read again before a release counts as healthy: owners come first."""
+    return ObjectSelector("Application", domain.namespace), ObjectSelector(
+        "Deployment", domain.namespace
+    )
 
 
-def of_place(place: Place, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether the Application over an access domain's folder has applied a commit."""
-    over = _over(place)
-    name = f"Application {over.namespace}/{over.name}"
-    found = objects.get(("Application", *over))
-    if found is None:
+def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history: History) -> Health:
+    """Return whether the Application of a domain's folder has applied a commit."""
+    application = _folder_application(domain)
+    name = f"Application {application.namespace}/{application.name}"
+    app = objects.get(("Application", *application))
+    if app is None:
         return Health("waiting", "is not there; apply bootstrap/ to the cluster", name)
-    if any(history.includes(revision, commit) for revision in _applied(found)):
+    if any(history.includes(revision, commit) for revision in _applied_commits(app)):
         return Health("reconciled")
     waiting = "has not applied the commit yet"
-    message, revision = _trouble(found)
+    message, revision = _failure(app)
     if not message:
         return Health("waiting", waiting, name)
     if revision and not history.includes(revision, commit):
-        return Health("waiting", f"{waiting}; of {revision[:10]} it says: {message}", name)
+        return Health("waiting", f"{waiting}; for {revision[:10]} it reports: {message}", name)
     return Health("waiting", message, name, failing=True)
 
 
-def of_target(target: Target, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether a release of an applied commit runs, or is gone where it is to be gone."""
+def release_health(target: Target, commit: str, objects: Objects, history: History) -> Health:
+    """Return whether a release of an applied commit runs, or is removed if unwanted."""
     if not target.wanted:
-        return _gone(target, objects)
+        return _removal_health(target, objects)
     if not target.by_helm:
-        return of_client(target, objects)
-    name = f"Application {target.place.namespace}/{target.name}"
-    found = objects.get(("Application", target.place.namespace, target.name))
-    if found is None:
+        return client_health(target, objects)
+    name = f"Application {target.domain.namespace}/{target.name}"
+    app = objects.get(("Application", target.domain.namespace, target.name))
+    if app is None:
         return Health("reconciled", "is not there yet", name)
-    if found["metadata"].get("deletionTimestamp"):
-        return Health("reconciled", "is still being removed, and made anew then", name)
-    behind = _behind(target.place, found, commit, objects, history)
-    if not behind and _status(found, "sync").get("status") == "Synced":
-        return _of_synced(found, name, objects)
-    message, _ = _trouble(found)
+    if app["metadata"].get("deletionTimestamp"):
+        return Health("reconciled", "is being removed and will then be created again", name)
+    outdated = _why_outdated(target.domain, app, commit, objects, history)
+    if not outdated and _status(app, "sync").get("status") == "Synced":
+        return _synced_health(app, name, objects)
+    message, _ = _failure(app)
     if message:
         return Health("reconciled", message, name, failing=True)
-    running = str(_status(found, "operationState").get("message") or "is being synced")
-    return Health("reconciled", behind or running, name)
+    running = str(_status(app, "operationState").get("message") or "is being synced")
+    return Health("reconciled", outdated or running, name)
 
 
-def since(target: Target, objects: Objects) -> str:
-    """Return since when a release is as it is, as the cluster says it; empty where it does not."""
+def last_transition(target: Target, objects: Objects) -> str:
+    """Return when the state of a release last changed; empty if the cluster does not say."""
     kind = "Application" if target.by_helm else "Deployment"
-    found = objects.get((kind, target.place.namespace, target.name)) or {}
-    said = condition(found.get("status") or {}, "Available")
+    item = objects.get((kind, target.domain.namespace, target.name)) or {}
     if target.by_helm:
-        said = _status(found, "health")
-    return str(said.get("lastTransitionTime", ""))
+        state = _status(item, "health")
+    else:
+        state = condition(item.get("status") or {}, "Available")
+    return str(state.get("lastTransitionTime", ""))
 
 
-def applied(place: Place, objects: Objects) -> str:
-    """Return the commit that an access domain's folder was last seen to be applied from."""
-    found = objects.get(("Application", *_over(place)))
-    return next(iter(_applied(found)), "") if found else ""
+def applied_commit(domain: ClusterDomain, objects: Objects) -> str:
+    """Return the commit that a domain's Application has applied; empty if it is not known."""
+    app = objects.get(("Application", *_folder_application(domain)))
+    return next(iter(_applied_commits(app)), "") if app else ""
 
 
-def _over(place: Place) -> Named:
-    assert place.application is not None  # noqa: S101 - or Flux's reading would be asked
-    return place.application
+def _folder_application(domain: ClusterDomain) -> ObjectName:
+    assert domain.application is not None  # noqa: S101 - otherwise Flux's reader is used
+    return domain.application
 
 
-def _applied(found: Object) -> list[str]:
+def _applied_commits(app: Object) -> list[str]:
     """Return the commits that an Application is known to have applied, the newest first.
 
-    The commit that it was compared with counts where it was found Synced. Where commits come fast
-    that may never be seen; then the last sync counts that succeeded and was of everything.
+    If it is Synced, that is the commit that it was compared with. If commits come fast, it may
+    never be Synced, so the last successful sync of all resources counts too.
     """
-    source = (found.get("spec") or {}).get("source")
-    sync, operation = _status(found, "sync"), _status(found, "operationState")
+    source = (app.get("spec") or {}).get("source")
+    sync, operation = _status(app, "sync"), _status(app, "operationState")
     revisions = []
     compared = (sync.get("comparedTo") or {}).get("source")
     if sync.get("status") == "Synced" and _same(compared, source):
         revisions.append(str(sync.get("revision", "")))
     result = operation.get("syncResult") or {}
-    partial = _asked(operation).get("resources")
+    partial = _requested_sync(operation).get("resources")
     if (
         operation.get("phase") == "Succeeded"
         and not partial
@@ -118,84 +121,89 @@ def _applied(found: Object) -> list[str]:
     return [revision for revision in revisions if revision]
 
 
-def _behind(place: Place, found: Object, commit: str, objects: Objects, history: History) -> str:
-    """Return why the status of a service's Application is not about what is wanted of it."""
-    sync, source = _status(found, "sync"), (found.get("spec") or {}).get("source") or {}
+def _why_outdated(
+    domain: ClusterDomain, app: Object, commit: str, objects: Objects, history: History
+) -> str:
+    """Return why a status is not about the current spec and commit; empty if it is."""
+    sync, source = _status(app, "sync"), (app.get("spec") or {}).get("source") or {}
     if not sync:
-        return "was not looked at yet"
+        return "has not been compared yet"
     if not _same((sync.get("comparedTo") or {}).get("source"), source):
-        return "was not compared in its present form yet"
-    over = objects.get(("Application", *_over(place))) or {}
-    folder = (over.get("spec") or {}).get("source") or {}
+        return "has not been compared with its current spec yet"
+    application = objects.get(("Application", *_folder_application(domain))) or {}
+    folder = (application.get("spec") or {}).get("source") or {}
     if source.get("repoURL") != folder.get("repoURL"):
-        return ""  # the chart is in a registry, and its version part of the source
+        return ""  # the chart is in a registry, and the source includes its version
     revision = str(sync.get("revision", ""))
     if history.includes(revision, commit):
         return ""
     if history.unchanged(revision, commit, str(source.get("path", ""))):
         return ""
-    return "has not taken the commit's chart yet"
+    return "has not applied the commit's chart yet"
 
 
-def _of_synced(found: Object, name: str, objects: Objects) -> Health:
-    """Return the health of a service that is applied as wanted, by what it is made of."""
-    for item in (found.get("status") or {}).get("resources") or ():
+def _synced_health(app: Object, name: str, objects: Objects) -> Health:
+    """Return the health of a service whose Application is synced, from its Deployments."""
+    for item in (app.get("status") or {}).get("resources") or ():
         if item.get("kind") != "Deployment":
             continue
         key = ("Deployment", str(item.get("namespace", "")), str(item.get("name", "")))
         if key not in objects:
             return Health("reconciled", "is not there yet", f"Deployment {key[1]}/{key[2]}")
-        health = of_deployment(objects[key])
+        health = deployment_health(objects[key])
         if health.state != "healthy":
             return health
-    said = _status(found, "health")
-    if said.get("status") == "Healthy":
+    reported = _status(app, "health")
+    if reported.get("status") == "Healthy":
         return Health("healthy")
-    reason = str(said.get("message") or f"its health is {said.get('status') or 'not known yet'}")
-    return Health("reconciled", reason, name, failing=said.get("status") == "Degraded")
+    reason = str(
+        reported.get("message") or f"its health is {reported.get('status') or 'not known yet'}"
+    )
+    return Health("reconciled", reason, name, failing=reported.get("status") == "Degraded")
 
 
-def _gone(target: Target, objects: Objects) -> Health:
-    namespace = target.place.namespace
+def _removal_health(target: Target, objects: Objects) -> Health:
+    namespace = target.domain.namespace
     kind = "Application" if target.by_helm else "Deployment"
     name = f"{kind} {namespace}/{target.name}"
-    found = objects.get((kind, namespace, target.name))
-    if found is None and not (target.by_helm and _left(target, objects)):
+    item = objects.get((kind, namespace, target.name))
+    if item is None and not (target.by_helm and _has_leftovers(target, objects)):
         return Health("healthy")
-    message = _error(found or {}) if target.by_helm else ""
+    message = _error(item or {}) if target.by_helm else ""
     if message:
         return Health("reconciled", f"is still being removed; {message}", name, failing=True)
     return Health("reconciled", "is still being removed", name)
 
 
-def _left(target: Target, objects: Objects) -> bool:
-    """Tell whether something that an Application made is there without it."""
-    tracked = f"{target.place.namespace}_{target.name}:"
+def _has_leftovers(target: Target, objects: Objects) -> bool:
+    """Report whether a Deployment of a removed Application still exists."""
+    tracked = f"{target.domain.namespace}_{target.name}:"
     return any(
-        str((found["metadata"].get("annotations") or {}).get(_TRACKED_BY, "")).startswith(tracked)
-        for (kind, namespace, _), found in objects.items()
-        if kind == "Deployment" and namespace == target.place.namespace
+        str((item["metadata"].get("annotations") or {}).get(_TRACKED_BY, "")).startswith(tracked)
+        for (kind, namespace, _), item in objects.items()
+        if kind == "Deployment" and namespace == target.domain.namespace
     )
 
 
-def _trouble(found: Object) -> tuple[str, str]:
-    """Return what Argo CD says against an Application, and of which commit where it says so."""
-    operation = _status(found, "operationState")
+def _failure(app: Object) -> tuple[str, str]:
+    """Return why an Application fails and, if known, for which commit."""
+    operation = _status(app, "operationState")
     result = operation.get("syncResult") or {}
-    revision = str(result.get("revision") or _asked(operation).get("revision") or "")
-    tried = result.get("source")
-    stale = tried and not _same(tried, (found.get("spec") or {}).get("source"))
+    revision = str(result.get("revision") or _requested_sync(operation).get("revision") or "")
+    synced = result.get("source")
+    stale = synced and not _same(synced, (app.get("spec") or {}).get("source"))
     phase = operation.get("phase")
-    # While it is to be tried again, a sync that failed is called Running, and yet has an end.
+    # A failed sync that will be retried has the phase Running, but also an end.
     if phase == "Running" and operation.get("finishedAt"):
-        return ("its former form is still tried: " if stale else "") + _told(operation), revision
+        prefix = "its previous spec is still being retried: " if stale else ""
+        return prefix + _sync_message(operation), revision
     if phase in ("Failed", "Error") and not stale:
-        return _told(operation), revision
-    return _error(found), ""
+        return _sync_message(operation), revision
+    return _error(app), ""
 
 
-def _told(operation: Object) -> str:
-    """Return the message of a sync that failed, and of the objects that it does not speak of."""
+def _sync_message(operation: Object) -> str:
+    """Return the message of a failed sync, with those of failed objects that it leaves out."""
     message = str(operation.get("message", ""))
     failed = [
         item
@@ -210,32 +218,32 @@ def _told(operation: Object) -> str:
     return "; ".join([message, *details[:_DETAILS]])
 
 
-def _error(found: Object) -> str:
-    """Return the first condition that is an error; the others warn."""
-    for item in (found.get("status") or {}).get("conditions") or ():
+def _error(app: Object) -> str:
+    """Return the first condition that is an error; other conditions are warnings."""
+    for item in (app.get("status") or {}).get("conditions") or ():
         if str(item.get("type", "")).endswith("Error"):
             return f"{item['type']}: {item.get('message', '')}"
     return ""
 
 
-def _status(found: Object, part: str) -> Object:
-    return (found.get("status") or {}).get(part) or {}
+def _status(app: Object, part: str) -> Object:
+    return (app.get("status") or {}).get(part) or {}
 
 
-def _asked(operation: Object) -> Object:
-    """Return what a sync was asked to do."""
+def _requested_sync(operation: Object) -> Object:
+    """Return the parameters of a sync."""
     return (operation.get("operation") or {}).get("sync") or {}
 
 
-def _same(one: object, other: object) -> bool:
-    """Tell whether two sources are the same, whatever Argo CD leaves out or writes out empty."""
-    return _bare(one) == _bare(other)
+def _same(source: object, other: object) -> bool:
+    """Report whether two sources are equal; Argo CD may omit empty fields or write them."""
+    return _without_empty(source) == _without_empty(other)
 
 
-def _bare(value: object) -> object:
+def _without_empty(value: object) -> object:
     if isinstance(value, dict):
-        found = {key: _bare(item) for key, item in value.items()}
-        return {key: item for key, item in found.items() if item not in (None, "", {}, [])}
+        items = {key: _without_empty(item) for key, item in value.items()}
+        return {key: item for key, item in items.items() if item not in (None, "", {}, [])}
     if isinstance(value, list):
-        return [_bare(item) for item in value]
+        return [_without_empty(item) for item in value]
     return value

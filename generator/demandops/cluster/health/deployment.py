@@ -1,37 +1,37 @@
-"""What Deployments say of themselves (apps/v1), and conditions in general. Pure."""
+"""The health of Deployments (apps/v1), and how to find a condition. Pure."""
 
 from __future__ import annotations
 
-from demandops.cluster.health.health import Health, Object, Objects, Target
+from demandops.cluster.health.model import Health, Object, Objects, Target
 
 
-def of_deployment(found: Object) -> Health:
-    """Return whether all replicas of a Deployment are there in its present form."""
-    metadata, status = found["metadata"], found.get("status") or {}
+def deployment_health(deployment: Object) -> Health:
+    """Return whether all replicas of a Deployment are available with its current spec."""
+    metadata, status = deployment["metadata"], deployment.get("status") or {}
     name = f"Deployment {metadata.get('namespace')}/{metadata.get('name')}"
-    wanted = (found.get("spec") or {}).get("replicas", 1)
+    wanted = (deployment.get("spec") or {}).get("replicas", 1)
     current = status.get("observedGeneration", 0) >= metadata.get("generation", 0)
     updated, available = status.get("updatedReplicas", 0), status.get("availableReplicas", 0)
     if current and updated >= wanted and available >= wanted:
         return Health("healthy")
     for kind, bad in (("ReplicaFailure", "True"), ("Progressing", "False")):
-        found_condition = condition(status, kind)
-        if found_condition.get("status") == bad:
-            message = str(found_condition.get("message", ""))
+        problem = condition(status, kind)
+        if problem.get("status") == bad:
+            message = str(problem.get("message", ""))
             return Health("reconciled", message, name, failing=True)
     return Health("reconciled", f"{available} of {wanted} replicas are available", name)
 
 
-def of_client(target: Target, objects: Objects) -> Health:
-    """Return whether a connection end runs: plain manifests, so its Deployment is all there is."""
-    namespace = target.place.namespace
-    found = objects.get(("Deployment", namespace, target.name))
-    if found is None:
+def client_health(target: Target, objects: Objects) -> Health:
+    """Return whether a communication client runs; its Deployment decides."""
+    namespace = target.domain.namespace
+    deployment = objects.get(("Deployment", namespace, target.name))
+    if deployment is None:
         return Health("reconciled", "is not there yet", f"Deployment {namespace}/{target.name}")
-    return of_deployment(found)
+    return deployment_health(deployment)
 
 
 def condition(status: Object, kind: str) -> Object:
-    """Return the condition of a type, empty where there is none."""
-    found = (item for item in status.get("conditions") or () if item.get("type") == kind)
-    return next(found, {})
+    """Return the condition of a type; empty if there is none."""
+    conditions = status.get("conditions") or ()
+    return next((item for item in conditions if item.get("type") == kind), {})

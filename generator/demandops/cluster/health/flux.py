@@ -1,35 +1,45 @@
-"""What Flux's objects say about releases. Pure: objects in, health out.
+"""The health of releases, from Flux's objects. Pure.
 
-Objects are plain data as the Kubernetes API gives them. Field names as of Flux 2.9
+Objects are plain data as the Kubernetes API returns them. Field names as of Flux 2.9
 (kustomize.toolkit.fluxcd.io/v1, helm.toolkit.fluxcd.io/v2).
 """
 
 from __future__ import annotations
 
-from demandops.cluster.health.deployment import condition, of_client, of_deployment
-from demandops.cluster.health.health import Health, History, Object, Objects, Place, Target, Watched
+from demandops.cluster.health.deployment import client_health, condition, deployment_health
+from demandops.cluster.health.model import (
+    ClusterDomain,
+    Health,
+    History,
+    Object,
+    Objects,
+    ObjectSelector,
+    Target,
+)
 
 _HELM_NAME = "helm.toolkit.fluxcd.io/name"
 
 
-def watched(place: Place) -> tuple[Watched, ...]:
-    """Return what must be known to tell how things are at a place."""
+def objects_to_watch(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+    """Return the objects that the health of a domain and its releases depends on."""
     kinds = ("Kustomization", "GitRepository", "HelmRelease", "Deployment")
-    return tuple(Watched(kind, place.namespace) for kind in kinds)
+    return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
 
 
-def confirmed_by(place: Place) -> tuple[Watched, ...]:
-    """Return what is read once more before something is healthy: releases, then what they own."""
-    return Watched("HelmRelease", place.namespace), Watched("Deployment", place.namespace)
+def objects_to_confirm(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+    """Return the objects to read again before a release counts as healthy: owners come first."""
+    return ObjectSelector("HelmRelease", domain.namespace), ObjectSelector(
+        "Deployment", domain.namespace
+    )
 
 
-def of_place(place: Place, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether an access domain's Kustomization has applied a commit."""
-    found = objects.get(("Kustomization", place.namespace, place.domain))
-    name = f"Kustomization {place.namespace}/{place.domain}"
-    if found is None:
+def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history: History) -> Health:
+    """Return whether a domain's Kustomization has applied a commit."""
+    kustomization = objects.get(("Kustomization", domain.namespace, domain.name))
+    name = f"Kustomization {domain.namespace}/{domain.name}"
+    if kustomization is None:
         return Health("waiting", "is not there; apply bootstrap/ to the cluster", name)
-    status = found.get("status") or {}
+    status = kustomization.get("status") or {}
     reached = _commit(status.get("lastAppliedRevision"))
     if reached and history.includes(reached, commit):
         return Health("reconciled")
@@ -37,22 +47,22 @@ def of_place(place: Place, commit: str, objects: Objects, history: History) -> H
     ready = condition(status, "Ready")
     if ready.get("status") == "False" and attempted and history.includes(attempted, commit):
         return Health("waiting", str(ready.get("message", "")), name, failing=True)
-    source = objects.get(("GitRepository", place.namespace, _source(found)))
+    source = objects.get(("GitRepository", domain.namespace, _source(kustomization)))
     fetched = condition((source or {}).get("status") or {}, "Ready")
     if fetched.get("status") == "False":
-        at = f"GitRepository {place.namespace}/{_source(found)}"
+        at = f"GitRepository {domain.namespace}/{_source(kustomization)}"
         return Health("waiting", str(fetched.get("message", "")), at, failing=True)
     return Health("waiting", "has not applied the commit yet", name)
 
 
-def of_target(target: Target, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether a release of an applied commit runs, or is gone where it is to be gone."""
+def release_health(target: Target, commit: str, objects: Objects, history: History) -> Health:
+    """Return whether a release of an applied commit runs, or is removed if unwanted."""
     if not target.wanted:
-        return _gone(target, objects)
+        return _removal_health(target, objects)
     if not target.by_helm:
-        return of_client(target, objects)
-    release = objects.get(("HelmRelease", target.place.namespace, target.name))
-    name = f"HelmRelease {target.place.namespace}/{target.name}"
+        return client_health(target, objects)
+    release = objects.get(("HelmRelease", target.domain.namespace, target.name))
+    name = f"HelmRelease {target.domain.namespace}/{target.name}"
     if release is None:
         return Health("reconciled", "is not there yet", name)
     status = release.get("status") or {}
@@ -63,27 +73,27 @@ def of_target(target: Target, commit: str, objects: Objects, history: History) -
     if not current or ready.get("status") != "True":
         return Health("reconciled", str(ready.get("message") or "is being installed"), name)
     for deployment in _deployments(target, objects):
-        health = of_deployment(deployment)
+        health = deployment_health(deployment)
         if health.state != "healthy":
             return health
     return Health("healthy")
 
 
-def since(target: Target, objects: Objects) -> str:
-    """Return since when a release is as it is, as the cluster says it; empty where it does not."""
+def last_transition(target: Target, objects: Objects) -> str:
+    """Return when the state of a release last changed; empty if the cluster does not say."""
     kind, ready = ("HelmRelease", "Ready") if target.by_helm else ("Deployment", "Available")
-    found = objects.get((kind, target.place.namespace, target.name)) or {}
-    return str(condition(found.get("status") or {}, ready).get("lastTransitionTime", ""))
+    item = objects.get((kind, target.domain.namespace, target.name)) or {}
+    return str(condition(item.get("status") or {}, ready).get("lastTransitionTime", ""))
 
 
-def applied(place: Place, objects: Objects) -> str:
-    """Return the commit that an access domain's Kustomization has applied, or nothing."""
-    found = objects.get(("Kustomization", place.namespace, place.domain)) or {}
-    return _commit((found.get("status") or {}).get("lastAppliedRevision"))
+def applied_commit(domain: ClusterDomain, objects: Objects) -> str:
+    """Return the commit that a domain's Kustomization has applied; empty if it is not known."""
+    kustomization = objects.get(("Kustomization", domain.namespace, domain.name)) or {}
+    return _commit((kustomization.get("status") or {}).get("lastAppliedRevision"))
 
 
-def _gone(target: Target, objects: Objects) -> Health:
-    namespace = target.place.namespace
+def _removal_health(target: Target, objects: Objects) -> Health:
+    namespace = target.domain.namespace
     kind = "HelmRelease" if target.by_helm else "Deployment"
     if (kind, namespace, target.name) in objects or _deployments(target, objects):
         return Health("reconciled", "is still being removed", f"{kind} {namespace}/{target.name}")
@@ -91,15 +101,15 @@ def _gone(target: Target, objects: Objects) -> Health:
 
 
 def _deployments(target: Target, objects: Objects) -> list[Object]:
-    """Return a release's Deployments; helm-controller labels all that it installs."""
+    """Return a release's Deployments; helm-controller labels everything that it installs."""
     if not target.by_helm:
         return []
     return [
-        found
-        for (kind, namespace, _), found in objects.items()
+        item
+        for (kind, namespace, _), item in objects.items()
         if kind == "Deployment"
-        and namespace == target.place.namespace
-        and (found["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
+        and namespace == target.domain.namespace
+        and (item["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
     ]
 
 

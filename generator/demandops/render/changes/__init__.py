@@ -1,1 +1,1 @@
-"""What differs between two states of the rendered files."""
+"""Differences between two states of the rendered files."""

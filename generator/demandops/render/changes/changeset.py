@@ -1,7 +1,6 @@
-"""What a decision changes in the state repo: files by path, and releases in words.
+"""The changes that a decision makes in the state repo: files by path, and releases in words.
 
-Rendering gives text, this compares it with what is there: a file that would be written with the
-bytes it has already does not appear, so an unchanged release costs no commit.
+A file whose text stays the same is not in the changeset, so an unchanged release needs no commit.
 """
 
 from __future__ import annotations
@@ -18,59 +17,62 @@ from demandops.ledger.apply import ClaimChange, Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey
-from demandops.render import override_marks
+from demandops.render import release_file
 from demandops.render.engine import Engine
-from demandops.render.gitops import controller
+from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 from demandops.render.output_check import check_files
 
 Change = Literal["start", "change", "stop"]
 
-Read = Callable[[str], str | None]
-"""Returns the text of a file of the state repo, or nothing where there is none."""
+CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
+"""The order in which changes are listed."""
+
+FileReader = Callable[[str], str | None]
+"""Returns the text of a file of the state repo, or ``None`` if there is no such file."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
-    """One release that starts, changes or stops, and in what."""
+    """A release that starts, changes or stops, and the facts that change."""
 
     name: str
     change: Change
-    what: str
+    description: str
     details: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Changeset:
-    """Files to write (``None``: to remove) and the releases behind them."""
+    """The files to write (``None``: to remove) and the releases that change."""
 
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
     overrides: tuple[str, ...] = ()
-    """The files of the overrides that shaped what is written."""
-    waiting: tuple[str, ...] = ()
-    """What does not reach a release, for an override holds it."""
+    """The files of the overrides that shape the written files."""
+    blocked: tuple[str, ...] = ()
+    """A warning for each release that a ``hold`` override keeps from changing."""
 
 
-def of_change(
+def build_changeset(
     before: Ledger,
     after: Ledger,
     claims: Iterable[ClaimChange],
     keys: Iterable[ReleaseKey],
-    world: tuple[Config, Engine, Read],
+    context: tuple[Config, Engine, FileReader],
 ) -> Changeset:
-    """Return what it takes to get from one ledger to the other.
+    """Return the changes in the state repo that follow from a change of the ledger.
 
     Args:
         before, after: the ledgers.
         claims: the claims that differ.
-        keys: the releases that may differ (:func:`demandops.plan.planner.affected`).
-        world: the configuration, its engine and how to read the state repo as it is.
+        keys: the releases that may differ (:func:`demandops.plan.release_keys.affected`).
+        context: the configuration, its engine, and a reader of the current files.
 
     Raises:
-        Refused, InvalidInput: where a release cannot be planned or rendered.
+        Refused, InvalidInput: if a release cannot be planned or rendered.
     """
-    config, engine, read = world
+    config, engine, read = context
     files: dict[str, str | None] = {
         ledger_format.path_of(change.key): ledger_format.write(change.after)
         if change.after
@@ -79,26 +81,26 @@ def of_change(
     }
     releases = []
     shaped: set[str] = set()
-    waiting: list[str] = []
+    blocked: list[str] = []
     for key in keys:
         old, new = _plan_leniently(before, config, key), plan(after, config, key)
         old_path = path_of(old) if old else None
         new_path = path_of(new) if new else None
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
-        standing = read(new_path) if new_path else None
-        waiting += _waiting(old, new) if standing is not None else ()
-        text = override_marks.text_of(new, config, engine, standing) if new else None
-        if new_path and text != standing:
+        current = read(new_path) if new_path else None
+        blocked += _blocked(old, new) if current is not None else ()
+        text = release_file.release_text(new, config, engine, current) if new else None
+        if new_path and text != current:
             files[new_path] = text
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
-        if text is not None and text == standing:
+        if text is not None and text == current:
             continue
         if old or new:
-            releases.append(described(old, new, standing is not None))
+            releases.append(describe_change(old, new, current is not None))
     check_files(files)
-    told = tuple(sorted(releases, key=_order))
-    return Changeset(files, told, tuple(sorted(shaped)), tuple(waiting))
+    releases.sort(key=lambda change: (CHANGE_ORDER.index(change.change), change.name))
+    return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
 
 
 def render_all(
@@ -106,69 +108,77 @@ def render_all(
     config: Config,
     engine: Engine,
     keys: Iterable[ReleaseKey],
-    standing: Mapping[str, str],
+    current: Mapping[str, str],
 ) -> dict[str, str]:
-    """Return every generated file that ledger and configuration ask for.
+    """Return all generated files, by path.
 
     Args:
-        standing: the generated files as they are, of which overrides may hold some.
+        ledger: the claims.
+        config: the configuration.
+        engine: its engine.
+        keys: all releases (:func:`demandops.plan.release_keys.all_keys`).
+        current: the generated files in the state repo; overrides may hold some of them.
+
+    Raises:
+        Refused, InvalidInput: if a release cannot be planned or rendered.
     """
-    files = controller.standing_files(config, engine)
+    files = manifests.base_files(config, engine)
     for key in keys:
         release = plan(ledger, config, key)
         if release is not None:
             path = path_of(release)
-            files[path] = override_marks.text_of(release, config, engine, standing.get(path))
-    return files | override_marks.charts_kept(files, standing, config)
+            files[path] = release_file.release_text(release, config, engine, current.get(path))
+    return files | release_file.kept_charts(files, current, config)
 
 
 def _plan_leniently(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
-    """Plan what stood; where that is no longer possible there is nothing to compare with."""
+    """Return the former release, or ``None`` if it can no longer be planned."""
     try:
         return plan(ledger, config, key)
     except Refused:
         return None
 
 
-def _order(change: ReleaseChange) -> tuple[int, str]:
-    return ["start", "change", "stop"].index(change.change), change.name
+def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
+    """Return a description of how a release changes.
 
-
-def described(old: Release | None, new: Release | None, stood: bool) -> ReleaseChange:
-    """Return in words what becomes of a release; ``stood``: there is a file of it."""
+    Args:
+        old, new: the release before and after; one of them is not ``None``.
+        existed: whether the release had a file before.
+    """
     release = new or old
-    assert release is not None  # noqa: S101 - the caller has one of them
+    assert release is not None  # noqa: S101 - see above
     if isinstance(release, ServiceRelease):
-        what = f"{release.key.service} on {release.node.id}"
-        what += f" for {release.key.source or release.key.application}"
+        description = f"{release.key.service} on {release.node.id}"
+        description += f" for {release.key.source or release.key.application}"
     elif isinstance(release, Bridge):
-        what = f"Zenoh bridge on {release.node.id}"
+        description = f"Zenoh bridge on {release.node.id}"
     else:
-        what = f"{release.type.name} {release.side} of connection {release.connection}"
-        what += f" on {release.node.id}"
+        description = f"{release.type.name} {release.side} of connection {release.connection}"
+        description += f" on {release.node.id}"
     kind: Change = "stop" if not new else "start"
-    if new and stood:
+    if new and existed:
         kind = "change"
     details = _differences(old, new) if kind == "change" else ()
-    return ReleaseChange(release.name, kind, what, details)
+    return ReleaseChange(release.name, kind, description, details)
 
 
 def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
-    held = new is not None and new.shaping.held  # nothing else reaches its file
     before, after = _overrides(old), _overrides(new)
-    before, after = (before, after) if held else (_facts(old) + before, _facts(new) + after)
-    known, wanted = frozenset(before), frozenset(after)
-    gone = [f"- {fact}" for fact in before if fact not in wanted]
-    come = [f"+ {fact}" for fact in after if fact not in known]
-    return (*gone, *come)
+    if new is None or not new.shaping.held:  # of a held file, only the comments change
+        before, after = _facts(old) + before, _facts(new) + after
+    old_facts, new_facts = frozenset(before), frozenset(after)
+    removed = [f"- {fact}" for fact in before if fact not in new_facts]
+    added = [f"+ {fact}" for fact in after if fact not in old_facts]
+    return (*removed, *added)
 
 
-def _waiting(old: Release | None, new: Release | None) -> Iterator[str]:
-    """Yield a warning where a release that is held would otherwise change."""
+def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
+    """Yield a warning if a held release would otherwise change."""
     if new is None or not new.shaping.held or _facts(old) == _facts(new):
         return
-    by = " and ".join(one.path for one, effects in new.shaping.by if "hold" in effects)
-    yield f"{new.name} is held by {by}, so what is asked of it waits until it is let go"
+    by = " and ".join(override.path for override, effects in new.shaping.by if "hold" in effects)
+    yield f"{new.name} is held by {by}; its changes wait until the hold ends"
 
 
 def _overrides(release: Release | None) -> list[str]:
@@ -185,17 +195,17 @@ def _facts(release: Release | None) -> list[str]:
         return [*facts, f"replicas {release.replicas}"]
     if isinstance(release, Bridge):
         return _facts_of_bridge(release)
-    return [*map(_told, release.topics.values()), _meeting_place(release)]
+    return [*map(_fact_of_route, release.topics.values()), _fact_of_link(release)]
 
 
-def _told(route: Route) -> str:
-    way = "from" if route.reverse else "to"
+def _fact_of_route(route: Route) -> str:
+    direction = "from" if route.reverse else "to"
     options = {name: value for name, value in route.options().items() if name != "reverse"}
-    more = ", ".join(f"{name} {value}" for name, value in options.items())
-    return f"topic {route.source} {way} {route.target}" + (f" ({more})" if more else "")
+    listed = ", ".join(f"{name} {value}" for name, value in options.items())
+    return f"topic {route.source} {direction} {route.target}" + (f" ({listed})" if listed else "")
 
 
-def _meeting_place(end: MqttEnd | RosEnd) -> str:
+def _fact_of_link(end: MqttEnd | RosEnd) -> str:
     if isinstance(end, MqttEnd):
         return f"broker {end.broker.node}"
     return f"address {end.address.host}:{end.address.port}"
@@ -204,8 +214,8 @@ def _meeting_place(end: MqttEnd | RosEnd) -> str:
 def _facts_of_bridge(bridge: Bridge) -> list[str]:
     return [
         *(f"connection {id}" for id in bridge.connections),
-        *(f"takes {topic}" for topic in bridge.publishers),
-        *(f"gives {topic}" for topic in bridge.subscribers),
+        *(f"reads {topic}" for topic in bridge.publishers),
+        *(f"writes {topic}" for topic in bridge.subscribers),
         *(f"rate {rate:g} of {topic}" for topic, rate in bridge.rates.items()),
         *(f"connects to {endpoint}" for endpoint in bridge.connect),
     ]

@@ -1,6 +1,7 @@
-"""What runs otherwise at one commit than at another: releases, and in which facts they differ.
+"""The releases that differ between two commits, and the facts in which they differ.
 
-Goes by the files, for these are what the clusters follow, and by both plans for what they mean.
+The files decide whether a release differs, because the clusters follow the files. The plans of both
+commits describe the difference.
 """
 
 from __future__ import annotations
@@ -15,21 +16,21 @@ from demandops.ledger.apply import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import all_keys
-from demandops.render.changes.changeset import Change, described
+from demandops.render.changes.changeset import CHANGE_ORDER, Change, describe_change
 
 _MOST_LINES = 12
 
 Sides = tuple[str | None, str | None]
-"""The text of a file before and after; nothing where there was none."""
+"""The text of a file before and after; ``None`` if it does not exist."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReleaseDifference:
-    """One release that started, stopped or changed; ``path`` is its file, the newer one."""
+    """A release that started, stopped or changed; ``path`` is its file, if possible the new one."""
 
     name: str
     change: Change
-    what: str
+    description: str
     path: str
     details: tuple[str, ...]
 
@@ -37,55 +38,59 @@ class ReleaseDifference:
 def compare(
     before: tuple[Ledger, Config], after: tuple[Ledger, Config], files: Mapping[str, Sides]
 ) -> tuple[list[ReleaseDifference], list[str]]:
-    """Return the releases that differ, and the other files that do.
+    """Return the releases that differ, and the differing files that are not of a release.
 
     Args:
-        before, after: books and configuration of both commits.
-        files: every generated file that differs.
+        before, after: the ledger and configuration of each commit.
+        files: all generated files that differ.
     """
     old, new = _by_name(*before), _by_name(*after)
-    moves: dict[str, dict[str, Sides]] = {}
+    by_release: dict[str, dict[str, Sides]] = {}
     others = []
     for path, sides in sorted(files.items()):
         name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
         if name in old or name in new:
-            moves.setdefault(name, {})[path] = sides
+            by_release.setdefault(name, {})[path] = sides
         else:
             others.append(path)
-    found = [_difference(name, old.get(name), new.get(name), at) for name, at in moves.items()]
-    order = ("start", "change", "stop")
-    return sorted(found, key=lambda one: (order.index(one.change), one.name)), others
+    differences = [
+        _difference(name, old.get(name), new.get(name), changed)
+        for name, changed in by_release.items()
+    ]
+    differences.sort(key=lambda release: (CHANGE_ORDER.index(release.change), release.name))
+    return differences, others
 
 
 def _by_name(ledger: Ledger, config: Config) -> dict[str, Release]:
-    found = {}
+    releases = {}
     for key in all_keys(ledger, config):
         try:
             release = plan(ledger, config, key)
-        except Refused:  # a person's change that could not be carried out
+        except Refused:  # a person's change that cannot be carried out
             continue
         if release is not None:
-            found[release.name] = release
-    return found
+            releases[release.name] = release
+    return releases
 
 
 def _difference(
-    name: str, old: Release | None, new: Release | None, at: Mapping[str, Sides]
+    name: str, old: Release | None, new: Release | None, files: Mapping[str, Sides]
 ) -> ReleaseDifference:
-    was = next((path for path, sides in at.items() if sides[0] is not None), None)
-    now = next((path for path, sides in at.items() if sides[1] is not None), None)
-    change: Change = "start" if was is None else "stop" if now is None else "change"
-    told = described(old, new, was is not None)
-    details = told.details if change == "change" and told.change == "change" else ()
-    if was and now and was != now:
-        details = (f"- {was}", f"+ {now}", *details)
-    if change == "change" and not details and now:
-        details = tuple(_lines(*at[now]))
-    return ReleaseDifference(name, change, told.what, now or was or "", details)
+    old_path = next((path for path, sides in files.items() if sides[0] is not None), None)
+    new_path = next((path for path, sides in files.items() if sides[1] is not None), None)
+    change: Change = "start" if old_path is None else "stop" if new_path is None else "change"
+    planned = describe_change(old, new, old_path is not None)
+    details = planned.details if change == "change" and planned.change == "change" else ()
+    if old_path and new_path and old_path != new_path:
+        details = (f"- {old_path}", f"+ {new_path}", *details)
+    if change == "change" and not details and new_path:
+        details = tuple(_lines(*files[new_path]))
+    path = new_path or old_path or ""
+    return ReleaseDifference(name, change, planned.description, path, details)
 
 
 def _lines(before: str | None, after: str | None) -> Iterator[str]:
-    """Yield the lines of a file that differ, where no fact of its plan does."""
+    """Yield the lines of a file that differ, for a change that no fact of the plan describes."""
     lines = difflib.unified_diff((before or "").split("\n"), (after or "").split("\n"), n=0)
     changed = [line for line in lines if line[:1] in "+-" and line[:3] not in ("+++", "---")]
     yield from (f"{line[0]} {line[1:].strip()}" for line in changed[:_MOST_LINES])

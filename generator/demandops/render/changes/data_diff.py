@@ -1,36 +1,46 @@
-"""What differs between two pieces of plain data: leaf by leaf, or as a JSON merge patch. Pure."""
+"""Differences between two pieces of plain data: by leaf, or as a JSON merge patch. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
+from demandops import strict_yaml
+
 ABSENT = object()
-"""Stands for a value that is not there."""
+"""Marks a missing value."""
 
 
-def leaves(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
-    """Yield (path, old, new) of the smallest parts that differ, as ``spec.values.image.tag``."""
+def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
+    """Yield (path, old, new) of the smallest parts that differ.
+
+    A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`.
+    """
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
             inner = f"{path}.{key}" if path else str(key)
-            yield from leaves(old.get(key, ABSENT), new.get(key, ABSENT), inner)
+            yield from leaf_differences(old.get(key, ABSENT), new.get(key, ABSENT), inner)
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for index, (left, right) in enumerate(zip(old, new, strict=True)):
-            yield from leaves(left, right, f"{path}[{index}]")
+            yield from leaf_differences(left, right, f"{path}[{index}]")
     elif type(old) is not type(new) or old != new:
         yield path, old, new
 
 
 def merge_patch(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
-    """Return the JSON merge patch (RFC 7386) that makes ``old`` into ``new``; null removes."""
+    """Return the JSON merge patch (RFC 7386) that turns ``old`` into ``new``; null removes."""
     patch: dict[str, Any] = {key: None for key in old if key not in new}
     for key, value in new.items():
-        was = old.get(key, ABSENT)
-        if isinstance(was, dict) and isinstance(value, dict):
-            inner = merge_patch(was, value)
+        old_value = old.get(key, ABSENT)
+        if isinstance(old_value, dict) and isinstance(value, dict):
+            inner = merge_patch(old_value, value)
             if inner:
                 patch[key] = inner
-        elif next(leaves(was, value), None) is not None:
+        elif next(leaf_differences(old_value, value), None) is not None:
             patch[key] = value
     return patch
+
+
+def short_value(value: object) -> str:
+    """Return a value in few words, for a person."""
+    return "none" if value is ABSENT else strict_yaml.brief(value)

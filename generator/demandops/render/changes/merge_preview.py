@@ -1,7 +1,7 @@
-"""What a change of configuration or books would do to everything that is rendered. Pure.
+"""What a change of the configuration or the ledger would do to all releases and files. Pure.
 
-Unlike a demand's changeset, which looks at what it touches, this looks at everything, for
-configuration may change anything.
+A demand's changeset covers only the releases that the demand touches. A change of the configuration
+may affect any release, so this compares all of them.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from demandops.ledger.apply import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of
-from demandops.render.changes.changeset import ReleaseChange, described
-from demandops.render.changes.data_diff import leaves
-from demandops.render.changes.override_suggestion import value_of
+from demandops.render.changes.changeset import CHANGE_ORDER, ReleaseChange, describe_change
+from demandops.render.changes.data_diff import leaf_differences, short_value
 from demandops.render.engine import Engine
-from demandops.render.gitops import controller
+from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 
 _MOST_FACTS = 20
@@ -31,7 +30,7 @@ _MOST_FACTS = 20
 
 @dataclass(frozen=True, slots=True)
 class FileChange:
-    """A generated file as it is and as it would be; nothing: it is not there."""
+    """A generated file before and after; ``None`` if it does not exist."""
 
     path: str
     before: str | None
@@ -50,110 +49,114 @@ class FileChange:
 
 @dataclass(frozen=True, slots=True)
 class MergePreview:
-    """The releases that would start, change or stop, and every file that would be written."""
+    """The releases that would start, change or stop, and the files that would change."""
 
     releases: tuple[ReleaseChange, ...]
     files: tuple[FileChange, ...]
 
 
-def releases_of(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release]:
-    """Return what runs; what cannot be planned any more is passed over."""
-    found: dict[ReleaseKey, Release] = {}
+def planned_releases(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release]:
+    """Return all releases that can be planned."""
+    releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(ledger, config):
         try:
             release = plan(ledger, config, key)
         except InvalidInput:
             continue
         if release is not None:
-            found[key] = release
-    return found
+            releases[key] = release
+    return releases
 
 
-def faults(
+def render_faults(
     ledger: Ledger, config: Config, engine: Engine, edited: Collection[str] = ()
 ) -> list[Fault]:
-    """Return what keeps releases from being planned or rendered, of all of them.
+    """Return the faults that keep releases from being planned or rendered.
 
-    Each is told to be in the claim among those that ask for the release that is in ``edited``, or
-    else where it is, or in any of these claims.
+    A fault's file is the first that exists: a claim of the release that is in ``edited``, the
+    fault's own file, any claim of the release.
+
+    Args:
+        ledger: the claims.
+        config: the configuration.
+        engine: its engine.
+        edited: the files that a person changed.
     """
-    found: list[Fault] = []
-    asking: dict[ReleaseKey, list[str]] = {}
+    faults: list[Fault] = []
+    claim_files: dict[ReleaseKey, list[str]] = {}
     for key in all_keys(ledger, config):
         try:
             release = plan(ledger, config, key)
             if release is not None:
-                controller.render(release, config, engine)
+                manifests.render(release, config, engine)
         except InvalidInput as error:
-            asking = asking or _claim_files(ledger, config)
-            found += _located(error.faults, asking.get(key, []), edited)
-    return list(dict.fromkeys(found))
+            claim_files = claim_files or _claim_files(ledger, config)
+            faults += _located(error.faults, claim_files.get(key, []), edited)
+    return list(dict.fromkeys(faults))
 
 
 def _claim_files(ledger: Ledger, config: Config) -> dict[ReleaseKey, list[str]]:
-    """Return by release the files of the claims that ask for it."""
-    found: dict[ReleaseKey, list[str]] = {}
+    """Return the files of the claims that need a release, by release."""
+    by_release: dict[ReleaseKey, list[str]] = {}
     for subject in (Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)):
         files = [ledger_format.path_of(claim.key) for claim in ledger.of(subject)]
         for key in keys_of(ledger, config, subject):
-            found.setdefault(key, []).extend(files)
-    return found
+            by_release.setdefault(key, []).extend(files)
+    return by_release
 
 
 def _located(
     faults: Iterable[Fault], claims: list[str], edited: Collection[str]
 ) -> Iterator[Fault]:
-    ours = next((path for path in claims if path in edited), "")
-    for found in faults:
-        place = ours or found.file or (claims or [""])[0]
-        yield replace(found, file=place)
+    edited_claim = next((path for path in claims if path in edited), "")
+    for fault in faults:
+        yield replace(fault, file=edited_claim or fault.file or (claims or [""])[0])
 
 
-def consequence(
+def preview(
     old: Mapping[ReleaseKey, Release],
     new: Mapping[ReleaseKey, Release],
-    standing: Mapping[str, str],
+    current: Mapping[str, str],
     files: Mapping[str, str],
 ) -> MergePreview:
-    """Return what it takes to get from what stands to what is wanted.
+    """Return the releases and files that change.
 
     Args:
         old, new: the releases before and after.
-        standing, files: the generated files before and after.
+        current, files: the generated files before and after.
     """
-    changes = tuple(
-        FileChange(path, standing.get(path), files.get(path))
-        for path in sorted({*standing, *files})
-        if standing.get(path) != files.get(path)
+    file_changes = tuple(
+        FileChange(path, current.get(path), files.get(path))
+        for path in sorted({*current, *files})
+        if current.get(path) != files.get(path)
     )
-    touched = {change.path for change in changes}
-    told = []
+    changed_paths = {change.path for change in file_changes}
+    releases = []
     for key in dict.fromkeys([*old, *new]):
-        was, will = old.get(key), new.get(key)
-        before = path_of(was) if was else None
-        after = path_of(will) if will else None
-        if before not in touched and after not in touched:
+        before, after = old.get(key), new.get(key)
+        old_path = path_of(before) if before else None
+        new_path = path_of(after) if after else None
+        if old_path not in changed_paths and new_path not in changed_paths:
             continue
-        stands = standing.get(before or after or "")
-        change = described(was, will, stands is not None)
+        text = current.get(old_path or new_path or "")
+        change = describe_change(before, after, text is not None)
         if change.change == "change" and not change.details:
-            facts = _facts(stands or "", files.get(after or "", ""))
+            facts = _facts(text or "", files.get(new_path or "", ""))
             change = replace(change, details=tuple(facts))
-        told.append(change)
-    order = ["start", "change", "stop"]
-    told.sort(key=lambda change: (order.index(change.change), change.name))
-    return MergePreview(tuple(told), changes)
+        releases.append(change)
+    releases.sort(key=lambda change: (CHANGE_ORDER.index(change.change), change.name))
+    return MergePreview(tuple(releases), file_changes)
 
 
 def _facts(before: str, after: str) -> Iterator[str]:
-    """Yield what differs in a manifest, for a change that the plan has no words for."""
+    """Yield the differences between two manifests, if no fact of the plan describes them."""
     try:
         differing = list(
-            leaves(list(strict_yaml.load_all(before)), list(strict_yaml.load_all(after)))
+            leaf_differences(list(strict_yaml.load_all(before)), list(strict_yaml.load_all(after)))
         )
     except InvalidInput:
         return
     for path, old, new in differing[:_MOST_FACTS]:
-        yield f"{path.removeprefix('[0].')}: {value_of(old)} → {value_of(new)}"
+        yield f"{path.removeprefix('[0].')}: {short_value(old)} → {short_value(new)}"
     if len(differing) > _MOST_FACTS:
         yield f"and {len(differing) - _MOST_FACTS} more"

@@ -1,7 +1,7 @@
-"""From a generated file that somebody edited by hand to the override that has the same effect.
+"""The override that has the same effect as a manual edit to a generated file. Pure.
 
-Pure. What is generated is written anew, so an edit there is lost; an override, which people merge
-in ``overrides/``, stays. The one suggested here is meant to be pasted as it is, with a reason.
+The generator overwrites manual edits to generated files, but an override in ``overrides/`` stays.
+A person can use the suggested override unchanged, except for its reason.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from demandops.config.config import Config
 from demandops.config.registry import Image
 from demandops.errors import InvalidInput
 from demandops.plan.release import Bridge, Release, ServiceRelease
-from demandops.render.changes.data_diff import ABSENT, leaves, merge_patch
+from demandops.render.changes.data_diff import leaf_differences, merge_patch
 from demandops.render.gitops.flux import chart_object
 from demandops.settings import API_VERSION
 
@@ -27,26 +27,27 @@ _IMAGE_KEYS = ("repository", "tag", "digest")
 _REFERENCE = re.compile(
     r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:[0-9a-f]{64}))?"
 )
-_REASON = "Say here why; this stands for an edit of a generated file by hand"
+_REASON = "Say here why; this replaces a manual edit of a generated file"
 
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """An override instead of an edit of ``path``.
+    """An override that replaces a manual edit of ``path``.
 
-    ``left`` is what of the edit it does not do, ``also`` the other releases that it fits.
+    ``not_covered`` lists the parts of the edit that the override does not make.
+    ``other_releases`` lists other releases that need the same override.
     """
 
     path: str
     name: str
     text: str
-    left: tuple[str, ...] = ()
-    also: tuple[str, ...] = ()
+    not_covered: tuple[str, ...] = ()
+    other_releases: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
 class _Effects:
-    """What the override would do, and what of the edit is left over."""
+    """The effects of the override, and the parts of the edit that it does not cover."""
 
     values: dict[str, Any] = field(default_factory=dict)
     version: str = ""
@@ -54,31 +55,31 @@ class _Effects:
     replicas: int | None = None
     hold: bool = False
     deny: bool = False
-    left: list[str] = field(default_factory=list)
+    not_covered: list[str] = field(default_factory=list)
 
     def data(self) -> dict[str, Any]:
-        found = {
+        effects = {
             "values": self.values,
             "version": self.version,
             "images": self.images,
             "hold": self.hold,
             "deny": self.deny,
         }
-        given = {name: effect for name, effect in found.items() if effect}
-        return given if self.replicas is None else given | {"replicas": self.replicas}
+        used = {name: effect for name, effect in effects.items() if effect}
+        return used if self.replicas is None else used | {"replicas": self.replicas}
 
 
-def suggest(
+def suggest_override(
     path: str, texts: tuple[str, str | None], release: Release, config: Config, owner: str
 ) -> Suggestion | None:
-    """Return the override for an edit, or nothing where none does any of it.
+    """Return the override for a manual edit, or ``None`` if an override cannot make any of it.
 
     Args:
         path: the generated file.
-        texts: what it was, and what a person made of it (nothing: it was deleted).
-        release: what it was rendered from.
-        config: the configuration that it was rendered from.
-        owner: who is to be named as the override's owner.
+        texts: the file before and after the edit; ``None`` after: it was deleted.
+        release: the release that the file was rendered from.
+        config: the configuration that the file was rendered from.
+        owner: the owner that the override names.
     """
     before, after = texts
     effects = _Effects()
@@ -90,9 +91,9 @@ def suggest(
         except InvalidInput:
             return None
         if isinstance(release, ServiceRelease):
-            _of_service(old, new, release, config, effects)
+            _read_service_edit(old, new, release, config, effects)
         else:
-            _of_client(old, new, config, effects)
+            _read_client_edit(old, new, config, effects)
     if not effects.data():
         return None
     text = strict_yaml.dump(
@@ -105,11 +106,11 @@ def suggest(
             **effects.data(),
         }
     )
-    return Suggestion(path, release.name, text, tuple(effects.left))
+    return Suggestion(path, release.name, text, tuple(effects.not_covered))
 
 
-def fits_too(release: Release, other: Release) -> bool:
-    """Tell whether the override for one release would fit another as well."""
+def same_override_fits(release: Release, other: Release) -> bool:
+    """Report whether a suggested override for one release fits another release too."""
     if not (isinstance(release, ServiceRelease) and isinstance(other, ServiceRelease)):
         return False
     same = (release.key.service, release.node.id) == (other.key.service, other.node.id)
@@ -118,7 +119,7 @@ def fits_too(release: Release, other: Release) -> bool:
 
 
 def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
-    """Return what selects a release; ``whole``: a connection with both its ends."""
+    """Return the selector of a release; with ``whole``, of both ends of its connection."""
     if isinstance(release, ServiceRelease):
         selected = {"applications": list(release.applications), "services": [release.key.service]}
         return selected if release.key.application else selected | {"nodes": [release.node.id]}
@@ -126,22 +127,22 @@ def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
     return {"connections": ids} if whole else {"connections": ids, "nodes": [release.node.id]}
 
 
-def _of_service(
+def _read_service_edit(
     old: list[Any], new: list[Any], release: ServiceRelease, config: Config, effects: _Effects
 ) -> None:
-    """Read the edit of a HelmRelease or an Application."""
+    """Find the effects of an edit of a HelmRelease or an Application."""
     kind = old[0].get("kind")
-    where = _VALUES.get(kind, ())
+    values_path = _VALUES.get(kind, ())
     done = set()
-    was, now = _at(old[0], where), _at(new[0] if new else None, where)
-    if isinstance(was, dict) and isinstance(now, dict):
-        effects.values = merge_patch(was, now)
-        done.add(".".join(where))
-        _take_images(effects.values, was, release, config, effects)
+    before, after = _at(old[0], values_path), _at(new[0] if new else None, values_path)
+    if isinstance(before, dict) and isinstance(after, dict):
+        effects.values = merge_patch(before, after)
+        done.add(".".join(values_path))
+        _move_images(effects.values, before, release, config, effects)
         replicas = effects.values.get("replicas")
-        if was.get("replicas") == release.replicas and type(replicas) is int and replicas >= 0:
+        if before.get("replicas") == release.replicas and type(replicas) is int and replicas >= 0:
             effects.replicas = effects.values.pop("replicas")
-    for path, left, right in leaves(old, new):
+    for path, left, right in leaf_differences(old, new):
         place = path.removeprefix("[0].")
         if place == "spec.chartRef.name":
             chart = release.service.chart
@@ -154,10 +155,10 @@ def _of_service(
         if place == "spec.suspend" and right is True:
             effects.hold = True
             continue
-        if not any(place == one or place.startswith((f"{one}.", f"{one}[")) for one in done):
-            effects.left.append(place)
-    if effects.hold:  # what is held stays as it is rendered, so nothing else goes with it
-        effects.left += [name for name in effects.data() if name != "hold"]
+        if not any(place == path or place.startswith((f"{path}.", f"{path}[")) for path in done):
+            effects.not_covered.append(place)
+    if effects.hold:  # a hold keeps the file as it was rendered, so it excludes other effects
+        effects.not_covered += [name for name in effects.data() if name != "hold"]
         effects.values, effects.images = {}, {}
         effects.version, effects.replicas = "", None
 
@@ -168,42 +169,42 @@ def _at(document: Any, path: tuple[str, ...]) -> Any:  # noqa: ANN401
     return document
 
 
-def _take_images(
+def _move_images(
     patch: dict[str, Any],
     values: dict[str, Any],
     release: ServiceRelease,
     config: Config,
     effects: _Effects,
 ) -> None:
-    """Move what a patch says of the registry's images to the effect that is made for it."""
+    """Move the changes of registry images from a patch of values to the ``images`` effect."""
     names: dict[str, list[str]] = {}
     for name in release.service.images:
         names.setdefault(config.images[name].repository, []).append(name)
     for key in list(patch):
-        inner, was = patch[key], values.get(key)
-        if not isinstance(inner, dict) or not isinstance(was, dict):
+        inner, old = patch[key], values.get(key)
+        if not isinstance(inner, dict) or not isinstance(old, dict):
             continue
-        known = names.get(str(was.get("repository", "")), [])
+        images = names.get(str(old.get("repository", "")), [])
         pin = {part: inner[part] for part in _IMAGE_KEYS if inner.get(part)}
-        if len(known) == 1 and pin and set(inner) <= set(_IMAGE_KEYS):
-            effects.images[known[0]] = {part: str(text) for part, text in pin.items()}
+        if len(images) == 1 and pin and set(inner) <= set(_IMAGE_KEYS):
+            effects.images[images[0]] = {part: str(text) for part, text in pin.items()}
             del patch[key]
         else:
-            _take_images(inner, was, release, config, effects)
+            _move_images(inner, old, release, config, effects)
             if not inner:
                 del patch[key]
 
 
-def _of_client(old: list[Any], new: list[Any], config: Config, effects: _Effects) -> None:
-    """Read the edit of plain manifests: their image is all that an override changes there."""
+def _read_client_edit(old: list[Any], new: list[Any], config: Config, effects: _Effects) -> None:
+    """Find the effects of an edit of plain manifests; an override changes only their image."""
     by_reference = {image.reference(): (name, image) for name, image in config.images.items()}
-    for path, left, right in leaves(old, new):
-        found = by_reference.get(left) if path.endswith(".image") else None
-        pin = _pin(right, found[1]) if found else None
-        if found and pin:
-            effects.images[found[0]] = pin
+    for path, left, right in leaf_differences(old, new):
+        known = by_reference.get(left) if path.endswith(".image") else None
+        pin = _pin(right, known[1]) if known else None
+        if known and pin:
+            effects.images[known[0]] = pin
         else:
-            effects.left.append(_place(path, old))
+            effects.not_covered.append(_place(path, old))
 
 
 def _place(path: str, documents: list[Any]) -> str:
@@ -222,8 +223,3 @@ def _pin(reference: object, image: Image) -> dict[str, str] | None:
     if match["repository"] != image.repository:
         pin["repository"] = match["repository"]
     return pin if pin.keys() & {"tag", "digest"} else None
-
-
-def value_of(value: object) -> str:
-    """Return a value of a manifest in few words, for a person."""
-    return "nothing" if value is ABSENT else strict_yaml.brief(value)

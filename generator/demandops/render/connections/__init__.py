@@ -1,7 +1,6 @@
-"""Communication clients: each a Deployment and a ConfigMap with the client's own configuration.
+"""Communication clients: each is a Deployment and a ConfigMap with the client's configuration.
 
-One module for each type of connection makes the configuration; :mod:`.schema` holds it against
-what the client reads before anything is written.
+Each type of connection has a module that makes the configuration. :mod:`.client_schema` checks it.
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ from demandops.render.engine import Engine
 
 
 def render(release: MqttEnd | RosEnd | Bridge, config: Config, engine: Engine) -> str:
-    """Return the manifests of one client as one YAML text.
+    """Return the manifests of a client as one YAML text.
 
     Raises:
-        InvalidInput: where its configuration has what the client does not read.
-        Refused: where the registry has no image of the client.
+        InvalidInput: if its configuration has a field that the client does not read.
+        Refused: if the registry has no image for the client.
     """
     if isinstance(release, MqttEnd):
         return mqtt.render(release, config, engine)

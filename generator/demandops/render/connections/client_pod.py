@@ -1,4 +1,4 @@
-"""What the pods of all communication clients have in common: image, place, checksum."""
+"""What the pods of all communication clients share: image, placement, checksum."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from demandops.plan.release import Bridge, MqttEnd, RosEnd
 
 
 def context(release: MqttEnd | RosEnd | Bridge, image: str, config: Config) -> dict[str, object]:
-    """Return what every client's template needs.
+    """Return the variables that every client's template needs.
 
     Raises:
-        Refused: where the registry has no such image.
+        Refused: if the registry has no such image.
     """
     if image not in config.images:
         message = f"'{image}' is in use, but not in {IMAGES_FILE}; add it there"
@@ -28,5 +28,5 @@ def context(release: MqttEnd | RosEnd | Bridge, image: str, config: Config) -> d
 
 
 def checksum(text: str) -> str:
-    """Return what a pod carries so that a change of ``text`` restarts it."""
+    """Return a checksum for the pod template, so that a change of ``text`` restarts the pod."""
     return hashlib.sha256(text.encode()).hexdigest()

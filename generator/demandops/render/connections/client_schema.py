@@ -1,8 +1,7 @@
-"""The last look at a client's configuration: does the client read every field of it?
+"""The check of a communication client's configuration before it is committed.
 
-The schemas (``templates/connections/<type>/schema.json``) are ours, written after what the clients
-read. A client passes over what it does not know, or dies of it, and either is seen only on the
-node; so what does not fit never reaches a commit.
+The schemas (``templates/connections/<type>/schema.json``) are our own and list the fields that each
+client reads. A client ignores an unknown field or crashes on it, which shows only on the node.
 """
 
 from __future__ import annotations
@@ -19,10 +18,11 @@ from demandops.settings import data_folder
 
 
 def check(kind: str, configuration: dict[str, Any], release: str) -> None:
-    """Hold the configuration of a client (``mqtt``, ``zenoh``, ``ros``) against its schema.
+    """Check the configuration of a client (``mqtt``, ``zenoh``, ``ros``) against its schema.
 
     Raises:
-        InvalidInput: naming each field that does not fit; a fault of the program, not of a demand.
+        InvalidInput: naming each field that does not match. It is a fault of the program, not of a
+            demand.
     """
     faults = [
         fault(field_path(tuple(error.instance_path)), error.message).within(f"{kind} of {release}")

@@ -1,9 +1,9 @@
-"""MQTT: two ends, each an mqtt_client with its ROS parameters.
+"""MQTT connections: each end is an mqtt_client with its ROS parameters.
 
 Parameters as ika-rwth-aachen/mqtt_client v2.5 reads them. The client cannot drop a bridge while it
-runs, so the ConfigMap's checksum stands in the pod template and a change of topics restarts it.
+runs, so the pod template has a checksum of the parameters and a change of topics restarts the pod.
 
-A broker's user name and password never come this way: the pod reads them from a Secret
+The parameters do not contain a broker's user name and password: the pod reads them from a Secret
 (``docs/decisions/0009-credentials-of-brokers.md``).
 """
 
@@ -21,7 +21,7 @@ from demandops.render.connections import client_pod, client_schema
 from demandops.render.engine import Engine
 
 CA_FILE = "/tls/ca.crt"
-"""Where the broker's certificate authority is mounted."""
+"""The path where the certificate of the broker's authority is mounted."""
 
 COMPOSE = """\
 import json, os, pathlib
@@ -33,14 +33,14 @@ broker = {"broker": {"user": user, "pass": password}}
 text = json.dumps({"/**/*": {"ros__parameters": broker}}, ensure_ascii=False)
 pathlib.Path("/credentials/params.yaml").write_text(text)
 """
-"""What the init container runs: files of the Secret become a ROS parameter file in memory."""
+"""The init container's program: it turns the Secret into a ROS parameter file in memory."""
 
 
 def parameters(end: MqttEnd) -> dict[str, Any]:
-    """Return the ROS parameter file of one end.
+    """Return the content of one end's ROS parameter file.
 
-    Each topic passes through one MQTT topic, named by the connection and the source topic: names
-    may differ between the ends.
+    Each ROS topic has one MQTT topic, named after the connection and the source topic: a topic's
+    name may differ between the ends.
     """
     bridge: dict[str, Any] = {}
     read = {route.read: (name, route) for name, route in end.topics.items() if end.reads(route)}
@@ -68,21 +68,21 @@ def parameters(end: MqttEnd) -> dict[str, Any]:
 
 
 def _broker(broker: Broker) -> dict[str, Any]:
-    found: dict[str, Any] = {"host": broker.host, "port": broker.port}
+    data: dict[str, Any] = {"host": broker.host, "port": broker.port}
     if broker.tls:
-        found["tls"] = {"enabled": True}
+        data["tls"] = {"enabled": True}
         if broker.tls.ca_secret:
-            found["tls"]["ca_certificate"] = CA_FILE
-    return found
+            data["tls"]["ca_certificate"] = CA_FILE
+    return data
 
 
 def _options(route: Route, *, retained: bool = False) -> dict[str, Any]:
-    """Return a topic's further parameters; what is as the client has it anyway is left out."""
-    found: dict[str, Any] = {}
+    """Return a topic's further parameters, without those that have the client's default."""
+    options: dict[str, Any] = {}
     if route.primitive:
-        found["primitive"] = True
+        options["primitive"] = True
     if route.type:
-        found["ros_type"] = route.type
+        options["ros_type"] = route.type
     ros: dict[str, Any] = {"queue_size": route.queue} if route.queue else {}
     qos = {"reliability": route.reliability, "durability": route.durability}
     qos = {name: value for name, value in qos.items() if value}
@@ -90,7 +90,7 @@ def _options(route: Route, *, retained: bool = False) -> dict[str, Any]:
     mqtt: dict[str, Any] = {"qos": route.qos} if route.qos else {}
     mqtt |= {"retained": True} if retained else {}
     advanced = {name: part for name, part in (("ros", ros), ("mqtt", mqtt)) if part}
-    return {**found, "advanced": advanced} if advanced else found
+    return {**options, "advanced": advanced} if advanced else options
 
 
 def render(end: MqttEnd, config: Config, engine: Engine) -> str:

@@ -1,7 +1,7 @@
-"""ROS: two ends, each an eProsima DDS-Router between the node's ROS graph and the other end.
+"""ROS connections: each end is an eProsima DDS-Router that links the node to the other end.
 
-Configuration as DDS-Router v3.5 reads it (version v5.0). It takes in a new allowlist while it
-runs, from the mounted file, which it must be told to look at again; all else restarts the pod.
+Configuration as DDS-Router v3.5 reads it (version v5.0). A running router accepts a new allowlist
+from the mounted file, which it reads again at an interval. Any other change restarts the pod.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from demandops.render.connections import client_pod, client_schema
 from demandops.render.engine import Engine
 
 RELOAD_SECONDS = 10
-"""How often a router looks for new topics: its watcher does not see a ConfigMap change."""
+"""How often a router reads its file again: its file watcher misses ConfigMap changes."""
 
 _LOCAL, _WAN = "local", "wan"
 
@@ -31,8 +31,8 @@ def dds_type(ros_type: str) -> str:
 def configuration(end: RosEnd) -> dict[str, Any]:
     """Return the configuration of one end's router.
 
-    Topics pass from where they are read to where they are written and not back. Most come from
-    the source, which the general routes say, so that a further one needs no restart.
+    A topic passes only from the end that reads it to the end that writes it. Most topics come from
+    the source. The general routes cover them, so that a new one needs no restart.
     """
     inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
     topics = [{"name": f"rt{route.read}", "type": dds_type(route.type)} for route in _all(end)]
@@ -69,13 +69,13 @@ def _all(end: RosEnd) -> list[Route]:
     return list(end.topics.values())
 
 
-def _routes(giving: str, taking: str) -> list[dict[str, Any]]:
-    """Return the rule that one participant gives to the other, which gives nothing back."""
-    return [{"src": giving, "dst": [taking]}, {"src": taking}]
+def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
+    """Return the routes by which one participant sends to the other and not back."""
+    return [{"src": sender, "dst": [receiver]}, {"src": receiver}]
 
 
 def _qos(route: Route, *, reads: bool) -> dict[str, Any]:
-    """Return a topic's settings; the rate is limited where the topic is read, before the link."""
+    """Return a topic's settings; the reading end limits the rate, before the link."""
     qos: dict[str, Any] = {}
     if route.reliability:
         qos["reliability"] = route.reliability == "reliable"

@@ -1,7 +1,7 @@
-"""Zenoh: one zenoh-bridge-ros2dds on each node, with the topics of all its Zenoh connections.
+"""Zenoh connections: each node has one zenoh-bridge-ros2dds for all of them.
 
-Configuration as eclipse-zenoh/zenoh-plugin-ros2dds 1.10 reads it. The bridge reads it once, so its
-checksum stands in the pod template.
+Configuration as eclipse-zenoh/zenoh-plugin-ros2dds 1.10 reads it. The bridge reads it only at the
+start, so the pod template has its checksum.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from demandops.render.engine import Engine
 def configuration(bridge: Bridge) -> dict[str, Any]:
     """Return the configuration of a node's bridge.
 
-    ``allow`` names what passes; a list that is missing there lets nothing pass. Nobody is looked
-    for by multicast: who connects to whom is in Git.
+    ``allow`` lists the topics that pass; a missing list lets none pass. Multicast scouting is off:
+    Git says which bridges connect.
     """
     lists = {"publishers": bridge.publishers, "subscribers": bridge.subscribers}
     ros: dict[str, Any] = {
@@ -45,7 +45,7 @@ def configuration(bridge: Bridge) -> dict[str, Any]:
 
 
 def _exactly(topic: str) -> str:
-    """Return the regular expression that matches a topic's name and nothing else."""
+    """Return the regular expression that matches only this topic's name."""
     return f"^{re.escape(topic)}$"
 
 

@@ -1,1 +1,1 @@
-"""What a GitOps controller reads: Flux's objects, or Argo CD's."""
+"""The manifests that a GitOps controller reads: Flux's or Argo CD's."""

@@ -1,8 +1,8 @@
-"""Argo CD: one Application for each service, and for each access domain one that brings them in.
+"""Manifests for Argo CD: one Application for each service and one for each access domain's folder.
 
-Fields of argoproj.io/v1alpha1 as of Argo CD 3.2. Each cluster has an Argo CD of its own. The
-Applications of services are in the access domain's namespace and not in Argo CD's, for there
-nothing would keep them from naming another domain's project (docs/decisions/0011).
+Fields of argoproj.io/v1alpha1 as of Argo CD 3.2. Each cluster has its own Argo CD. The
+Applications of services are in the access domain's namespace. In Argo CD's own namespace they could
+name another domain's project (docs/decisions/0011).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from demandops.render.gitops.paths import (
 from demandops.settings import MAIN_BRANCH
 
 IN_CLUSTER = "https://kubernetes.default.svc"
-"""The name under which an Argo CD knows the cluster that it runs in."""
+"""Argo CD's address for the cluster that it runs in."""
 
 
 def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
@@ -35,7 +35,7 @@ def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
 def render(
     release: ServiceRelease, values: Mapping[str, Any], repository: RepoSettings, engine: Engine
 ) -> str:
-    """Return the one file of a service: its Application."""
+    """Return the file of a service: its Application."""
     return engine.text(
         "argocd/release.yaml.j2",
         release=release,
@@ -48,8 +48,8 @@ def render(
     )
 
 
-def standing_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return bootstrap files, and for each access domain a placeholder."""
+def base_files(config: Config, engine: Engine) -> dict[str, str]:
+    """Return the bootstrap files and a placeholder for each access domain."""
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
         for cluster, domains in domains_by_cluster(config).items()
@@ -76,9 +76,9 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
 
 
 def _sources(config: Config) -> list[str]:
-    """Return every address that a domain's Applications may take something from."""
+    """Return every URL that a domain's Applications may use as a source."""
     section = config.repository.argocd
-    assert section is not None  # noqa: S101 - the configuration holds what gitops names
+    assert section is not None  # noqa: S101 - required when gitops is "argocd"
     charts = {
         source.oci or source.http for chart in config.charts.values() for source in chart.sources()
     }

@@ -1,7 +1,7 @@
-"""Flux: one HelmRelease for each service, one chart source for each chart, a folder a domain.
+"""Manifests for Flux: one HelmRelease for each service, one source for each chart and domain.
 
-Fields of helm.toolkit.fluxcd.io/v2 and source.toolkit.fluxcd.io/v1 as of Flux 2.9. Requesters do
-not appear here: who else asks for a running service changes the ledger and nothing that runs.
+Fields of helm.toolkit.fluxcd.io/v2 and source.toolkit.fluxcd.io/v1 as of Flux 2.9. Requesters are
+not in the manifests, so one more requester of a running service changes only the ledger.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from demandops.settings import MAIN_BRANCH
 
 
 def render(release: ServiceRelease, values: Mapping[str, Any], engine: Engine) -> str:
-    """Return the one file of a service: its HelmRelease."""
+    """Return the file of a service: its HelmRelease."""
     chart = release.chart
     return engine.text(
         "flux/release.yaml.j2",
@@ -36,12 +36,12 @@ def render(release: ServiceRelease, values: Mapping[str, Any], engine: Engine) -
 
 
 def chart_object(name: str, chart: ChartSource) -> str:
-    """Return the name of the object that fetches one chart in one version."""
+    """Return the name of the object that fetches one version of a chart."""
     return f"{name}-{chart.version}".lower()
 
 
-def standing_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return bootstrap files, and for each access domain a placeholder and the chart sources."""
+def base_files(config: Config, engine: Engine) -> dict[str, str]:
+    """Return the bootstrap files, and a placeholder and the chart sources for each domain."""
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
         for cluster, domains in domains_by_cluster(config).items()

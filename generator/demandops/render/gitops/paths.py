@@ -1,7 +1,6 @@
-"""Where a release stands in the state repo, whichever controller reads it.
+"""The paths of generated files, the same for both controllers.
 
-Other programs rely on these paths, and so do both controllers: a folder is one access domain's
-part of one cluster.
+Other programs rely on these paths. A folder holds one access domain's part of one cluster.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ BOOTSTRAP_ROOT = "bootstrap"
 
 
 def domain_folder(cluster: str, domain: AccessDomain) -> str:
-    """Return the folder that a controller applies as one."""
+    """Return the folder of an access domain on a cluster; a controller applies it as a whole."""
     return f"{CLUSTERS_ROOT}/{cluster}/{domain.name}"
 
 
@@ -27,12 +26,12 @@ def path_of(release: Release) -> str:
 
 
 def bootstrap_path(cluster: str) -> str:
-    """Return the path of what makes a cluster follow the repo."""
+    """Return the path of the manifests with which a cluster follows the repo."""
     return f"{BOOTSTRAP_ROOT}/{cluster}.yaml"
 
 
 def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
-    """Return every (cluster, access domain) that some node belongs to, sorted."""
+    """Return every (cluster, access domain) that has a node, sorted."""
     pairs = {
         (node.cluster, config.domain_of[node.id].name)
         for node in config.nodes.values()
@@ -42,8 +41,8 @@ def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
 
 
 def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return the access domains of each cluster that has one."""
-    found: dict[str, list[AccessDomain]] = {}
+    """Return the access domains in use, by cluster."""
+    domains: dict[str, list[AccessDomain]] = {}
     for cluster, domain in domains_in_use(config):
-        found.setdefault(cluster, []).append(domain)
-    return found
+        domains.setdefault(cluster, []).append(domain)
+    return domains

@@ -25,8 +25,8 @@ from demandops.ledger.apply import ClaimChange
 from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
-from demandops.render import override_marks
-from demandops.render.gitops import controller
+from demandops.render import release_file
+from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.staterepo.audit import allowed_changes
@@ -102,7 +102,7 @@ class _Proof:
                 for path, _ in _standing(before)
                 if _CHARTS in path and path not in wanted
             }
-            kept = override_marks.charts_kept({}, charts, self.state.config)
+            kept = release_file.kept_charts({}, charts, self.state.config)
             wanted |= {path: _blob(text) for path, text in kept.items()}
         return _differing(wanted, self.standing)
 
@@ -110,7 +110,7 @@ class _Proof:
 def _rendered(release: Release, state: State, before: Tree | None) -> tuple[str, Oid]:
     path = path_of(release)
     standing = trees.read_text(before, path) if before is not None else None
-    return path, _blob(override_marks.text_of(release, state.config, state.engine, standing))
+    return path, _blob(release_file.release_text(release, state.config, state.engine, standing))
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
@@ -246,7 +246,7 @@ def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[Cla
 
 def _from_nothing(state: State, commit: Commit) -> _Proof:
     """Render a commit whole, so that the next can be proven by what differs."""
-    steady = controller.standing_files(state.config, state.engine)
+    steady = manifests.base_files(state.config, state.engine)
     proof = _Proof(
         tree=commit.tree,
         state=state,

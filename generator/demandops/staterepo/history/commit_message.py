@@ -291,7 +291,7 @@ def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
         return ["Desired state: unchanged; what is asked runs already, or still for others."]
     lines = ["Desired state:"]
     for release in releases:
-        lines.append(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
+        lines.append(f"  {_SIGNS[release.change]} {release.name} ({release.description})")
         lines += [f"      {detail}" for detail in release.details]
     return lines
 

@@ -17,14 +17,18 @@ from demandops.decision import State, consequence
 from demandops.demand.claim import Claim, Subject
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file as ledger_format
-from demandops.render.changes.changeset import Read
+from demandops.render.changes.changeset import FileReader
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
 from demandops.staterepo.load.snapshot import Snapshot
 
 
 def held_back(
-    repo: Repository, snapshot: Snapshot, before: Snapshot, subjects: Iterable[Subject], read: Read
+    repo: Repository,
+    snapshot: Snapshot,
+    before: Snapshot,
+    subjects: Iterable[Subject],
+    read: FileReader,
 ) -> tuple[Snapshot, list[Subject], list[Fault]]:
     """Hold back what of ``subjects`` cannot be planned, neither as configured now nor as before.
 
@@ -45,7 +49,9 @@ def held_back(
     return snapshot, good, faults
 
 
-def _faults(state: State, before: Snapshot, subject: Subject, read: Read) -> tuple[Fault, ...]:
+def _faults(
+    state: State, before: Snapshot, subject: Subject, read: FileReader
+) -> tuple[Fault, ...]:
     try:
         consequence(state, before.state.ledger, [subject], read)
     except InvalidInput as error:

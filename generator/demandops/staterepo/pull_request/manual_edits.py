@@ -12,8 +12,12 @@ from demandops.config.override import OVERRIDES_ROOT
 from demandops.errors import Fault, fault
 from demandops.ledger import claim_file as ledger_format
 from demandops.plan.release import Release
-from demandops.render.changes import merge_preview as consequences
-from demandops.render.changes.override_suggestion import Suggestion, fits_too, suggest
+from demandops.render.changes import merge_preview
+from demandops.render.changes.override_suggestion import (
+    Suggestion,
+    same_override_fits,
+    suggest_override,
+)
 from demandops.render.gitops.paths import BOOTSTRAP_ROOT, path_of
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
@@ -61,10 +65,10 @@ def refused(
         if release is not None and before is not None and base.state is not None:
             who = owner if owner.isprintable() and owner.strip() else "unknown"
             texts = (before, after)
-            found = suggest(path, texts, release, base.state.config, who.strip()[:100])
+            found = suggest_override(path, texts, release, base.state.config, who.strip()[:100])
         if found is not None:
             also = sorted(one.name for one in releases.values() if _fits(release, one))
-            found = replace(found, name=_free(found.name, taken), also=tuple(also))
+            found = replace(found, name=_free(found.name, taken), other_releases=tuple(also))
             suggestions.append(found)
         message = _message(path, before is None, after is None, found)
         faults.append(fault("", message).within(path))
@@ -72,13 +76,13 @@ def refused(
 
 
 def _fits(release: Release | None, other: Release) -> bool:
-    return release is not None and fits_too(release, other)
+    return release is not None and same_override_fits(release, other)
 
 
 def _by_path(base: Base) -> dict[str, Release]:
     if base.state is None:
         return {}
-    known = consequences.releases_of(base.state.ledger, base.state.config)
+    known = merge_preview.planned_releases(base.state.ledger, base.state.config)
     return {path_of(release): release for release in known.values()}
 
 
@@ -100,9 +104,9 @@ def _message(path: str, added: bool, deleted: bool, found: Suggestion | None) ->
         )
     if found is not None:
         rest = ""
-        if found.left:
-            more = ", …" if len(found.left) > _MOST_LEFT else ""
-            rest = f" (no override changes {', '.join(found.left[:_MOST_LEFT])}{more})"
+        if found.not_covered:
+            more = ", …" if len(found.not_covered) > _MOST_LEFT else ""
+            rest = f" (no override changes {', '.join(found.not_covered[:_MOST_LEFT])}{more})"
         return f"{_LOST}, and merge {found.name} as shown{rest}"
     if path.startswith(f"{NOTES_ROOT}/"):
         return "is the generator's own, and written anew by it; take the edit back"

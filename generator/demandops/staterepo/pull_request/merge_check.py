@@ -29,7 +29,7 @@ from demandops.plan.release_keys import ReleaseKey
 from demandops.plan.views.bookkeeping import bookkeeping
 from demandops.plan.views.bookkeeping_diff import EntryChange, difference
 from demandops.plan.views.override_report import survey, warnings
-from demandops.render.changes import merge_preview as consequences
+from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview
 from demandops.render.changes.override_suggestion import Suggestion
 from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
@@ -97,13 +97,13 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
         path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
     ]
     refused, suggested = _hand_edits(folder, files, start, edited)
-    new = consequences.releases_of(state.ledger, state.config)
+    new = merge_preview.planned_releases(state.ledger, state.config)
     old = new if start is None else _releases(start)
     return replace(
         found,
         faults=_ordered([*faults, *refused]),
         suggestions=suggested,
-        consequence=consequences.consequence(old, new, standing, wanted),
+        consequence=merge_preview.preview(old, new, standing, wanted),
         books=_books(start, state),
         warnings=_warnings(state, moment),
     )
@@ -199,14 +199,14 @@ def _wanted(state: State, standing: Mapping[str, str], edited: Collection[str]) 
     try:
         return rendered(state, standing)
     except InvalidInput as error:
-        found = consequences.faults(state.ledger, state.config, state.engine, edited)
+        found = merge_preview.render_faults(state.ledger, state.config, state.engine, edited)
         raise InvalidInput(found or error.faults) from None
 
 
 def _releases(start: Base) -> dict[ReleaseKey, Release]:
     if start.state is None:
         return {}
-    return consequences.releases_of(start.state.ledger, start.state.config)
+    return merge_preview.planned_releases(start.state.ledger, start.state.config)
 
 
 def _books(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:

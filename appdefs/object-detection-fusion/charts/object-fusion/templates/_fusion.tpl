@@ -1,6 +1,6 @@
 {{- /*
-The watcher's own parameters, which it reads once when it starts. Both the ConfigMap that holds them
-and the checksum that restarts the pods on a change come from here.
+The watcher's own parameters, which it reads only when it starts. The ConfigMap contains them, and a
+checksum of them restarts the pods when they change.
 */ -}}
 {{- define "fusion.watcherParams" -}}
 {{ toJson .Values.watcher.nodeName }}:
@@ -21,9 +21,9 @@ and the checksum that restarts the pods on a change come from here.
 {{- end -}}
 
 {{- /*
-A list of topics as ROS 2 can take it. An empty YAML list has no element type: a node that starts
-with it finds no value, and rclpy sends it as a list of booleans, which a node refuses for a list of
-texts. One empty text is the usual stand-in; no topic can have that name.
+A list of topics in a form that ROS 2 accepts. An empty YAML list has no element type: a node that
+starts with it gets no value, and rclpy sends it as a list of booleans, which a node refuses. So an
+empty list becomes a list with one empty string, which cannot be a topic's name.
 */ -}}
 {{- define "fusion.topics" -}}
 {{- . | uniq | sortAlpha | default (list "") | toJson -}}

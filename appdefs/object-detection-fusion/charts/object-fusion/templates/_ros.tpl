@@ -1,31 +1,31 @@
 {{- /*
-What every ROS 2 pod of this application needs. The file is the same, byte for byte, in each chart
-of the application (a test compares them): a library chart would have to be built into every
-package, and a chart that is read straight out of a Git folder must work without that step.
+Helpers for every ROS 2 pod of this application. Each chart of the application has an identical copy
+of this file (a test compares them). A library chart would need a build step, and a chart in a Git
+folder must work without one.
 
-Values are written with toJson throughout. JSON is YAML, and no text in a value can become syntax.
+All values are written with toJson: JSON is valid YAML, and text in a value cannot become syntax.
 */ -}}
 
 {{- /*
-Labels of the objects themselves. There is no helm.sh/chart label: with it, every new chart version
-would rewrite every object, and the version of a release stands in the release anyway.
+Labels of the objects. There is no helm.sh/chart label, because then each new chart version would
+change every object. The release already contains the chart's version.
 */ -}}
 {{- define "ros.labels" -}}
 {{- $more := dict "app.kubernetes.io/part-of" "object-detection-fusion" "app.kubernetes.io/managed-by" .Release.Service -}}
 {{- merge (include "ros.selectorLabels" . | fromJson) $more | toJson -}}
 {{- end -}}
 
-{{- /* Labels by which a Deployment finds its pods: they can never change, so nothing in them may. */ -}}
+{{- /* Labels by which a Deployment selects its pods. Kubernetes does not allow them to change. */ -}}
 {{- define "ros.selectorLabels" -}}
 {{- dict "app.kubernetes.io/name" .Chart.Name "app.kubernetes.io/instance" .Release.Name | toJson -}}
 {{- end -}}
 
-{{- /* Labels of the pods: the selector's win over those of the values. */ -}}
+{{- /* Labels of the pods: labels of the selector replace those of the values. */ -}}
 {{- define "ros.podLabels" -}}
 {{- mergeOverwrite (deepCopy .Values.podLabels) (include "ros.selectorLabels" . | fromJson) | toJson -}}
 {{- end -}}
 
-{{- /* Name of an image, from a dict of `image` (as in the values) and `default` (the tag to fall back on). */ -}}
+{{- /* Name of an image, from a dict of `image` (as in the values) and `default` (the default tag). */ -}}
 {{- define "ros.image" -}}
 {{- if .image.digest -}}
 {{- printf "%s@%s" .image.repository .image.digest | toJson -}}
@@ -43,10 +43,10 @@ would rewrite every object, and the version of a release stands in the release a
 {{- end -}}
 
 {{- /*
-How a container starts, from a dict of `setup` (scripts to source) and `run` (the command line).
-The script is a constant: scripts, node names and topics reach it as arguments of their own, so
-that no character in them is ever read by a shell. Without setup scripts the image's own entry
-point stays in place and gets the command line.
+The command of a container, from a dict of `setup` (scripts to source) and `run` (the command line).
+The shell script is a constant. Setup scripts, node names and topics are separate arguments, so the
+shell never interprets their characters. Without setup scripts, the image's own entry point gets the
+command line.
 */ -}}
 {{- define "ros.start" -}}
 {{- if .setup -}}
@@ -58,8 +58,8 @@ args: {{ toJson .run }}
 {{- end -}}
 
 {{- /*
-Environment of a container. HOME points to the pod's own volume, because ROS 2 writes its logs below
-it and an arbitrary user has no home folder in the image; the values may set another one.
+Environment of a container. HOME is a volume of the pod, because ROS 2 writes its logs there and an
+arbitrary user has no home folder in the image. The values may set another HOME.
 */ -}}
 {{- define "ros.env" -}}
 - name: ROS_DOMAIN_ID
@@ -78,11 +78,11 @@ it and an arbitrary user has no home folder in the image; the values may set ano
 {{- end -}}
 
 {{- /*
-Probes of a container, from its `probes` values. A probe that names no handler of its own asks
-whether `ros2 launch` has a child process: it reads who is whose parent from /proc and looks for a
-parent with `launch` among its arguments, but no `--`, which only the shell that still sources the
-setup scripts has. That needs no ROS discovery (which costs a second of processor time and fails on
-a busy network), no port, and only bash and grep.
+Probes of a container, from its `probes` values. A probe without a handler checks whether
+`ros2 launch` has a child process. It reads the parent processes from /proc and looks for one with
+`launch` but without `--` in its arguments: only the shell that sources the setup scripts has `--`.
+The check needs bash and grep, but no port and no ROS discovery, which takes a second of processor
+time and fails on a busy network.
 */ -}}
 {{- define "ros.probes" -}}
 {{- $check := "grep -hs ^PPid: /proc/[0-9]*/status | { while read -r _ parent; do if grep -qszx launch /proc/$parent/cmdline; then grep -qszxe -- /proc/$parent/cmdline || exit 0; fi; done; exit 1; }" -}}
@@ -98,7 +98,7 @@ a busy network), no port, and only bash and grep.
 {{- end }}
 {{- end -}}
 
-{{- /* The part of a pod's specification that says where and as whom it runs. */ -}}
+{{- /* The part of a pod's specification about its node, its account and its rights. */ -}}
 {{- define "ros.podSpec" -}}
 {{- with include "ros.serviceAccountName" . -}}
 serviceAccountName: {{ toJson . }}

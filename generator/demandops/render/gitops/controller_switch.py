@@ -1,8 +1,8 @@
-"""What a person does on the clusters when a state repo goes over to the other GitOps controller.
+"""The steps on the clusters when a state repo switches between Flux and Argo CD.
 
-Pure: words and commands, made from the names that rendering gives. The order matters. A controller
-that is still at work when its releases leave the repo would remove what runs, so it is stopped
-before; it is taken off only when the other one has taken over.
+Pure: returns instructions and commands for a person. The order matters. A running controller would
+remove the workloads when its releases leave the repo, so it is stopped first. Its objects are
+deleted only after the other controller has taken over.
 """
 
 from __future__ import annotations
@@ -16,38 +16,41 @@ from demandops.render.gitops.argocd import project_of
 from demandops.render.gitops.paths import bootstrap_path, domains_by_cluster
 
 _SUSPEND = """'{"spec":{"suspend":true}}'"""
-_LET_GO = """'{"metadata":{"finalizers":null}}'"""
+_DROP_FINALIZERS = """'{"metadata":{"finalizers":null}}'"""
 _OURS = "app.kubernetes.io/managed-by=demandops"
-_FLUXS = "helmrelease,helmchart,helmrepository,ocirepository"
+_FLUX_KINDS = "helmrelease,helmchart,helmrepository,ocirepository"
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One thing to do, and the commands that do it on one cluster."""
+    """An instruction for one cluster, and the commands that carry it out."""
 
     cluster: str
-    what: str
+    description: str
     commands: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Handover:
-    """What to do on the clusters before the state repo changes, and after."""
+class SwitchSteps:
+    """The steps before the state repo changes, and those after."""
 
     before: tuple[Step, ...] = ()
     after: tuple[Step, ...] = ()
 
 
-def handover(old: Config, new: Config) -> Handover:
-    """Return what is to be done for a state repo to go from one controller to the other.
+def switch_steps(old: Config, new: Config) -> SwitchSteps:
+    """Return the steps to switch the controller; none if it stays the same.
 
-    Nothing is deleted on the way: docs/argocd.md has the reasons, and the end-to-end tests do it.
+    No workload is deleted on the way (docs/argocd.md has the reasons).
+
+    Args:
+        old, new: the configuration before and after.
     """
     if old.repository.gitops == new.repository.gitops:
-        return Handover()
+        return SwitchSteps()
     if new.repository.gitops == "argocd":
-        return Handover(tuple(_suspend_flux(new)), tuple(_from_flux(new)))
-    return Handover(tuple(_let_argocd_go(old)), tuple(_from_argocd(new)))
+        return SwitchSteps(tuple(_suspend_flux(new)), tuple(_finish_switch_to_argocd(new)))
+    return SwitchSteps(tuple(_delete_applications(old)), tuple(_finish_switch_to_flux(new)))
 
 
 def _suspend_flux(config: Config) -> Iterator[Step]:
@@ -61,38 +64,37 @@ def _suspend_flux(config: Config) -> Iterator[Step]:
                 f"{kubectl} get helmrelease -l {_of(domain)} -o name | "
                 f"xargs -r {kubectl} patch {suspend}"
             )
-        yield Step(
-            cluster, "suspend Flux, which would remove what it no longer finds", (*commands,)
-        )
+        yield Step(cluster, "suspend Flux, so that it does not prune the workloads", (*commands,))
 
 
-def _from_flux(config: Config) -> Iterator[Step]:
+def _finish_switch_to_argocd(config: Config) -> Iterator[Step]:
     for cluster, domains in domains_by_cluster(config).items():
         yield _follow(cluster, "wait until all Applications are Synced")
         commands = []
         for domain in domains:
             kubectl = f"kubectl -n {domain.namespace}"
-            commands.append(  # Helm's notes, which would have Flux go on from them one day
+            commands.append(  # Helm's release records: a later Flux would continue from them
                 f"{kubectl} get helmrelease -l {_of(domain)} -o name | sed s,.*/,, | "
                 f"xargs -r -I NAME {kubectl} delete secret -l owner=helm,name=NAME"
             )
-            commands.append(f"{kubectl} delete {_FLUXS} -l {_of(domain)}")
+            commands.append(f"{kubectl} delete {_FLUX_KINDS} -l {_of(domain)}")
             commands.append(f"{kubectl} delete kustomization {domain.name}")
         commands += [
             f"kubectl -n {namespace} delete gitrepository {config.repository.source}"
             for namespace in _namespaces(domains)
         ]
-        yield Step(cluster, "delete what Flux had; suspended, it removes nothing", (*commands,))
+        description = "delete Flux's objects; because Flux is suspended, no workload is removed"
+        yield Step(cluster, description, (*commands,))
 
 
 def _of(domain: AccessDomain) -> str:
-    """Return the label that Flux puts on all that a domain's Kustomization applies."""
+    """Return the label that Flux puts on everything that a domain's Kustomization applies."""
     return f"kustomize.toolkit.fluxcd.io/name={domain.name}"
 
 
-def _let_argocd_go(config: Config) -> Iterator[Step]:
+def _delete_applications(config: Config) -> Iterator[Step]:
     section = config.repository.argocd
-    assert section is not None  # noqa: S101 - the configuration holds what gitops names
+    assert section is not None  # noqa: S101 - required when gitops is "argocd"
     for cluster, domains in domains_by_cluster(config).items():
         commands = []
         for domain in domains:
@@ -100,13 +102,15 @@ def _let_argocd_go(config: Config) -> Iterator[Step]:
                 project_of(domain, config.repository),
                 f"kubectl -n {section.namespace}",
             )
-            commands.append(f"{kubectl} patch application {name} --type merge -p {_LET_GO}")
+            commands.append(
+                f"{kubectl} patch application {name} --type merge -p {_DROP_FINALIZERS}"
+            )
             commands.append(f"{kubectl} delete application {name}")
         for namespace in _namespaces(domains):
             kubectl = f"kubectl -n {namespace}"
             commands.append(
                 f"{kubectl} get application -l {_OURS} -o name | "
-                f"xargs -r {kubectl} patch --type merge -p {_LET_GO}"
+                f"xargs -r {kubectl} patch --type merge -p {_DROP_FINALIZERS}"
             )
             commands.append(f"{kubectl} delete application -l {_OURS}")
         commands += [
@@ -114,18 +118,18 @@ def _let_argocd_go(config: Config) -> Iterator[Step]:
             f"{project_of(domain, config.repository)}"
             for domain in domains
         ]
-        what = "delete Argo CD's Applications without what they hold: finalizers first"
-        yield Step(cluster, what, (*commands,))
+        description = "delete Argo CD's Applications but not their workloads: finalizers first"
+        yield Step(cluster, description, (*commands,))
 
 
-def _from_argocd(config: Config) -> Iterator[Step]:
+def _finish_switch_to_flux(config: Config) -> Iterator[Step]:
     for cluster in domains_by_cluster(config):
-        yield _follow(cluster, "Flux adopts what is there")
+        yield _follow(cluster, "Flux adopts the running workloads")
 
 
 def _follow(cluster: str, then: str) -> Step:
     show = f"git show main:{bootstrap_path(cluster)} | kubectl apply -f -"
-    return Step(cluster, f"have the cluster follow the repo again; {then}", (show,))
+    return Step(cluster, f"make the cluster follow the repo again; {then}", (show,))
 
 
 def _namespaces(domains: list[AccessDomain]) -> list[str]:

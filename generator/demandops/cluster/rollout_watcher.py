@@ -1,0 +1,229 @@
+"""Follows releases on their clusters until they reach the requested level.
+
+One thread evaluates the rollouts whenever a watch reports a change. A cluster that is away delays
+only the rollouts on it.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+from demandops.cluster.access import ClusterAccess
+from demandops.cluster.health import (
+    ClusterDomain,
+    Health,
+    History,
+    Level,
+    Objects,
+    Target,
+    health_reader,
+    worst,
+)
+from demandops.cluster.object_cache import ObjectCache
+
+log = logging.getLogger("demandops")
+
+OnProgress = Callable[[str, str], None]
+"""Called with a state (``reconciled``, ``healthy``, ``failing``) and a text, once for each text."""
+
+_PAUSE_S = 0.05
+_LONGEST_WAIT_S = 1.0
+
+
+@dataclass(eq=False)
+class _Rollout:
+    commit: str
+    domains: tuple[ClusterDomain, ...]
+    targets: tuple[Target, ...]
+    level: Level
+    deadline: float
+    on_progress: OnProgress
+    future: Future[Health] = field(default_factory=Future)
+    reported: set[str] = field(default_factory=set)
+    failed: Health | None = None
+    confirmed: bool = False
+    busy: bool = False
+
+
+class RolloutWatcher:
+    """Follows releases on the clusters that the operator's file names."""
+
+    def __init__(self, clusters: Mapping[str, ClusterAccess], history: History) -> None:
+        """Start without watches; the watches of a domain start with its first rollout.
+
+        Args:
+            clusters: the access to each cluster; clusters without a kubeconfig are ignored.
+            history: the commits of the state repo; called from the status thread.
+        """
+        self._history = history
+        self._changed = threading.Event()
+        self._closed = False
+        self._lock = threading.Lock()
+        self._open: list[_Rollout] = []
+        self._caches = {
+            name: ObjectCache(name, access, self._changed.set)
+            for name, access in clusters.items()
+            if access.kubeconfig
+        }
+        self._thread = threading.Thread(target=self._run, name="demandops-status", daemon=True)
+        self._thread.start()
+
+    def why_unreachable(self, domains: Iterable[ClusterDomain]) -> str:
+        """Return why releases in these domains cannot be followed; empty if they can."""
+        missing = sorted({domain.cluster for domain in domains} - set(self._caches))
+        return f"no access to cluster {', '.join(missing)}" if missing else ""
+
+    def follow(
+        self,
+        commit: str,
+        targets: Iterable[Target],
+        level: Level,
+        timeout: float,
+        on_progress: OnProgress = lambda state, text: None,
+    ) -> Future[Health]:
+        """Follow releases of a published commit; returns at once.
+
+        Args:
+            commit: the published commit.
+            targets: the releases; :meth:`why_unreachable` must be empty for their domains.
+            level: the level that they have to reach.
+            timeout: seconds until the future is resolved in any case.
+            on_progress: called with each new state, from the status thread.
+
+        Returns:
+            A future of the health. It is resolved when the health reaches ``level``, or after the
+            timeout with the reason.
+        """
+        targets = tuple(targets)
+        domains = tuple(dict.fromkeys(target.domain for target in targets))
+        deadline = time.monotonic() + timeout
+        rollout = _Rollout(commit, domains, targets, level, deadline, on_progress)
+        for domain in domains:
+            self._caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
+        with self._lock:
+            self._open.append(rollout)
+        self._changed.set()
+        return rollout.future
+
+    def close(self) -> None:
+        """Stop; open futures are resolved with the current health."""
+        self._closed = True
+        self._changed.set()
+        self._thread.join(5)
+        for cache in self._caches.values():
+            cache.close()
+
+    def _run(self) -> None:
+        while not self._closed:
+            self._changed.wait(_LONGEST_WAIT_S)
+            self._changed.clear()
+            self._evaluate()
+            time.sleep(_PAUSE_S)  # changes come in bursts
+        self._evaluate(last=True)
+
+    def _evaluate(self, last: bool = False) -> None:
+        with self._lock:
+            rollouts = list(self._open)
+        if not rollouts:
+            return
+        objects = {name: cache.objects() for name, cache in self._caches.items()}
+        for rollout in rollouts:
+            if rollout.busy and not last:
+                continue
+            health = self._health(rollout, objects)
+            if health.reaches("healthy") and not (rollout.confirmed or last):
+                self._in_background(rollout, self._confirm)
+                continue
+            self._report(rollout, health)
+            rollout.failed = health if health.failing else rollout.failed
+            if health.reaches(rollout.level) or last:
+                self._resolve(rollout, health)
+            elif time.monotonic() > rollout.deadline:
+                self._in_background(rollout, partial(self._time_out, health=health))
+
+    def _in_background(self, rollout: _Rollout, work: Callable[[_Rollout], None]) -> None:
+        """Run work that queries a cluster in its own thread, because it may not answer."""
+        rollout.busy = True
+
+        def run() -> None:
+            try:
+                work(rollout)
+            except Exception as error:
+                log.debug("a cluster did not answer: %s", error)
+            rollout.busy = False
+            self._changed.set()
+
+        threading.Thread(target=run, name="demandops-status-ask", daemon=True).start()
+
+    def _confirm(self, rollout: _Rollout) -> None:
+        for domain in rollout.domains:
+            self._caches[domain.cluster].refresh(health_reader(domain).objects_to_confirm(domain))
+        rollout.confirmed = True
+
+    def _time_out(self, rollout: _Rollout, health: Health) -> None:
+        """Resolve a rollout after its timeout; add the reason of pods that do not run.
+
+        If the controller is just retrying, add the reason of the earlier failure.
+        """
+        failed = rollout.failed
+        if failed and not health.failing and failed.object == health.object:
+            health = replace(health, reason=f"{health.reason}; before: {failed.reason}")
+        kind, _, name = health.object.partition(" ")
+        if kind == "Deployment":
+            namespace, _, deployment = name.partition("/")
+            with suppress(Exception):
+                for target in rollout.targets:
+                    if target.domain.namespace == namespace:
+                        cache = self._caches[target.domain.cluster]
+                        reason = cache.why_unavailable(namespace, deployment)
+                        if reason:
+                            health = replace(health, reason=f"{health.reason}; {reason}")
+                            break
+        self._resolve(rollout, health)
+
+    def _resolve(self, rollout: _Rollout, health: Health) -> None:
+        with self._lock:
+            if rollout not in self._open:
+                return
+            self._open.remove(rollout)
+        rollout.future.set_result(health)
+
+    def _health(self, rollout: _Rollout, objects: Mapping[str, Objects]) -> Health:
+        commit = rollout.commit
+        health = worst([self._domain_health(domain, commit, objects) for domain in rollout.domains])
+        if health.state == "waiting" or not rollout.domains:
+            return health
+        return worst([self._release_health(target, commit, objects) for target in rollout.targets])
+
+    def _domain_health(
+        self, domain: ClusterDomain, commit: str, objects: Mapping[str, Objects]
+    ) -> Health:
+        reader = health_reader(domain)
+        reason = self._caches[domain.cluster].why_unknown(reader.objects_to_watch(domain))
+        if reason:
+            return Health("waiting", f"cannot be read: {reason}", f"cluster {domain.cluster}")
+        return reader.domain_health(domain, commit, objects[domain.cluster], self._history)
+
+    def _release_health(
+        self, target: Target, commit: str, objects: Mapping[str, Objects]
+    ) -> Health:
+        reader = health_reader(target.domain)
+        return reader.release_health(target, commit, objects[target.domain.cluster], self._history)
+
+    @staticmethod
+    def _report(rollout: _Rollout, health: Health) -> None:
+        reached = [level for level in ("reconciled", "healthy") if health.reaches(level)]
+        states = [(level, level) for level in reached]
+        if health.failing:
+            states.append(("failing", f"{health.object}: {health.reason}"))
+        for state, text in states:
+            if text not in rollout.reported:
+                rollout.reported.add(text)
+                rollout.on_progress(state, text)

@@ -1,0 +1,41 @@
+"""The manifests of the state repo, for the controller that ``demandops.yaml`` names.
+
+A service's Helm values and the plain manifests of connections are the same for Flux and Argo CD.
+"""
+
+from __future__ import annotations
+
+from demandops.config.config import Config
+from demandops.plan.release import Release, ServiceRelease
+from demandops.render import connections
+from demandops.render.engine import Engine
+from demandops.render.gitops import argocd, flux
+from demandops.render.helm_values import values_of
+
+
+def render(release: Release, config: Config, engine: Engine) -> str:
+    """Return the manifests of a release as the text of one file.
+
+    Raises:
+        Refused: if the registry has no image for a communication client.
+        InvalidInput: if an appdef's values template fails or its values do not match the chart's
+            schema.
+    """
+    if not isinstance(release, ServiceRelease):
+        return connections.render(release, config, engine)
+    values = values_of(release, config, engine)
+    if config.repository.gitops == "argocd":
+        return argocd.render(release, values, config.repository, engine)
+    return flux.render(release, values, engine)
+
+
+def base_files(config: Config, engine: Engine) -> dict[str, str]:
+    """Return the files that exist even without demands.
+
+    Each cluster has a bootstrap file, with which its controller follows the repo. Each access
+    domain on it has a placeholder: Git drops empty folders, and on a missing folder Flux and Argo
+    CD fail instead of pruning.
+    """
+    if config.repository.gitops == "argocd":
+        return argocd.base_files(config, engine)
+    return flux.base_files(config, engine)

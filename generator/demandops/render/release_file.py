@@ -1,0 +1,94 @@
+"""The file of a release: comment lines that name the overrides, then the rendered body.
+
+A ``hold`` override keeps the body of a file byte for byte; only the comments above it may change.
+They go on naming the overrides that shaped the body when it was frozen.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from demandops.config.config import Config
+from demandops.config.override import Override, written
+from demandops.plan.release import Release
+from demandops.render.engine import Engine
+from demandops.render.gitops import manifests
+from demandops.render.gitops.paths import CLUSTERS_ROOT
+
+_START = "# override overrides/"
+_OUTSIDE_BODY = frozenset({"hold", "keep"})
+"""Effects that do not change the body, so their comments are updated even if it is held."""
+_UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
+_CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
+
+
+def release_text(release: Release, config: Config, engine: Engine, current: str | None) -> str:
+    """Return the text of a release's file; a held file keeps its current body.
+
+    Args:
+        release: the release.
+        config: the configuration that it was planned with.
+        engine: the engine of that configuration.
+        current: the file's text in the state repo; ``None`` if there is no file.
+
+    Raises:
+        Refused, InvalidInput: if it cannot be rendered.
+    """
+    shaping = release.shaping
+    if not shaping.held:
+        comments = [override_comment(override, effects) for override, effects in shaping.by]
+        return _join(comments, manifests.render(release, config, engine))
+    outside, of_body = list[str](), list[str]()
+    for override, effects in shaping.by:
+        comments = outside if _OUTSIDE_BODY & {*effects} else of_body
+        comments.append(override_comment(override, effects))
+    if current is None:
+        return _join([*outside, *of_body], manifests.render(release, config, engine))
+    comments, body = split_comments(current)
+    frozen = [comment for comment in comments if not _UPDATED_COMMENT.match(comment)]
+    return _join([*outside, *frozen], body)
+
+
+def _join(comments: list[str], body: str) -> str:
+    return "".join(f"{comment}\n" for comment in comments) + body
+
+
+def override_comment(override: Override, effects: tuple[str, ...]) -> str:
+    """Return the comment that names an override and its effects."""
+    until = f"until {written(override.end)}; " if override.end else ""
+    return (
+        f"# override {override.path}: {', '.join(effects)}; priority {override.priority}; {until}"
+        f"owner {override.owner}; reason: {override.reason}"
+    )
+
+
+def split_comments(text: str) -> tuple[list[str], str]:
+    """Return the comment lines above a file's body, and the body."""
+    lines = text.splitlines(keepends=True)
+    count = 0
+    while count < len(lines) and lines[count].startswith(_START):
+        count += 1
+    return [line.rstrip("\n") for line in lines[:count]], "".join(lines[count:])
+
+
+def kept_charts(
+    files: Mapping[str, str], current: Mapping[str, str], config: Config
+) -> dict[str, str]:
+    """Return the chart sources to keep because a held release may still use them.
+
+    Sources of charts in this repo are not kept: under its old name such a source would fetch the
+    new chart.
+
+    Args:
+        files: the generated files as they will be.
+        current: the generated files in the state repo.
+        config: the configuration.
+    """
+    if not any(override.hold for override in config.in_force):
+        return {}
+    return {
+        path: text
+        for path, text in current.items()
+        if _CHART.fullmatch(path) and path not in files and "kind: GitRepository" not in text
+    }
