@@ -27,9 +27,9 @@ from demandops.demand import (
 from demandops.demand.claim import Subject
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, InvalidInput, Refused
-from demandops.ledger import apply as booking
 from demandops.ledger import restoration
-from demandops.ledger.apply import Changes, Ledger
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Changes, Ledger
 from demandops.ledger.restoration import Restoration
 from demandops.plan import implied_connections
 from demandops.plan.checks import denial, quota
@@ -168,7 +168,7 @@ def _booked(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger
         Refused: where the books, an override or a quota do not allow it.
     """
     asked, config = kept_claims.requested(request), state.config
-    ledger, changes = booking.apply(kept_claims.giving_way(state.ledger, asked), request, now)
+    ledger, changes = apply(kept_claims.giving_way(state.ledger, asked), request, now)
     refusals = list(denial.faults(request, ledger, changes, config))
     refusals = refusals or list(quota.faults(state.ledger, ledger, changes, config))
     if refusals:

@@ -30,8 +30,8 @@ from asking import (
 from demandops.cli.main import run
 from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from demandops.errors import Refused
-from demandops.ledger import apply as booking
-from demandops.ledger.apply import Ledger
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import all_keys
@@ -301,7 +301,7 @@ class TestParameters:
                 ),
             ),
         )
-        return booking.apply(ledger, request, NOW + timedelta(minutes=minute))[0]
+        return apply(ledger, request, NOW + timedelta(minutes=minute))[0]
 
     @staticmethod
     def planned(books: Books, ledger: Ledger, service: str = "recorder") -> dict[str, object]:

@@ -18,7 +18,8 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.decision import State, admit, rendered
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger, apply
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Ledger
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo import new_repo
 from demandops.staterepo.git import tree as trees

@@ -15,7 +15,7 @@ from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.decision import State, decide, rendered
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.staterepo import new_repo
 
 HERE = Path(__file__).parent

@@ -17,7 +17,7 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.decision import State, decide, explain, rendered
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.render.output_check import check_files
 from demandops.staterepo import new_repo

@@ -22,7 +22,7 @@ from demandops.decision import Decision, State, decide, rendered
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, Refused
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.service.timing.lease_expiry import LeaseClock
 from demandops.service.timing.rate_limit import RateLimit

@@ -11,11 +11,9 @@ from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.ledger import named_demand
 from demandops.ledger.decommission import decommission
 from demandops.ledger.join import join
-from demandops.ledger.ledger import Changes, ClaimChange, Ledger
+from demandops.ledger.ledger import Changes, Ledger
 from demandops.ledger.restoration import restore
 from demandops.ledger.shutdown import release
-
-__all__ = ["Changes", "ClaimChange", "Ledger", "apply"]
 
 
 def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:

@@ -20,7 +20,7 @@ from demandops.demand.demand_request import ConnectionType
 from demandops.demand.route import Route
 from demandops.demand.transport_choice import choose_broker, message_type, misfits
 from demandops.errors import Fault, Refused, fault
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan import naming
 from demandops.plan.release import Address, Bridge, MqttEnd, RosEnd, place
 

@@ -17,7 +17,7 @@ from demandops.demand.demand_request import (
 )
 from demandops.demand.route import Route
 from demandops.identifiers import topic_problem
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import outputs
 from demandops.plan.release import ServiceKey
 

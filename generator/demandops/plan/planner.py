@@ -15,7 +15,7 @@ from demandops.config.registry import ChartSource
 from demandops.demand.claim import ApplicationClaim, Subject, SubjectKind
 from demandops.demand.demand_request import InputTopic
 from demandops.errors import Refused, fault
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan import connection_clients, naming, parameters
 from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.overrides import effects

@@ -12,7 +12,7 @@ from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import Refused, fault
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan import connection_clients
 from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.overrides.claims_in_force import in_force

@@ -8,7 +8,7 @@ from demandops.decision import Decision, State
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import DemandRequest
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey, affected, all_keys, keys_of

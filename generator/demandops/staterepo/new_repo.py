@@ -16,7 +16,7 @@ from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, rendered
 from demandops.errors import StateRepoError
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.settings import MAIN_BRANCH, RENDER_VERSION, data_folder
 from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees

@@ -12,7 +12,7 @@ from asking import FAST, configuration, skeleton
 from demandops.config.load import load
 from demandops.decision import State, rehearse
 from demandops.errors import InvalidInput
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 
 FILES = sorted(
     path

@@ -9,7 +9,7 @@ from asking import Books, configuration, perception, skeleton
 from demandops.config.load import load
 from demandops.decision import State, rehearse
 from demandops.errors import InvalidInput
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"

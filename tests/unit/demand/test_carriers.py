@@ -12,7 +12,7 @@ from demandops.config.load import load
 from demandops.decision import State
 from demandops.demand.demand_request import ConnectionType
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 
 from tests import demanding
 

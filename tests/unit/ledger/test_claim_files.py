@@ -17,7 +17,7 @@ from demandops.demand.claim import (
 from demandops.demand.demand_request import ConnectionType, InputTopic, id_problem
 from demandops.demand.route import Route, united
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from hypothesis import given
 from hypothesis import strategies as st
 from trying import examples

@@ -19,7 +19,7 @@ from demandops.demand.lease import LONGEST_S, Lease
 from demandops.demand.route import Route, united
 from demandops.identifiers import id_problem
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from hypothesis import given, note
 from hypothesis import strategies as st
 from model.leases import BY_MESSAGE, Goal, Promises, Subject

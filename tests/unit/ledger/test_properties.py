@@ -14,7 +14,7 @@ from demandops.decision import Decision, State, rendered
 from demandops.demand.claim import ApplicationClaim, Claim
 from demandops.errors import Refused
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from hypothesis import assume, given, note
 from hypothesis import strategies as st
 from inmemory import NOW, Repo, outcome

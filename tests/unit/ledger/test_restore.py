@@ -15,7 +15,7 @@ from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Operation
 from demandops.demand.lease import Lease
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.restoration import Restoration
 from inmemory import NOW, Repo
 from model.goals import Maker

@@ -19,7 +19,8 @@ from demandops.demand.demand_request import (
 from demandops.demand.route import Route, united
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger, apply
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Ledger
 
 NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
 STRING = "std_msgs/msg/String"

@@ -14,7 +14,7 @@ from demandops.config.policy import matches
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, DemandRequest
 from demandops.errors import Fault, fault
-from demandops.ledger.apply import Changes, Ledger
+from demandops.ledger.ledger import Changes, Ledger
 from demandops.plan.overrides.claims_in_force import suspended_by
 from demandops.plan.overrides.selectors import Traits, fits, labelled, traits_of
 from demandops.plan.release import ServiceKey

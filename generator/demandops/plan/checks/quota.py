@@ -8,7 +8,7 @@ from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
 from demandops.demand.claim import ApplicationClaim, Claim, Subject, SubjectKind
 from demandops.errors import Fault, fault
-from demandops.ledger.apply import Changes, Ledger
+from demandops.ledger.ledger import Changes, Ledger
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import keys_of
 

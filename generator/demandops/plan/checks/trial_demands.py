@@ -13,8 +13,8 @@ from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.config.policy import matches
 from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
-from demandops.ledger import apply as booking
-from demandops.ledger.apply import Ledger
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.effects import effects_on, with_overrides
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
@@ -57,7 +57,7 @@ def _services(
             ),
         ),
     )
-    ledger, changes = booking.apply(Ledger(), request, _NEVER)
+    ledger, changes = apply(Ledger(), request, _NEVER)
     for key in affected(Ledger(), ledger, config, changes.subjects()):
         release = plan(ledger, config, key)
         if isinstance(release, ServiceRelease):

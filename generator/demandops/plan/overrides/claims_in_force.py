@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import Claim, Subject
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.selectors import Traits, fits, traits_of
 
 _MOST_JUDGED = 100_000

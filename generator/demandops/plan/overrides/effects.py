@@ -12,7 +12,7 @@ from dataclasses import replace
 from demandops.config.config import DDS_ROUTER_IMAGE, MQTT_CLIENT_IMAGE, ZENOH_BRIDGE_IMAGE, Config
 from demandops.config.override import Override
 from demandops.demand.claim import KEPT, Claim
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.claims_in_force import denied_by
 from demandops.plan.overrides.selectors import Traits, selects
 from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease, Shaping, place

@@ -15,8 +15,7 @@ from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import KEPT, Claim, ClaimKey, Subject, SubjectKind, is_kept
 from demandops.demand.demand_request import DemandRequest
-from demandops.ledger.apply import Changes, Ledger
-from demandops.ledger.ledger import differences
+from demandops.ledger.ledger import Changes, Ledger, differences
 from demandops.plan.overrides.claims_in_force import suspended_by
 from demandops.plan.overrides.selectors import selects, traits_of
 

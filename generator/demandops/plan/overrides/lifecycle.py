@@ -15,7 +15,7 @@ from demandops.config.override import Override, written
 from demandops.demand.claim import ClaimKey, Subject
 from demandops.ledger import claim_file as ledger_format
 from demandops.ledger import ended_override_file
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 
 

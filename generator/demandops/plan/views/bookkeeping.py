@@ -11,7 +11,7 @@ from typing import Any
 
 from demandops.config.config import Config
 from demandops.demand.claim import SubjectKind
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.connection_clients import connection_topics
 from demandops.plan.overrides.claims_in_force import in_force, suspended
 from demandops.plan.planner import plan

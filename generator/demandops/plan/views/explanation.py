@@ -22,7 +22,7 @@ from demandops.config.config import (
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.demand.claim import KEPT, ApplicationClaim, Claim, Subject, demand_id, is_kept
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import denied, plan
 from demandops.plan.release import Bridge, MqttEnd, Release, ServiceRelease
 from demandops.plan.release_keys import all_keys, keys_of

@@ -9,7 +9,7 @@ from typing import Literal
 
 from demandops.config.config import Config
 from demandops.config.override import Override, written
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.claims_in_force import suspended_by
 from demandops.plan.planner import denied, plan

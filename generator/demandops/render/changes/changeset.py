@@ -14,7 +14,7 @@ from demandops.config.config import Config
 from demandops.demand.route import Route
 from demandops.errors import Refused
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import ClaimChange, Ledger
+from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey

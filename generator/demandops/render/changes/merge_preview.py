@@ -15,7 +15,7 @@ from demandops.config.config import Config
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of

@@ -15,7 +15,7 @@ from datetime import datetime, timedelta, timezone
 
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import DemandRequest, Operation
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.service.ticket import Ticket
 
 log = logging.getLogger("demandops")

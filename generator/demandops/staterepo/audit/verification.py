@@ -21,7 +21,7 @@ from demandops.demand.claim import Claim
 from demandops.errors import InvalidInput
 from demandops.ledger import claim_file as ledger_format
 from demandops.ledger import ended_override_file
-from demandops.ledger.apply import ClaimChange
+from demandops.ledger.ledger import ClaimChange
 from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey

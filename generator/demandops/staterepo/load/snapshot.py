@@ -21,7 +21,7 @@ from demandops.demand.claim import Claim, ClaimKey, Subject
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file as ledger_format
 from demandops.ledger import ended_override_file
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message

@@ -22,7 +22,7 @@ from demandops.decision import State, rehearse, rendered
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file as ledger_format
 from demandops.ledger import ended_override_file
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.lifecycle import due, taken_in
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey

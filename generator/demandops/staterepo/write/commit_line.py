@@ -23,7 +23,7 @@ from demandops.decision import Decision, State, consequence, rendered
 from demandops.demand.claim import ClaimKey, Subject
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.lifecycle import TakenIn, differing, ended, files_of, taken_in
 from demandops.render.changes.changeset import Change, Changeset, ReleaseChange
