@@ -94,7 +94,9 @@ class Decision:
     @property
     def lease_s(self) -> int | None:
         """For how many seconds the demand holds unless it is renewed; nothing: without end."""
-        claims = self.state.ledger.of_demand(self.request.demand) if self.request.demand else ()
+        claims = (
+            self.state.ledger.claims_of_demand(self.request.demand) if self.request.demand else ()
+        )
         claims = claims or tuple(change.after for change in self.changes.claims if change.after)
         return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
 
@@ -275,7 +277,7 @@ def _uncarried(request: DemandRequest, ledger: Ledger, config: Config) -> Iterat
     for app in request.applications:
         for foreign in implied_connections.foreign_inputs(app, config):
             topic = foreign.topic
-            if not ledger.carries(app.node, topic.topic):
+            if not ledger.is_carried_to(app.node, topic.topic):
                 yield (
                     f"application '{app.id}': no connection carries {foreign.name} {topic.topic} "
                     f"of '{topic.source}' to '{app.node}'"

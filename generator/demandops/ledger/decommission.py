@@ -15,7 +15,7 @@ from types import MappingProxyType
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim, Subject, SubjectKind
 from demandops.demand.demand_request import DemandRequest, Leaving
 from demandops.errors import Fault, Refused, fault, near
-from demandops.ledger.ledger import Changes, Ledger, differences
+from demandops.ledger.ledger import Changes, Ledger, claim_changes
 
 
 def decommission(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
@@ -30,11 +30,11 @@ def decommission(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple
     if "node" in leaving.kinds:
         claims |= {f"{c.subject} {c.demand}": c for c in claims_at(ledger, leaving.name)}
     if "requester" in leaving.kinds:
-        held = ledger.of_requester(leaving.name)
+        held = ledger.claims_of_requester(leaving.name)
         claims |= {f"{c.subject} {c.demand}": c for c in held}
     for claim in claims.values():
         ledger = ledger.replace(claim.key, _left_of(claim, leaving, now))
-    changes = differences(start, ledger, [claim.key for claim in claims.values()])
+    changes = claim_changes(start, ledger, [claim.key for claim in claims.values()])
     if not changes:
         raise Refused([_nothing_held(start, leaving)])
     return ledger, Changes(claims=changes)
@@ -42,9 +42,11 @@ def decommission(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple
 
 def claims_at(ledger: Ledger, node: str) -> list[Claim]:
     """Return the claims that need a node, in no order."""
-    subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.at_node(node)]
-    subjects += [Subject(SubjectKind.CONNECTION, id) for id in ledger.connected(node)]
-    return [claim for subject in subjects for claim in ledger.of(subject) if needs(claim, node)]
+    subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.applications_at(node)]
+    subjects += [Subject(SubjectKind.CONNECTION, id) for id in ledger.connections_needing(node)]
+    return [
+        claim for subject in subjects for claim in ledger.claims_on(subject) if needs(claim, node)
+    ]
 
 
 def needs(claim: Claim, node: str) -> bool:
@@ -77,8 +79,12 @@ def _without_node(claim: Claim, node: str, now: datetime) -> Claim | None:
 
 def _nothing_held(ledger: Ledger, leaving: Leaving) -> Fault:
     """Say that nothing is held, with a name that comes near: a typo must show."""
-    names = [ledger.names("requester")] if "requester" in leaving.kinds else []
-    names += [ledger.names("node"), ledger.names("link")] if "node" in leaving.kinds else []
+    names = [ledger.indexed_names("requester")] if "requester" in leaving.kinds else []
+    names += (
+        [ledger.indexed_names("node"), ledger.indexed_names("link")]
+        if "node" in leaving.kinds
+        else []
+    )
     kinds = " or ".join(sorted(leaving.kinds))
     close = near(leaving.name, {name for found in names for name in found})
     message = f"'{leaving.name}' holds nothing as a {kinds}{close}"

@@ -28,7 +28,7 @@ from demandops.demand.demand_request import (
 from demandops.demand.lease import renewed
 from demandops.demand.route import Route
 from demandops.errors import Fault, Refused, fault
-from demandops.ledger.ledger import Changes, Ledger, differences
+from demandops.ledger.ledger import Changes, Ledger, claim_changes
 
 
 def join(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
@@ -37,20 +37,20 @@ def join(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger,
     start = ledger
     keys: list[ClaimKey] = []
     for index, app in enumerate(request.applications):
-        standing = ledger.application(app.id)
+        standing = ledger.application_claims(app.id)
         faults += application_conflicts(f"applications[{index}]", app, standing)
         claim: Claim = _joined_application(ledger, request.id, app, now)
         ledger = ledger.replace(claim.key, claim)
         keys.append(claim.key)
     for index, connection in enumerate(request.connections):
-        held = ledger.connection(connection.id)
+        held = ledger.connection_claims(connection.id)
         faults += connection_conflicts(f"connections[{index}]", connection, held)
         claim = _joined_connection(ledger, request.id, connection, now)
         ledger = ledger.replace(claim.key, claim)
         keys.append(claim.key)
     if faults:
         raise Refused(faults)
-    return ledger, Changes(claims=differences(start, ledger, keys))
+    return ledger, Changes(claims=claim_changes(start, ledger, keys))
 
 
 def application_conflicts(

@@ -29,7 +29,7 @@ from demandops.demand.demand_request import (
 from demandops.demand.lease import Term, renewed
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.join import application_conflicts, connection_conflicts, touched, united
-from demandops.ledger.ledger import Changes, Ledger, differences
+from demandops.ledger.ledger import Changes, Ledger, claim_changes
 
 
 def put(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
@@ -38,7 +38,7 @@ def put(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, 
     Raises:
         Refused: where it belongs to others, or contradicts what other demands hold.
     """
-    held = ledger.of_demand(request.demand)
+    held = ledger.claims_of_demand(request.demand)
     _refuse_strangers(held, request)
     start = ledger
     others = ledger
@@ -48,14 +48,16 @@ def put(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, 
     faults: list[Fault] = []
     keys = [claim.key for claim in held]
     for index, app in enumerate(request.applications):
-        faults += application_conflicts(f"applications[{index}]", app, others.application(app.id))
+        faults += application_conflicts(
+            f"applications[{index}]", app, others.application_claims(app.id)
+        )
         key = ClaimKey(Subject(SubjectKind.APPLICATION, app.id), request.demand)
         faults += _twice(f"applications[{index}].id", key, ledger)
         ledger = ledger.replace(key, _application(request, app, start.get(key), now))
         keys.append(key)
     for index, connection in enumerate(request.connections):
         faults += connection_conflicts(
-            f"connections[{index}]", connection, others.connection(connection.id)
+            f"connections[{index}]", connection, others.connection_claims(connection.id)
         )
         key = ClaimKey(Subject(SubjectKind.CONNECTION, connection.id), request.demand)
         faults += _twice(f"connections[{index}].id", key, ledger)
@@ -63,7 +65,7 @@ def put(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, 
         keys.append(key)
     if faults:
         raise Refused(faults)
-    return ledger, Changes(claims=differences(start, ledger, keys))
+    return ledger, Changes(claims=claim_changes(start, ledger, keys))
 
 
 def _twice(where: str, key: ClaimKey, ledger: Ledger) -> Iterator[Fault]:
@@ -133,12 +135,12 @@ def renew(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
             continue
         term = Term(claim.lease.seconds, claim.lease.slack)
         ledger = ledger.replace(claim.key, replace(claim, lease=claim.lease.renewed(term, now)))
-    return ledger, Changes(claims=differences(start, ledger, [claim.key for claim in held]))
+    return ledger, Changes(claims=claim_changes(start, ledger, [claim.key for claim in held]))
 
 
 def expire(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
     """Release what of a demand has come to the end of its lease; nothing where it was renewed."""
-    held = ledger.of_demand(request.demand)
+    held = ledger.claims_of_demand(request.demand)
     return _without(ledger, [c for c in held if c.lease is not None and c.lease.ends < now])
 
 
@@ -146,17 +148,17 @@ def _without(ledger: Ledger, claims: Iterable[Claim]) -> tuple[Ledger, Changes]:
     start, keys = ledger, [claim.key for claim in claims]
     for key in keys:
         ledger = ledger.replace(key, None)
-    return ledger, Changes(claims=differences(start, ledger, keys))
+    return ledger, Changes(claims=claim_changes(start, ledger, keys))
 
 
 def _owned(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
-    held = ledger.of_demand(request.demand)
+    held = ledger.claims_of_demand(request.demand)
     if not held:
         near = sorted(
             {
                 claim.demand
                 for requester in request.named_by
-                for claim in ledger.of_requester(requester)
+                for claim in ledger.claims_of_requester(requester)
             }
         )
         known = f"; demands in this name: {', '.join(near[:5])}" if near else ""

@@ -24,7 +24,7 @@ from demandops.demand.demand_request import (
 from demandops.demand.lease import Lease, Term
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.claim_file import path_of
-from demandops.ledger.ledger import Changes, ClaimChange, Ledger, differences
+from demandops.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
 
 _SHOWN = 20
 
@@ -61,7 +61,7 @@ def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
     start = ledger
     for change in changes:
         ledger = ledger.replace(change.key, _fresh(change, now))
-    return ledger, Changes(claims=differences(start, ledger, [change.key for change in changes]))
+    return ledger, Changes(claims=claim_changes(start, ledger, [change.key for change in changes]))
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:

@@ -25,7 +25,7 @@ from demandops.demand.demand_request import (
     InputTopic,
 )
 from demandops.errors import Fault, Refused, fault
-from demandops.ledger.ledger import Changes, Ledger, differences
+from demandops.ledger.ledger import Changes, Ledger, claim_changes
 
 
 def release(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
@@ -35,7 +35,7 @@ def release(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
     not_held: list[str] = []
     for subject, asked in _listed(request):
         # looked up in what was held at first: a second listing of a subject means the same claim
-        claim = _meant(start.of(subject), request.id, asked)
+        claim = _meant(start.claims_on(subject), request.id, asked)
         if claim is None:
             not_held.append(f"{subject} for {', '.join(asked.requesters)}")
             continue
@@ -44,7 +44,7 @@ def release(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
         if left is not None:
             ledger = ledger.replace(claim.key, _subtracted(left, asked, now)[0])
         keys.append(claim.key)
-    changes = differences(start, ledger, keys)
+    changes = claim_changes(start, ledger, keys)
     if not changes:
         raise Refused([_nothing_held(start, request)])
     return ledger, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
@@ -141,7 +141,7 @@ def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
     near = [
         f"{claim.subject} for {', '.join(claim.requesters)} (request '{claim.request}')"
         for subject, _ in _listed(request)
-        for claim in ledger.of(subject)
+        for claim in ledger.claims_on(subject)
     ]
     where = "applications[0].id" if request.applications else "connections[0].id"
     if not near:

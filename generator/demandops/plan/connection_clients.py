@@ -44,7 +44,7 @@ class BridgeKey:
 
 def keys_of(ledger: Ledger, connection: str) -> Iterator[EndKey | BridgeKey]:
     """Yield the clients that run because a connection is held."""
-    claims = ledger.connection(connection)
+    claims = ledger.connection_claims(connection)
     if not claims:
         return
     if claims[0].type is ConnectionType.ZENOH:
@@ -100,7 +100,7 @@ def end(ledger: Ledger, config: Config, key: EndKey) -> MqttEnd | RosEnd | None:
     Raises:
         Refused: where the configuration no longer has what the connection needs.
     """
-    claims = ledger.connection(key.connection)
+    claims = ledger.connection_claims(key.connection)
     if not claims or claims[0].type is ConnectionType.ZENOH:
         return None
     topics = carried(claims, config)
@@ -149,7 +149,7 @@ def _own_and_peer(claim: ConnectionClaim, key: EndKey) -> tuple[str, str]:
 
 
 def _ros_end(ledger: Ledger, config: Config, key: EndKey, topics: dict[str, Route]) -> RosEnd:
-    claim = ledger.connection(key.connection)[0]
+    claim = ledger.connection_claims(key.connection)[0]
     ends = (claim.source, claim.target)
     typed = {
         name: replace(route, type=message_type(route, route.ends(*ends)[0], config))
@@ -159,10 +159,10 @@ def _ros_end(ledger: Ledger, config: Config, key: EndKey, topics: dict[str, Rout
     if listener is None:
         raise _stuck(key.connection, "finds no end with a wan address any more; restore it")
     address = _address(key.connection, listener)
-    for other in ledger.at(ConnectionType.ROS, listener.id):
+    for other in ledger.connections_at(ConnectionType.ROS, listener.id):
         if other == key.connection or _address(other, listener) != address:
             continue
-        if _listener(ledger.connection(other)[0], config) is listener:
+        if _listener(ledger.connection_claims(other)[0], config) is listener:
             raise _stuck(
                 key.connection,
                 f"would listen on port {address.port} of '{listener.id}', as '{other}' does; use "
@@ -221,8 +221,8 @@ def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
     publishers: dict[str, tuple[float, str]] = {}
     subscribers: set[str] = set()
     connections: dict[str, str] = {}
-    for id in ledger.at(ConnectionType.ZENOH, key.node):
-        claims = ledger.connection(id)
+    for id in ledger.connections_at(ConnectionType.ZENOH, key.node):
+        claims = ledger.connection_claims(id)
         source, target = claims[0].source, claims[0].target
         for route in carried(claims, config).values():
             connections[id] = target if key.node == source else source

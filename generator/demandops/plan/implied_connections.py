@@ -101,8 +101,8 @@ def _connection(
     app: ApplicationDemand, source: str, topic: str, ledger: Ledger
 ) -> ConnectionDemand:
     assert app.connect is not None  # noqa: S101 - the caller has looked
-    for id in ledger.bringing(app.node, topic):
-        for standing in ledger.connection(id):
+    for id in ledger.connections_bringing(app.node, topic):
+        for standing in ledger.connection_claims(id):
             route = standing.topics.get(topic)
             ends = (standing.source, standing.target)
             if ends == (source, app.node) and route is not None and not route.reverse:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias, TypeVar, cast
 
 from demandops.config.config import Config
 from demandops.demand.claim import Subject
-from demandops.ledger.ledger import ClaimChange, Ledger, entries
+from demandops.ledger.ledger import ClaimChange, Ledger, index_entries
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, keys_of
@@ -91,7 +91,7 @@ def _changed(changes: Iterable[ClaimChange]) -> set[_Read]:
     """Return whatever reads otherwise after the changes."""
     reads: set[_Read] = {_ALL}
     for change in changes:
-        reads |= {change.key.subject, *entries(change.before), *entries(change.after)}
+        reads |= {change.key.subject, *index_entries(change.before), *index_entries(change.after)}
     return reads
 
 

@@ -56,10 +56,10 @@ def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease 
     named = (key.application,) if key.application is not None else None
     users = tuple(  # an application may run elsewhere by now, or as something else
         application
-        for application in named or ledger.taking(str(key.source), str(key.topic))
+        for application in named or ledger.applications_taking(str(key.source), str(key.topic))
         if key in keys_of(ledger, config, Subject(SubjectKind.APPLICATION, application))
     )
-    claims = tuple(claim for user in users for claim in ledger.application(user))
+    claims = tuple(claim for user in users for claim in ledger.application_claims(user))
     if not claims:
         return None
     appdef = appdef_of(config, claims[0].appdef)

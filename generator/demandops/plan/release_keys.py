@@ -39,7 +39,7 @@ def keys_booked(
     if subject.kind is SubjectKind.CONNECTION:
         yield from connection_clients.keys_of(ledger, subject.id)
         return
-    claims = ledger.application(subject.id)
+    claims = ledger.application_claims(subject.id)
     if not claims:
         return
     known = strict or claims[0].appdef in config.appdefs

@@ -46,7 +46,7 @@ def demand(kind: str = "auto", topics: Any = None, **more: Any) -> dict[str, Any
 
 def carried(before: State, asked: dict[str, Any]) -> ConnectionType:
     after, _ = demanding.decide(before, asked, NOW, lambda path: None)
-    (claim,) = after.ledger.connection("c")
+    (claim,) = after.ledger.connection_claims("c")
     return claim.type
 
 
@@ -105,7 +105,9 @@ class TestAutomaticChoice:
         after, _ = demanding.decide(before, demand("mqtt"), NOW, lambda path: None)
         again = demand(requesters=["vehicle01"])
         after, _ = demanding.decide(after, again, NOW, lambda path: None)
-        assert {claim.type for claim in after.ledger.connection("c")} == {ConnectionType.MQTT}
+        assert {claim.type for claim in after.ledger.connection_claims("c")} == {
+            ConnectionType.MQTT
+        }
 
     def test_a_shutdown_without_a_type_means_what_stands(self) -> None:
         before = state(vehicle00=SPEAKS, edge=REACHABLE)
@@ -250,7 +252,7 @@ class TestThroughTheWire:
         asked = connection("c", topics=["/a"], broker="", type=number)
         assert books.send(goal([], [asked])).outcome == "booked"
         assert books.send(goal([], [asked])).outcome == "unchanged"
-        (claim,) = books.state.ledger.connection("c")
+        (claim,) = books.state.ledger.connection_claims("c")
         assert claim.type.name == name
         assert books.books()["connections"]["c"]["topics"] == ["/a"]
         assert books.send(goal([], [asked], shutdown=True)).outcome == "released"

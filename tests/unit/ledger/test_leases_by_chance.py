@@ -334,9 +334,9 @@ def test_the_index_is_that_of_a_ledger_built_in_any_order(
         again.minutes,
     )
     ends = [claim.lease.ends for claim in rest if claim.lease]
-    assert ledger.next_end() == min(ends, default=None)
+    assert ledger.next_lease_end() == min(ends, default=None)
     for now in ends:
-        gone = ledger.ended(now)
+        gone = ledger.ended_claims(now)
         assert {claim.key for claim in gone} == {
             claim.key for claim in rest if claim.lease and claim.lease.ends < now
         }

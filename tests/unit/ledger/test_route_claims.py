@@ -145,15 +145,15 @@ def test_a_type_that_is_said_later_is_filled_in_and_kept() -> None:
     ledger = joined(Ledger(), Route("/a", "/b"))
     ledger = joined(ledger, Route("/a", "/b", type=STRING))
     assert joined(ledger, Route("/a", "/b")) == ledger
-    (held,) = ledger.connection("c")
+    (held,) = ledger.connection_claims("c")
     assert held.topics == {"/a": Route("/a", "/b", type=STRING)}
 
 
 def test_what_is_carried_back_arrives_at_the_source() -> None:
     ledger = joined(Ledger(), Route("/a", "/b"), Route("/c", "/d", reverse=True))
-    assert ledger.carries("t", "/b")
-    assert ledger.carries("s", "/c")
-    assert not ledger.carries("t", "/d")
+    assert ledger.is_carried_to("t", "/b")
+    assert ledger.is_carried_to("s", "/c")
+    assert not ledger.is_carried_to("t", "/d")
 
 
 @pytest.mark.parametrize("kind", [ConnectionType.ZENOH, ConnectionType.ROS])
@@ -161,9 +161,12 @@ def test_links_are_known_at_both_nodes_as_long_as_somebody_holds_them(kind: Conn
     ledger = joined(Ledger(), Route("/a", "/a"), type=kind.value)
     ledger = joined(ledger, Route("/a", "/a"), type=kind.value, who="w")
     ledger = joined(ledger, Route("/a", "/a"), type=kind.value, id="d", target="u")
-    first, second = ledger.connection("c")
-    assert (ledger.at(kind, "s"), ledger.at(kind, "t")) == (("c", "d"), ("c",))
+    first, second = ledger.connection_claims("c")
+    assert (ledger.connections_at(kind, "s"), ledger.connections_at(kind, "t")) == (
+        ("c", "d"),
+        ("c",),
+    )
     ledger = ledger.replace(first.key, None)
-    assert ledger.at(kind, "t") == ("c",)
+    assert ledger.connections_at(kind, "t") == ("c",)
     ledger = ledger.replace(second.key, None)
-    assert (ledger.at(kind, "s"), ledger.at(kind, "t")) == (("d",), ())
+    assert (ledger.connections_at(kind, "s"), ledger.connections_at(kind, "t")) == (("d",), ())

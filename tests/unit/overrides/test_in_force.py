@@ -94,7 +94,7 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
             assert ((claim.subject.id, claim.demand) in told) is suspended
             if claim.demand.startswith(KEPT):
                 assert claim.requesters == ("petra",)
-                assert ledger.of(claim.subject) == (claim,), "it gives way to any other"
+                assert ledger.claims_on(claim.subject) == (claim,), "it gives way to any other"
         for entry in entries.services.values():
             assert (entry.service, entry.node) != ("object-detection", "cloud")
         assert "v2/edge" not in entries.connections
@@ -208,7 +208,7 @@ def test_a_kept_claim_is_the_owners_and_holds_what_the_last_one_did() -> None:
     books.send(one | {"shutdown": True})
     books.send(two | {"shutdown": True})
     subject = Subject(SubjectKind.APPLICATION, "edge/object_detection_fusion")
-    (claim,) = books.state.ledger.of(subject)
+    (claim,) = books.state.ledger.claims_on(subject)
     assert (claim.demand, claim.request) == ("override:tested", "override:tested")
     assert (claim.requesters, claim.lease) == (("petra",), None)
     assert "ego_data" not in claim.inputs  # type: ignore[union-attr]

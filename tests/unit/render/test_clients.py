@@ -106,9 +106,9 @@ class TestZenoh:
         for number in range(30):
             world.send(demand("zenoh", id=f"c{number}", source="vehicle01"))
         world.send(demand("zenoh", target="vehicle00", source="edge"))
-        assert world.state.ledger.at(world.state.ledger.connection("c")[0].type, "vehicle00") == (
-            "c",
-        )
+        assert world.state.ledger.connections_at(
+            world.state.ledger.connection_claims("c")[0].type, "vehicle00"
+        ) == ("c",)
 
     def test_topics_match_whole_names_and_nothing_else(self) -> None:
         world = zenoh_world()
@@ -159,7 +159,7 @@ class TestZenoh:
             who = chance.choice(["vehicle00", "vehicle01"])
             asked = demand("zenoh", topics, id=id, source=source, target=target, requesters=[who])
             asked["shutdown"] = chance.random() < 0.5
-            if asked["shutdown"] and not world.state.ledger.connection(id):
+            if asked["shutdown"] and not world.state.ledger.connection_claims(id):
                 continue
             try:
                 world.send(asked)
@@ -341,7 +341,7 @@ class TestWhatPeopleDidInGit:
         """Return why the books cannot be rendered once a claim or the inventory was edited."""
         world = World(state(**self.NODES))
         world.send(demand(kind))
-        (claim,) = world.state.ledger.connection("c")
+        (claim,) = world.state.ledger.connection_claims("c")
         edited = replace(claim, topics={route.source: route})
         books = world.state.ledger.replace(claim.key, edited)
         with pytest.raises(Refused) as refused:

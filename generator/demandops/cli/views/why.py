@@ -127,7 +127,7 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
     for kind in SubjectKind:
         subject = Subject(kind, name)
         folder = ledger_format.folder_of(subject)
-        if ledger.of(subject) or _has_history(repo, snapshot, folder):
+        if ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
             found.append(_Asked(kind.value[:-1], name, folder, subject=subject))
     return found
 
@@ -159,7 +159,7 @@ def _denied(snapshot: Snapshot, asked: _Asked) -> dict[str, Any]:
 
 
 def _is_held(snapshot: Snapshot, asked: _Asked) -> bool:
-    return asked.subject is not None and bool(snapshot.state.ledger.of(asked.subject))
+    return asked.subject is not None and bool(snapshot.state.ledger.claims_on(asked.subject))
 
 
 def _has_history(repo: Reader, snapshot: Snapshot, path: str) -> bool:

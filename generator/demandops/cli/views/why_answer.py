@@ -52,7 +52,7 @@ def denied(found: Release, by: Override) -> dict[str, Any]:
 def subject(snapshot: Snapshot, found: Subject) -> dict[str, Any]:
     """Return who holds an application or a connection, and what runs because of that."""
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    claims = sorted(ledger.of(found), key=lambda claim: claim.booked)
+    claims = sorted(ledger.claims_on(found), key=lambda claim: claim.booked)
     releases = explanation.releases_of(ledger, config, found)
     return {
         "runs": any(suspended_by(claim, config) is None for claim in claims),

@@ -112,8 +112,8 @@ def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator
     """Yield what of a demand is booked and does not run, for an override suspends it."""
     subjects = dict.fromkeys(subject for subject, _, _ in _listed(request))
     claims = [
-        *ledger.of_demand(request.demand),
-        *(claim for subject in subjects for claim in ledger.of(subject)),
+        *ledger.claims_of_demand(request.demand),
+        *(claim for subject in subjects for claim in ledger.claims_on(subject)),
     ]
     seen = set()
     asking = set(request.requesters())

@@ -39,7 +39,7 @@ def _claims(
 
 
 def _held(requester: str, ledger: Ledger, domain: AccessDomain, config: Config) -> int:
-    claims = ledger.of_requester(requester)
+    claims = ledger.claims_of_requester(requester)
     return sum(config.domain_of.get(_node(claim)) is domain for claim in claims)
 
 
@@ -54,7 +54,7 @@ def _services(node: str, before: Ledger, after: Ledger, config: Config) -> Itera
 
 
 def _running(node: str, ledger: Ledger, config: Config) -> int:
-    applications = (Subject(SubjectKind.APPLICATION, name) for name in ledger.at_node(node))
+    applications = (Subject(SubjectKind.APPLICATION, name) for name in ledger.applications_at(node))
     keys = {key for subject in applications for key in keys_of(ledger, config, subject)}
     return sum(isinstance(key, ServiceKey) and key.node == node for key in keys)
 

@@ -25,13 +25,13 @@ class ClaimsInForce(Ledger):
 
     config: Config | None = field(default=None, compare=False)
 
-    def of(self, subject: Subject) -> tuple[Claim, ...]:
+    def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject`` that are in force, sorted by demand id."""
-        return tuple(claim for claim in Ledger.of(self, subject) if self._stands(claim))
+        return tuple(claim for claim in Ledger.claims_on(self, subject) if self._stands(claim))
 
-    def carries(self, target: str, topic: str) -> bool:
+    def is_carried_to(self, target: str, topic: str) -> bool:
         """Tell whether some connection in force brings ``topic`` to the node ``target``."""
-        return bool(self.bringing(target, topic))
+        return bool(self.connections_bringing(target, topic))
 
     def _ids(self, *entry: str) -> tuple[str, ...]:
         found = ((key, self.get(key)) for key in self.index.get(entry) or ())

@@ -96,9 +96,11 @@ def _effects(release: Release, override: Override, config: Config) -> tuple[str,
 
 def _claims(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
     if isinstance(release, ServiceRelease):
-        return tuple(claim for app in release.applications for claim in ledger.application(app))
+        return tuple(
+            claim for app in release.applications for claim in ledger.application_claims(app)
+        )
     names = release.connections if isinstance(release, Bridge) else (release.connection,)
-    return tuple(claim for name in names for claim in ledger.connection(name))
+    return tuple(claim for name in names for claim in ledger.connection_claims(name))
 
 
 def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:

@@ -15,7 +15,7 @@ from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import KEPT, Claim, ClaimKey, Subject, SubjectKind, is_kept
 from demandops.demand.demand_request import DemandRequest
-from demandops.ledger.ledger import Changes, Ledger, differences
+from demandops.ledger.ledger import Changes, Ledger, claim_changes
 from demandops.plan.overrides.claims_in_force import suspended_by
 from demandops.plan.overrides.selectors import selects, traits_of
 
@@ -31,7 +31,7 @@ def requested(request: DemandRequest) -> tuple[Subject, ...]:
 def giving_way(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
     """Return the ledger without the overrides' own claims on these subjects."""
     for subject in subjects:
-        for claim in ledger.of(subject):
+        for claim in ledger.claims_on(subject):
             if is_kept(claim):
                 ledger = ledger.replace(claim.key, None)
     return ledger
@@ -48,7 +48,7 @@ def settled(
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
     after, more = kept(before, after, touched, world)
-    return after, replace(changes, claims=differences(before, after, [*keys, *more]))
+    return after, replace(changes, claims=claim_changes(before, after, [*keys, *more]))
 
 
 def kept(
@@ -63,10 +63,10 @@ def kept(
     """
     keys: list[ClaimKey] = []
     for subject in subjects:
-        own = [c for c in (*after.of(subject), *before.of(subject)) if is_kept(c)]
+        own = [c for c in (*after.claims_on(subject), *before.claims_on(subject)) if is_kept(c)]
         wanted = None
-        if all(is_kept(claim) for claim in after.of(subject)):
-            wanted = _wanted(own, before.of(subject), world)
+        if all(is_kept(claim) for claim in after.claims_on(subject)):
+            wanted = _wanted(own, before.claims_on(subject), world)
         for claim in own:
             keys.append(claim.key)
             after = after.replace(claim.key, None)

@@ -87,7 +87,7 @@ def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
     connections = {}
     standing = in_force(ledger, config)
     for id in ledger.subjects(SubjectKind.CONNECTION):
-        claims = standing.connection(id)
+        claims = standing.connection_claims(id)
         if not claims:
             continue
         connections[id] = ConnectionEntry(

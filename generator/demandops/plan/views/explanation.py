@@ -66,11 +66,11 @@ def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
     """
     claims: Iterable[Claim]
     if isinstance(release, ServiceRelease):
-        users = (claim for id in release.applications for claim in ledger.application(id))
+        users = (claim for id in release.applications for claim in ledger.application_claims(id))
         claims = [claim for claim in users if _takes(claim, release)]
     else:
         ids = release.connections if isinstance(release, Bridge) else (release.connection,)
-        claims = [claim for id in ids for claim in ledger.connection(id)]
+        claims = [claim for id in ids for claim in ledger.connection_claims(id)]
     return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
 
 

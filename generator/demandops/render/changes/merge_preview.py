@@ -94,7 +94,7 @@ def _claim_files(ledger: Ledger, config: Config) -> dict[ReleaseKey, list[str]]:
     """Return by release the files of the claims that ask for it."""
     found: dict[ReleaseKey, list[str]] = {}
     for subject in (Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)):
-        files = [ledger_format.path_of(claim.key) for claim in ledger.of(subject)]
+        files = [ledger_format.path_of(claim.key) for claim in ledger.claims_on(subject)]
         for key in keys_of(ledger, config, subject):
             found.setdefault(key, []).extend(files)
     return found

@@ -57,7 +57,7 @@ def _told_of(
     faults: Iterable[Fault], snapshot: Snapshot, before: Snapshot, subject: Subject
 ) -> list[Fault]:
     """Return faults of a subject, each told to be in the file of a claim that is another now."""
-    claims = snapshot.state.ledger.of(subject)
+    claims = snapshot.state.ledger.claims_on(subject)
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
     paths = [ledger_format.path_of(claim.key) for claim in (changed or claims)]
     return [found.within(paths[0]) if paths else found for found in faults]
@@ -65,7 +65,7 @@ def _told_of(
 
 def _holding(repo: Repository, snapshot: Snapshot, before: Snapshot, subject: Subject) -> Snapshot:
     ledger, keys = snapshot.state.ledger, snapshot.keys
-    claims = (*before.state.ledger.of(subject), *ledger.of(subject))
+    claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
     known = {ledger_format.path_of(claim.key): claim.key for claim in claims}
     ours = _generators(repo, snapshot, before, known)
     for path, key in known.items():

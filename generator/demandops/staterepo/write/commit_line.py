@@ -209,7 +209,7 @@ class CommitLine:
                 consequence(tried, books, [subject], self.read)
             except InvalidInput as error:
                 problems += error.faults
-                state = replace(state, ledger=state.ledger.restored(subject, books))
+                state = replace(state, ledger=state.ledger.with_claims_from(subject, books))
                 continue
             files |= files_of(state.ledger, ledger, own)
             state = tried
@@ -286,7 +286,7 @@ def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, st
     A lease that counted from the demand could be over before anybody has approved it.
     """
     ledger, files = state.ledger, {}
-    for claim in ledger.unstarted():
+    for claim in ledger.unstarted_claims():
         assert claim.lease is not None  # noqa: S101 - that is what was looked for
         begun = replace(claim, lease=claim.lease.begun(now))
         ledger = ledger.replace(claim.key, begun)
