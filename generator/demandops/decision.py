@@ -27,10 +27,10 @@ from demandops.demand import (
 from demandops.demand.claim import Subject
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, InvalidInput, Refused
-from demandops.ledger import restoration
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Changes, Ledger
-from demandops.ledger.restoration import Restoration
+from demandops.ledger.operations import restoration
+from demandops.ledger.operations.restoration import Restoration
 from demandops.plan import implied_connections
 from demandops.plan.checks import denial, quota
 from demandops.plan.connection_clients import is_bridged

@@ -191,11 +191,16 @@ class Ledger:
                 minutes = minutes.insert(entry[1])
         return Ledger(claims, index, minutes)
 
+    def without(self, claims: Iterable[Claim]) -> Ledger:
+        """Return the ledger without these claims."""
+        ledger = self
+        for claim in claims:
+            ledger = ledger.replace(claim.key, None)
+        return ledger
+
     def with_claims_from(self, subject: Subject, other: Ledger) -> Ledger:
         """Return the ledger with the claims on ``subject`` as they are in ``other``."""
-        ledger = self
-        for claim in self.claims_on(subject):
-            ledger = ledger.replace(claim.key, None)
+        ledger = self.without(self.claims_on(subject))
         for claim in other.claims_on(subject):
             ledger = ledger.replace(claim.key, claim)
         return ledger

@@ -16,7 +16,7 @@ from demandops.demand.demand_request import Operation
 from demandops.demand.lease import Lease
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
-from demandops.ledger.restoration import Restoration
+from demandops.ledger.operations.restoration import Restoration
 from inmemory import NOW, Repo
 from model.goals import Maker
 

@@ -18,8 +18,8 @@ from demandops.demand.claim import KEPT, ClaimKey, SubjectKind
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.decommission import needs
-from demandops.ledger.restoration import Restoration
+from demandops.ledger.operations.decommission import needs
+from demandops.ledger.operations.restoration import Restoration
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.settings import RENDER_VERSION
 

@@ -13,7 +13,7 @@ from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Operation
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.restoration import Restoration
+from demandops.ledger.operations.restoration import Restoration
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.tree import commit_of
 

@@ -28,7 +28,7 @@ from demandops.errors import Fault, Refused, fault
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
 
 
-def release(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+def shut_down(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
     """Release what a shutdown lists; raise :class:`Refused` where nothing of it is held."""
     start = ledger
     keys: list[ClaimKey] = []
