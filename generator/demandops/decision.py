@@ -35,8 +35,8 @@ from demandops.plan import implied_connections
 from demandops.plan.checks import denial, quota
 from demandops.plan.connection_clients import is_bridged
 from demandops.plan.overrides import kept_claims
-from demandops.plan.overrides.claims_in_force import in_force
-from demandops.plan.release_keys import affected, all_keys
+from demandops.plan.overrides.suspended_claims import without_suspended
+from demandops.plan.release_keys import affected_keys, all_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
 from demandops.render.changes.changeset import Read, ReleaseChange
@@ -133,7 +133,7 @@ def decide(
     on_stage("admitted")
     try:
         ledger, changes = _booked(state, request, now)
-        keys = affected(state.ledger, ledger, state.config, changes.subjects())
+        keys = affected_keys(state.ledger, ledger, state.config, changes.subjects())
         made = changeset.of_change(
             state.ledger, ledger, changes.claims, keys, (state.config, state.engine, read)
         )
@@ -169,13 +169,13 @@ def _booked(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger
     Raises:
         Refused: where the books, an override or a quota do not allow it.
     """
-    asked, config = kept_claims.requested(request), state.config
-    ledger, changes = apply(kept_claims.giving_way(state.ledger, asked), request, now)
+    asked, config = kept_claims.requested_subjects(request), state.config
+    ledger, changes = apply(kept_claims.without_kept_claims(state.ledger, asked), request, now)
     refusals = list(denial.faults(request, ledger, changes, config))
     refusals = refusals or list(quota.faults(state.ledger, ledger, changes, config))
     if refusals:
         raise Refused(refusals)
-    return kept_claims.settled(state.ledger, ledger, changes, asked, (config, now))
+    return kept_claims.with_kept_claims(state.ledger, ledger, changes, asked, (config, now))
 
 
 def admit(
@@ -192,7 +192,7 @@ def admit(
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         request, faults = demand_goal.parse(goal)
         request = permission.with_terms(request, config)
-        request = implied_connections.with_connections(request, state.ledger, config)
+        request = implied_connections.with_implied_connections(request, state.ledger, config)
     else:
         parsed, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if parsed is None:
@@ -222,15 +222,17 @@ def form_faults(goal: object) -> list[Fault]:
     return deployment_request_goal.form_faults(goal)
 
 
-def consequence(
+def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: Read
 ) -> changeset.Changeset:
     """Return what a change of the books that a person made asks of the rendered files."""
-    keys = affected(before, state.ledger, state.config, subjects)
+    keys = affected_keys(before, state.ledger, state.config, subjects)
     return changeset.of_change(before, state.ledger, (), keys, (state.config, state.engine, read))
 
 
-def rendered(state: State, standing: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+def rendered_files(
+    state: State, standing: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, str]:
     """Return every generated file that the state asks for.
 
     Args:
@@ -273,7 +275,7 @@ def _uncarried(request: DemandRequest, ledger: Ledger, config: Config) -> Iterat
     """Yield a warning for each input that no connection brings to the application's node."""
     if not request.operation.asks:
         return
-    ledger = in_force(ledger, config)
+    ledger = without_suspended(ledger, config)
     for app in request.applications:
         for foreign in implied_connections.foreign_inputs(app, config):
             topic = foreign.topic
@@ -298,12 +300,12 @@ def _bridged(request: DemandRequest, config: Config) -> Iterator[str]:
                 )
 
 
-def explain(error: InvalidInput) -> str:
+def refusal_text(error: InvalidInput) -> str:
     """Return a refusal as ``<code>: <field>: <remedy>``, one line for each fault."""
     return "\n".join(f"{found.code}: {found}" for found in error.faults)
 
 
-def rehearse(state: State) -> None:
+def try_configuration(state: State) -> None:
     """Try every appdef and every override in force on invented demands.
 
     Raises:

@@ -396,9 +396,9 @@ class TestParameters:
 
     def test_parameters_are_in_the_values(self, books: Books) -> None:
         ledger = self.book(Ledger(), "a", rate=7, title="{{ x }}\n: 'y'", labels=["yes", "1e3"])
-        from demandops.decision import State, rendered
+        from demandops.decision import State, rendered_files
 
-        files = rendered(State(books.config, books.state.engine, ledger))
+        files = rendered_files(State(books.config, books.state.engine, ledger))
         (text,) = (text for path, text in files.items() if "/rec-" in path)
         values = yaml.safe_load(text)["spec"]["values"]
         assert values["rate"] == 7

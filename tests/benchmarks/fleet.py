@@ -16,7 +16,7 @@ import pygit2
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
-from demandops.decision import State, admit, rendered
+from demandops.decision import State, admit, rendered_files
 from demandops.ledger import claim_file as ledger_format
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
@@ -121,7 +121,7 @@ def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
             request = admit(state, goal(edge_id(number), f"v{number:05d}x{place}"))
             ledger, _ = apply(ledger, request, now)
     files |= {ledger_format.path_of(claim.key): ledger_format.write(claim) for claim in ledger}
-    files |= rendered(State(config, state.engine, ledger))
+    files |= rendered_files(State(config, state.engine, ledger))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
     tree = trees.write(repo, None, files)

@@ -18,7 +18,7 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.config.file_model import Frozen, parse_file
 from demandops.config.load import load
 from demandops.config.policy import seconds_of
-from demandops.decision import Decision, State, decide, rendered
+from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, Refused
 from demandops.ledger import claim_file as ledger_format
@@ -203,9 +203,9 @@ class World:
         """Take a configuration in, and write what follows of it."""
         self.state = replace(state, ledger=self.state.ledger)
         empty = replace(state, ledger=Ledger())
-        self._standing = {**_skeleton(), **config, **rendered(empty)}
+        self._standing = {**_skeleton(), **config, **rendered_files(empty)}
         claims = {p: text for p, text in self.files.items() if ledger_format.kind_of(p)}
-        self.files = {**self._standing, **claims, **rendered(self.state)}
+        self.files = {**self._standing, **claims, **rendered_files(self.state)}
 
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
@@ -291,7 +291,7 @@ class World:
             if ledger_format.kind_of(path)
         ]
         assert rebuilt(claims) == self.state.ledger
-        asked = rendered(self.state)
+        asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())
         assert not names, f"these are there and not asked for, or the other way round: {names}"

@@ -22,7 +22,7 @@ from demandops.demand.transport_choice import choose_broker, message_type, misfi
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.ledger import Ledger
 from demandops.plan import naming
-from demandops.plan.release import Address, Bridge, MqttEnd, RosEnd, place
+from demandops.plan.release import Address, Bridge, MqttEnd, RosEnd, node_and_domain
 
 Side = Literal["source", "target"]
 
@@ -42,7 +42,7 @@ class BridgeKey:
     node: str
 
 
-def keys_of(ledger: Ledger, connection: str) -> Iterator[EndKey | BridgeKey]:
+def client_keys(ledger: Ledger, connection: str) -> Iterator[EndKey | BridgeKey]:
     """Yield the clients that run because a connection is held."""
     claims = ledger.connection_claims(connection)
     if not claims:
@@ -72,7 +72,7 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
     return route.read in node.bridged.get(taking, ())
 
 
-def carried(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[str, Route]:
+def carried_routes(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[str, Route]:
     """Return the routes that a connection's clients must carry: those not bridged already.
 
     Raises:
@@ -94,7 +94,7 @@ def carried(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[str, Ro
     return topics
 
 
-def end(ledger: Ledger, config: Config, key: EndKey) -> MqttEnd | RosEnd | None:
+def connection_end(ledger: Ledger, config: Config, key: EndKey) -> MqttEnd | RosEnd | None:
     """Return one end of a connection, or nothing where it carries no topic.
 
     Raises:
@@ -103,7 +103,7 @@ def end(ledger: Ledger, config: Config, key: EndKey) -> MqttEnd | RosEnd | None:
     claims = ledger.connection_claims(key.connection)
     if not claims or claims[0].type is ConnectionType.ZENOH:
         return None
-    topics = carried(claims, config)
+    topics = carried_routes(claims, config)
     if not topics:
         return None
     if claims[0].type is ConnectionType.MQTT:
@@ -129,7 +129,7 @@ def _mqtt_end(
             ]
         )
     own, peer = _own_and_peer(first, key)
-    node, domain = place(config, own)
+    node, domain = node_and_domain(config, own)
     return MqttEnd(
         connection=key.connection,
         side=key.side,
@@ -169,7 +169,7 @@ def _ros_end(ledger: Ledger, config: Config, key: EndKey, topics: dict[str, Rout
                 "another connection id, or widen firstPort and lastPort of its wan",
             )
     own, peer = _own_and_peer(claim, key)
-    node, domain = place(config, own)
+    node, domain = node_and_domain(config, own)
     return RosEnd(
         connection=key.connection,
         side=key.side,
@@ -211,7 +211,7 @@ def _number(connection: str) -> int:
     return int(naming.digest("port", connection), 16)
 
 
-def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
+def zenoh_bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
     """Return a node's Zenoh bridge, or nothing where no connection needs it.
 
     Raises:
@@ -224,7 +224,7 @@ def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
     for id in ledger.connections_at(ConnectionType.ZENOH, key.node):
         claims = ledger.connection_claims(id)
         source, target = claims[0].source, claims[0].target
-        for route in carried(claims, config).values():
+        for route in carried_routes(claims, config).values():
             connections[id] = target if key.node == source else source
             if key.node != route.ends(source, target)[0]:
                 subscribers.add(route.written)
@@ -234,7 +234,7 @@ def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
                 raise Refused([_two_rates(route, id, rate, other, key.node)])
     if not connections:
         return None
-    node, domain = place(config, key.node)
+    node, domain = node_and_domain(config, key.node)
     return Bridge(
         name=naming.object_name("zenoh", key.node),
         node=node,

@@ -22,7 +22,9 @@ from demandops.plan.planner import outputs
 from demandops.plan.release import ServiceKey
 
 
-def with_connections(request: DemandRequest, ledger: Ledger, config: Config) -> DemandRequest:
+def with_implied_connections(
+    request: DemandRequest, ledger: Ledger, config: Config
+) -> DemandRequest:
     """Return the request with a connection for each input that would not arrive otherwise.
 
     One that others hold and that brings the topic already is joined; else the two nodes share one

@@ -19,8 +19,8 @@ from demandops.ledger.ledger import Ledger
 from demandops.plan import connection_clients, naming, parameters
 from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.overrides import effects
-from demandops.plan.overrides.claims_in_force import in_force
-from demandops.plan.release import Release, ServiceKey, ServiceRelease, place
+from demandops.plan.overrides.suspended_claims import without_suspended
+from demandops.plan.release import Release, ServiceKey, ServiceRelease, node_and_domain
 from demandops.plan.release_keys import ReleaseKey, appdef_of, keys_of
 
 
@@ -31,24 +31,26 @@ def plan(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
         Refused: where claims contradict each other in a parameter, or what a claim names is no
             longer in the configuration.
     """
-    ledger = in_force(ledger, config)
+    ledger = without_suspended(ledger, config)
     release = _unshaped(ledger, config, key)
-    return effects.shaped(release, ledger, config) if release else None
+    return effects.apply_overrides(release, ledger, config) if release else None
 
 
-def denied(ledger: Ledger, config: Config, key: ReleaseKey) -> tuple[Release, Override] | None:
+def denied_release(
+    ledger: Ledger, config: Config, key: ReleaseKey
+) -> tuple[Release, Override] | None:
     """Return the release that is needed at ``key`` and the override that denies it, or nothing."""
-    ledger = in_force(ledger, config)
+    ledger = without_suspended(ledger, config)
     release = _unshaped(ledger, config, key)
-    by = effects.denying(release, ledger, config) if release else None
+    by = effects.service_denied_by(release, ledger, config) if release else None
     return (release, by) if release and by else None
 
 
 def _unshaped(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
     if isinstance(key, EndKey):
-        return connection_clients.end(ledger, config, key)
+        return connection_clients.connection_end(ledger, config, key)
     if isinstance(key, BridgeKey):
-        return connection_clients.bridge(ledger, config, key)
+        return connection_clients.zenoh_bridge(ledger, config, key)
     return _service(ledger, config, key)
 
 
@@ -64,7 +66,7 @@ def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease 
         return None
     appdef = appdef_of(config, claims[0].appdef)
     service = appdef.services[key.service]
-    node, domain = place(config, key.node)
+    node, domain = node_and_domain(config, key.node)
     if service.each is not None:
         claims = tuple(claim for claim in claims if _takes(claim, service.each, key))
         inputs = {service.each: _shared_input(claims, service.each, key)}

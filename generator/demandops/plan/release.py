@@ -162,7 +162,7 @@ class Bridge:
 Release = ServiceRelease | MqttEnd | RosEnd | Bridge
 
 
-def place(config: Config, node_id: str) -> tuple[Node, AccessDomain]:
+def node_and_domain(config: Config, node_id: str) -> tuple[Node, AccessDomain]:
     """Return a node and its access domain.
 
     Raises:

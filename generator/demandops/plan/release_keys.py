@@ -15,7 +15,7 @@ from demandops.errors import Refused, fault
 from demandops.ledger.ledger import Ledger
 from demandops.plan import connection_clients
 from demandops.plan.connection_clients import BridgeKey, EndKey
-from demandops.plan.overrides.claims_in_force import in_force
+from demandops.plan.overrides.suspended_claims import without_suspended
 from demandops.plan.release import ServiceKey
 
 ReleaseKey = ServiceKey | EndKey | BridgeKey
@@ -29,15 +29,17 @@ def keys_of(
     Of an application whose definition is gone nobody can say: nothing, or where ``strict`` it is
     refused, for what runs must not stop because somebody deleted a file that it still needs.
     """
-    yield from keys_booked(in_force(ledger, config), config, subject, strict=strict)
+    yield from keys_including_suspended(
+        without_suspended(ledger, config), config, subject, strict=strict
+    )
 
 
-def keys_booked(
+def keys_including_suspended(
     ledger: Ledger, config: Config, subject: Subject, *, strict: bool = False
 ) -> Iterator[ReleaseKey]:
     """Yield what ``subject`` needs by the claims of ``ledger``, suspended or not."""
     if subject.kind is SubjectKind.CONNECTION:
-        yield from connection_clients.keys_of(ledger, subject.id)
+        yield from connection_clients.client_keys(ledger, subject.id)
         return
     claims = ledger.application_claims(subject.id)
     if not claims:
@@ -58,7 +60,7 @@ def keys_booked(
             yield ServiceKey(name, node, source=source, topic=topic)
 
 
-def affected(
+def affected_keys(
     before: Ledger, after: Ledger, config: Config, subjects: Iterable[Subject]
 ) -> tuple[ReleaseKey, ...]:
     """Return every release that a change of ``subjects`` may have added, altered or removed.

@@ -21,11 +21,11 @@ def rehearse(config: Config, engine: Engine) -> None:
     Raises:
         Refused, InvalidInput: naming the template, the values or the override that does not work.
     """
-    invented = trial_demands.releases(config)
+    invented = trial_demands.trial_releases(config)
     faults = [found for made in invented.values() for found in _tried(made, config, engine)]
     for override in () if faults else config.in_force:
         tries = {
-            appdef: list(trial_demands.overridden(override, made, appdef, config))
+            appdef: list(trial_demands.overridden_releases(override, made, appdef, config))
             for appdef, made in invented.items()
         }
         failed = [_tried(made, config, engine) for made in tries.values() if made]

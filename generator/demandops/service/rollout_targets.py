@@ -11,7 +11,7 @@ from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
-from demandops.plan.release_keys import ReleaseKey, affected, all_keys, keys_of
+from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, keys_of
 from demandops.render.gitops.argocd import project_of
 
 
@@ -22,7 +22,7 @@ def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
     keys: dict[ReleaseKey, None] = {}
     for subject in dict.fromkeys(subjects):
         keys |= dict.fromkeys(keys_of(after, config, subject))
-    keys |= dict.fromkeys(affected(before, after, config, decision.changes.subjects()))
+    keys |= dict.fromkeys(affected_keys(before, after, config, decision.changes.subjects()))
     found = []
     for key in keys:
         new = plan(after, config, key)

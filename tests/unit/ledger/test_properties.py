@@ -10,7 +10,7 @@ from datetime import timedelta
 from random import Random
 
 import pytest
-from demandops.decision import Decision, State, rendered
+from demandops.decision import Decision, State, rendered_files
 from demandops.demand.claim import ApplicationClaim, Claim
 from demandops.errors import Refused
 from demandops.ledger import claim_file as ledger_format
@@ -313,11 +313,11 @@ def test_rendering_step_by_step_gives_what_rendering_at_once_gives(
     repo = Repo()
     for request in told(Maker(random).sequence(length)):
         repo.take(request)
-        at_once = rendered(repo.state)
+        at_once = rendered_files(repo.state)
         assert repo.below(*{path.split("/")[0] for path in at_once}) == at_once
         fresh = State.of(repo.state.config, ledger_in(repo))
         assert fresh.ledger == repo.state.ledger
-    assert rendered(fresh) == at_once
+    assert rendered_files(fresh) == at_once
 
 
 @examples(40)

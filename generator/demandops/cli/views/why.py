@@ -109,7 +109,7 @@ def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    known = {*explanation.names(ledger, config), *repo.ever_stopped(str(snapshot.commit))}
+    known = {*explanation.release_names(ledger, config), *repo.ever_stopped(str(snapshot.commit))}
     known |= {id for one in SubjectKind for id in ledger.subjects(one)}
     raise StateRepoError(f"nothing called {shown(name)} runs, or ever did{near(name, known)}")
 
@@ -117,10 +117,10 @@ def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -
 def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
     ledger, config = snapshot.state.ledger, snapshot.state.config
     found = []
-    release = explanation.find(ledger, config, name)
+    release = explanation.release_named(ledger, config, name)
     path = path_of(release) if release else repo.path_called(name, str(snapshot.commit))
     if path is None:  # one that an override denies may never have run
-        stopped = explanation.denied_called(ledger, config, name)
+        stopped = explanation.denied_release_named(ledger, config, name)
         path = path_of(stopped[0]) if stopped else None
     if path is not None:
         found.append(_Asked("release", name, path, release))
@@ -139,7 +139,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Asked:
     if key is not None:
         return _Asked("claim", key.demand, path, subject=key.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    release = explanation.find(snapshot.state.ledger, snapshot.state.config, name)
+    release = explanation.release_named(snapshot.state.ledger, snapshot.state.config, name)
     if release is not None and path_of(release) == path:
         return _Asked("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
@@ -154,7 +154,7 @@ def _denied(snapshot: Snapshot, asked: _Asked) -> dict[str, Any]:
     if asked.kind != "release":
         return {}
     name = asked.path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    stopped = explanation.denied_called(snapshot.state.ledger, snapshot.state.config, name)
+    stopped = explanation.denied_release_named(snapshot.state.ledger, snapshot.state.config, name)
     return why_answer.denied(*stopped) if stopped else {}
 
 

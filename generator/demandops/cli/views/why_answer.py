@@ -9,7 +9,7 @@ from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import Claim, Subject
 from demandops.ledger import claim_file as ledger_format
-from demandops.plan.overrides.claims_in_force import in_force, suspended_by
+from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
 from demandops.render.changes.changeset import described
@@ -24,7 +24,7 @@ _PEOPLES_COMMITS = 5
 def release(snapshot: Snapshot, found: Release) -> dict[str, Any]:
     """Return why a release runs."""
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    claims = explanation.claims_behind(in_force(ledger, config), found)
+    claims = explanation.claims_behind(without_suspended(ledger, config), found)
     return {
         "runs": True,
         "what": described(None, found, stood=False).what,
@@ -33,7 +33,7 @@ def release(snapshot: Snapshot, found: Release) -> dict[str, Any]:
         "claims": [_claim(claim, config) for claim in claims],
         "shaped_by": [
             {"file": one.file, "entry": one.entry or None, "what": one.what}
-            for one in explanation.shaped_by(found, config)
+            for one in explanation.shaping_files(found, config)
         ],
         "overrides": [_override(one, effects) for one, effects in found.shaping.by],
     }
@@ -96,7 +96,7 @@ def _override(override: Override, effects: Iterable[str]) -> dict[str, Any]:
 
 def _claim(claim: Claim, config: Config) -> dict[str, Any]:
     lease = claim.lease
-    suspended, kept = suspended_by(claim, config), explanation.kept_by(claim, config)
+    suspended, kept = suspended_by(claim, config), explanation.keeping_override(claim, config)
     return {
         "subject": str(claim.subject),
         "demand": claim.demand,

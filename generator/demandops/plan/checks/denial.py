@@ -15,10 +15,10 @@ from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, DemandRequest
 from demandops.errors import Fault, fault
 from demandops.ledger.ledger import Changes, Ledger
-from demandops.plan.overrides.claims_in_force import suspended_by
 from demandops.plan.overrides.selectors import Traits, fits, labelled, traits_of
+from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.plan.release import ServiceKey
-from demandops.plan.release_keys import keys_booked
+from demandops.plan.release_keys import keys_including_suspended
 
 
 def faults(
@@ -61,7 +61,7 @@ def _runs(
     """Yield the services that an application would run, as selectors see them."""
     if not isinstance(asked, ApplicationDemand):
         return
-    for key in keys_booked(after, config, subject):
+    for key in keys_including_suspended(after, config, subject):
         if isinstance(key, ServiceKey):
             yield Traits(
                 (key.node,), asked.requesters, (asked.id,), (asked.appdef,), service=key.service

@@ -15,15 +15,15 @@ from demandops.config.policy import matches
 from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
-from demandops.plan.overrides.effects import effects_on, with_overrides
+from demandops.plan.overrides.effects import apply_effects, effects_on
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
-from demandops.plan.release_keys import affected
+from demandops.plan.release_keys import affected_keys
 
 _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
-def releases(config: Config) -> dict[str, list[ServiceRelease]]:
+def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
     """Return appdef → its services for an invented demand on some node, without overrides.
 
     Raises:
@@ -58,13 +58,13 @@ def _services(
         ),
     )
     ledger, changes = apply(Ledger(), request, _NEVER)
-    for key in affected(Ledger(), ledger, config, changes.subjects()):
+    for key in affected_keys(Ledger(), ledger, config, changes.subjects()):
         release = plan(ledger, config, key)
         if isinstance(release, ServiceRelease):
             yield release
 
 
-def overridden(
+def overridden_releases(
     override: Override, invented: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
     """Yield the invented releases of an appdef as an override would have those it may be for."""
@@ -76,6 +76,6 @@ def overridden(
             and (not selector.appdefs or matches(appdef, selector.appdefs))
             for selector in override.select
         ):
-            shaped = with_overrides(release, [(override, effects)], config)
+            shaped = apply_effects(release, [(override, effects)], config)
             if isinstance(shaped, ServiceRelease):
                 yield shaped

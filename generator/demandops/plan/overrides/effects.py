@@ -13,9 +13,17 @@ from demandops.config.config import DDS_ROUTER_IMAGE, MQTT_CLIENT_IMAGE, ZENOH_B
 from demandops.config.override import Override
 from demandops.demand.claim import KEPT, Claim
 from demandops.ledger.ledger import Ledger
-from demandops.plan.overrides.claims_in_force import denied_by
 from demandops.plan.overrides.selectors import Traits, selects
-from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease, Shaping, place
+from demandops.plan.overrides.suspended_claims import denied_by
+from demandops.plan.release import (
+    Bridge,
+    MqttEnd,
+    Release,
+    RosEnd,
+    ServiceRelease,
+    Shaping,
+    node_and_domain,
+)
 
 _CLIENT_IMAGES: dict[type[MqttEnd | RosEnd | Bridge], str] = {
     MqttEnd: MQTT_CLIENT_IMAGE,
@@ -24,7 +32,7 @@ _CLIENT_IMAGES: dict[type[MqttEnd | RosEnd | Bridge], str] = {
 }
 
 
-def shaped(release: Release, ledger: Ledger, config: Config) -> Release | None:
+def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release | None:
     """Return a release as the overrides in force have it, or nothing where one denies it.
 
     Raises:
@@ -34,7 +42,7 @@ def shaped(release: Release, ledger: Ledger, config: Config) -> Release | None:
         return release
     claims = _claims(release, ledger)
     traits = _traits(release, claims)
-    if denying(release, ledger, config) is not None:
+    if service_denied_by(release, ledger, config) is not None:
         return None
     kept = {claim.demand.removeprefix(KEPT) for claim in claims if claim.demand.startswith(KEPT)}
     by = []
@@ -44,17 +52,17 @@ def shaped(release: Release, ledger: Ledger, config: Config) -> Release | None:
             effects = (*effects, "keep")
         if effects:
             by.append((override, effects))
-    return with_overrides(release, by, config)
+    return apply_effects(release, by, config)
 
 
-def denying(release: Release, ledger: Ledger, config: Config) -> Override | None:
+def service_denied_by(release: Release, ledger: Ledger, config: Config) -> Override | None:
     """Return the override that keeps a service from running, or nothing."""
     if not isinstance(release, ServiceRelease) or not any(one.deny for one in config.in_force):
         return None
     return denied_by(_traits(release, _claims(release, ledger)), config)
 
 
-def with_overrides(
+def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
     """Return a release with the effects of these overrides, who comes last wins."""
@@ -71,7 +79,7 @@ def with_overrides(
         if "replicas" in effects and override.replicas is not None:
             release = replace(release, replicas=override.replicas)
         if "node" in effects:
-            node, domain = place(config, str(override.node))
+            node, domain = node_and_domain(config, str(override.node))
             release = replace(release, node=node, domain=domain)
     return release
 

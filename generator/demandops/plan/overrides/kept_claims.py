@@ -16,11 +16,11 @@ from demandops.config.override import Override
 from demandops.demand.claim import KEPT, Claim, ClaimKey, Subject, SubjectKind, is_kept
 from demandops.demand.demand_request import DemandRequest
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
-from demandops.plan.overrides.claims_in_force import suspended_by
 from demandops.plan.overrides.selectors import selects, traits_of
+from demandops.plan.overrides.suspended_claims import suspended_by
 
 
-def requested(request: DemandRequest) -> tuple[Subject, ...]:
+def requested_subjects(request: DemandRequest) -> tuple[Subject, ...]:
     """Return the subjects that a request lists."""
     return (
         *(Subject(SubjectKind.APPLICATION, app.id) for app in request.applications),
@@ -28,7 +28,7 @@ def requested(request: DemandRequest) -> tuple[Subject, ...]:
     )
 
 
-def giving_way(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
+def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
     """Return the ledger without the overrides' own claims on these subjects."""
     for subject in subjects:
         for claim in ledger.claims_on(subject):
@@ -37,7 +37,7 @@ def giving_way(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
     return ledger
 
 
-def settled(
+def with_kept_claims(
     before: Ledger,
     after: Ledger,
     changes: Changes,
@@ -47,11 +47,11 @@ def settled(
     """Return a booking with what overrides keep, or no longer keep, of what it touched."""
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
-    after, more = kept(before, after, touched, world)
+    after, more = update_kept_claims(before, after, touched, world)
     return after, replace(changes, claims=claim_changes(before, after, [*keys, *more]))
 
 
-def kept(
+def update_kept_claims(
     before: Ledger, after: Ledger, subjects: Iterable[Subject], world: tuple[Config, datetime]
 ) -> tuple[Ledger, list[ClaimKey]]:
     """Return ``after`` with just the claims of overrides' own that belong there, and their keys.
@@ -76,7 +76,7 @@ def kept(
     return after, keys
 
 
-def subjects_kept(ledger: Ledger) -> tuple[Subject, ...]:
+def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
     """Return every subject that an override's own claim holds."""
     found = {claim.subject for claim in ledger if is_kept(claim)}
     return tuple(sorted(found, key=str))
@@ -87,14 +87,14 @@ def _wanted(
 ) -> Claim | None:
     config, now = world
     for claim in own:
-        if any(KEPT + one.name == claim.demand for one in keepers(claim, config)):
+        if any(KEPT + one.name == claim.demand for one in keeping_overrides(claim, config)):
             return claim
     if not stood:
         return None
     last = max(stood, key=lambda claim: (claim.booked, claim.demand))
     if suspended_by(last, config) is not None:
         return None
-    for override in keepers(last, config):
+    for override in keeping_overrides(last, config):
         name = KEPT + override.name
         return replace(
             last, demand=name, request=name, requesters=(override.owner,), booked=now, lease=None
@@ -102,7 +102,7 @@ def _wanted(
     return None
 
 
-def keepers(claim: Claim, config: Config) -> list[Override]:
+def keeping_overrides(claim: Claim, config: Config) -> list[Override]:
     """Return the overrides that keep what a claim holds, the highest first.
 
     One of an override's own stands in its owner's name, so there ``requesters`` has been judged.

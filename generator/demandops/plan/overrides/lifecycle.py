@@ -20,7 +20,7 @@ from demandops.plan.overrides import kept_claims
 
 
 @dataclass(frozen=True, slots=True)
-class TakenIn:
+class LedgerUpdate:
     """Books and configuration with what overrides ask of them, and the ledger's files for it."""
 
     ledger: Ledger
@@ -29,13 +29,13 @@ class TakenIn:
     files: Mapping[str, str | None]
 
 
-def taken_in(
+def update_ledger(
     before: tuple[Ledger, Config],
     after: tuple[Ledger, Config],
     subjects: Iterable[Subject],
     marked: Mapping[str, str],
     now: datetime,
-) -> TakenIn:
+) -> LedgerUpdate:
     """Return what a change of the configuration asks of the books.
 
     Args:
@@ -47,7 +47,9 @@ def taken_in(
     ledger, config = after
     known = {one.name: one for one in before[1].in_force}
     late = [
-        one for one in due(config, now) if one.name not in known or known[one.name].end != one.end
+        one
+        for one in expired_overrides(config, now)
+        if one.name not in known or known[one.name].end != one.end
     ]
     gone = ended_override_file.stale(marked, config.overrides)
     ended = {
@@ -59,24 +61,28 @@ def taken_in(
     config = config.with_ended(ended)
     files: dict[str, str | None] = dict.fromkeys(gone)
     files |= {ended_override_file.path_of(one.name): ended_override_file.write(one) for one in late}
-    touched = (*subjects, *kept_claims.subjects_kept(before[0]), *kept_claims.subjects_kept(ledger))
-    settled, keys = kept_claims.kept(before[0], ledger, dict.fromkeys(touched), (config, now))
-    files |= files_of(ledger, settled, keys)
-    return TakenIn(settled, config, tuple(keys), files)
+    touched = (*subjects, *kept_claims.kept_subjects(before[0]), *kept_claims.kept_subjects(ledger))
+    settled, keys = kept_claims.update_kept_claims(
+        before[0], ledger, dict.fromkeys(touched), (config, now)
+    )
+    files |= changed_claim_files(ledger, settled, keys)
+    return LedgerUpdate(settled, config, tuple(keys), files)
 
 
-def ended(state: tuple[Ledger, Config], override: Override, now: datetime) -> TakenIn:
+def end_override(state: tuple[Ledger, Config], override: Override, now: datetime) -> LedgerUpdate:
     """Return books and configuration without an override whose time is over."""
     ledger, config = state
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     after = config.with_ended({**config.ended, override.name: written(override.end)})
-    found = taken_in(state, (ledger, after), (), {}, now)
+    found = update_ledger(state, (ledger, after), (), {}, now)
     marker = {ended_override_file.path_of(override.name): ended_override_file.write(override)}
-    return TakenIn(found.ledger, found.config, found.keys, {**found.files, **marker})
+    return LedgerUpdate(found.ledger, found.config, found.keys, {**found.files, **marker})
 
 
-def files_of(before: Ledger, after: Ledger, keys: Iterable[ClaimKey]) -> dict[str, str | None]:
+def changed_claim_files(
+    before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
+) -> dict[str, str | None]:
     """Return the claim files at ``keys`` that differ (``None``: to remove)."""
     files: dict[str, str | None] = {}
     for key in keys:
@@ -86,7 +92,7 @@ def files_of(before: Ledger, after: Ledger, keys: Iterable[ClaimKey]) -> dict[st
     return files
 
 
-def due(config: Config, now: datetime) -> list[Override]:
+def expired_overrides(config: Config, now: datetime) -> list[Override]:
     """Return the overrides in force whose time is over, the first to end first."""
     over = [(one.end, one.name, one) for one in config.in_force if one.end and one.end <= now]
     return [one for _, _, one in sorted(over, key=lambda item: item[:2])]
@@ -97,7 +103,7 @@ def next_end(config: Config) -> datetime | None:
     return min((one.end for one in config.in_force if one.end), default=None)
 
 
-def differing(before: Config, after: Config) -> list[str]:
+def changed_override_files(before: Config, after: Config) -> list[str]:
     """Return the files of the overrides that came into force, changed or ceased to apply."""
     old = {one.name: one for one in before.in_force}
     new = {one.name: one for one in after.in_force}

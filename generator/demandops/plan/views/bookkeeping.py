@@ -13,7 +13,7 @@ from demandops.config.config import Config
 from demandops.demand.claim import SubjectKind
 from demandops.ledger.ledger import Ledger
 from demandops.plan.connection_clients import connection_topics
-from demandops.plan.overrides.claims_in_force import in_force, suspended
+from demandops.plan.overrides.suspended_claims import suspended_claims, without_suspended
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import all_keys
@@ -85,7 +85,7 @@ def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
                 requesters=release.requesters,
             )
     connections = {}
-    standing = in_force(ledger, config)
+    standing = without_suspended(ledger, config)
     for id in ledger.subjects(SubjectKind.CONNECTION):
         claims = standing.connection_claims(id)
         if not claims:
@@ -104,7 +104,7 @@ def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
 
 
 def _suspended(ledger: Ledger, config: Config) -> Iterator[SuspendedEntry]:
-    for claim, override in suspended(ledger, config):
+    for claim, override in suspended_claims(ledger, config):
         kind = claim.subject.kind.value[:-1]
         yield SuspendedEntry(
             kind,

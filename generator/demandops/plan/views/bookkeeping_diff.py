@@ -25,7 +25,7 @@ class EntryChange:
     gained: tuple[str, ...] = ()
 
 
-def difference(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
+def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
     """Return every entry that differs, services first, each kind sorted by name."""
     return (
         *_changes("service", dict(old.services), dict(new.services)),

@@ -23,13 +23,13 @@ from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.demand.claim import KEPT, ApplicationClaim, Claim, Subject, demand_id, is_kept
 from demandops.ledger.ledger import Ledger
-from demandops.plan.planner import denied, plan
+from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Bridge, MqttEnd, Release, ServiceRelease
 from demandops.plan.release_keys import all_keys, keys_of
 
 
 @dataclass(frozen=True, slots=True)
-class Shaping:
+class ShapingFile:
     """A file that people own, which of its entries shaped a release, and what that says."""
 
     file: str
@@ -37,13 +37,13 @@ class Shaping:
     what: str
 
 
-def find(ledger: Ledger, config: Config, name: str) -> Release | None:
+def release_named(ledger: Ledger, config: Config, name: str) -> Release | None:
     """Return the release of a name, or nothing where none of that name runs."""
     releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
     return next((release for release in releases if release and release.name == name), None)
 
 
-def names(ledger: Ledger, config: Config) -> list[str]:
+def release_names(ledger: Ledger, config: Config) -> list[str]:
     """Return the names of all releases that run."""
     releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
     return [release.name for release in releases if release]
@@ -91,49 +91,53 @@ def how_to_release(claim: Claim) -> str:
     return f"send operation: release for demand '{claim.demand}'"
 
 
-def shaped_by(release: Release, config: Config) -> list[Shaping]:
+def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
     """Return the files of people that say what a release is, and where."""
-    found = [Shaping(ROOT_FILE, "gitops", f"written for {config.repository.gitops}")]
+    found = [ShapingFile(ROOT_FILE, "gitops", f"written for {config.repository.gitops}")]
     of_kind = _service if isinstance(release, ServiceRelease) else _client
     found += of_kind(release, config)
-    found.append(Shaping(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))
+    found.append(ShapingFile(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))
     domain = release.domain
-    return [*found, Shaping(DOMAINS_FILE, domain.name, f"namespace {domain.namespace}")]
+    return [*found, ShapingFile(DOMAINS_FILE, domain.name, f"namespace {domain.namespace}")]
 
 
-def denied_called(ledger: Ledger, config: Config, name: str) -> tuple[Release, Override] | None:
+def denied_release_named(
+    ledger: Ledger, config: Config, name: str
+) -> tuple[Release, Override] | None:
     """Return the release of a name that claims need, and the override that denies it."""
     for key in all_keys(ledger, config):
-        found = denied(ledger, config, key)
+        found = denied_release(ledger, config, key)
         if found is not None and found[0].name == name:
             return found
     return None
 
 
-def kept_by(claim: Claim, config: Config) -> Override | None:
+def keeping_override(claim: Claim, config: Config) -> Override | None:
     """Return the override whose own claim this is, or nothing where somebody asks for it."""
     return config.overrides.get(claim.demand.removeprefix(KEPT)) if is_kept(claim) else None
 
 
-def _service(release: Release, config: Config) -> Iterator[Shaping]:
+def _service(release: Release, config: Config) -> Iterator[ShapingFile]:
     assert isinstance(release, ServiceRelease)  # noqa: S101 - the caller chose by that
     folder = f"appdefs/{release.appdef}"
-    yield Shaping(f"{folder}/appdef.yaml", f"services.{release.key.service}", "what it is")
-    yield Shaping(config.values_template(release.appdef, release.service), "", "its Helm values")
+    yield ShapingFile(f"{folder}/appdef.yaml", f"services.{release.key.service}", "what it is")
+    yield ShapingFile(
+        config.values_template(release.appdef, release.service), "", "its Helm values"
+    )
     chart, name = release.chart, release.service.chart
     where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
-    yield Shaping(CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}")
+    yield ShapingFile(CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}")
     for image in release.service.images:
-        yield Shaping(IMAGES_FILE, f"images.{image}", config.images[image].reference())
+        yield ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
 
 
-def _client(release: Release, config: Config) -> Iterator[Shaping]:
+def _client(release: Release, config: Config) -> Iterator[ShapingFile]:
     image = DDS_ROUTER_IMAGE
     if isinstance(release, Bridge):
         image = ZENOH_BRIDGE_IMAGE
     elif isinstance(release, MqttEnd):
         image = MQTT_CLIENT_IMAGE
         broker = release.broker
-        yield Shaping(BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}")
+        yield ShapingFile(BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}")
     if image in config.images:
-        yield Shaping(IMAGES_FILE, f"images.{image}", config.images[image].reference())
+        yield ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())

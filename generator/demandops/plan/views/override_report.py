@@ -11,11 +11,11 @@ from demandops.config.config import Config
 from demandops.config.override import Override, written
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
-from demandops.plan.overrides.claims_in_force import suspended_by
-from demandops.plan.planner import denied, plan
+from demandops.plan.overrides.suspended_claims import suspended_by
+from demandops.plan.planner import denied_release, plan
 from demandops.plan.release_keys import all_keys
 
-Standing = Literal["in force", "expired", "matches nothing"]
+State = Literal["in force", "expired", "matches nothing"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +23,12 @@ class Entry:
     """An override, and the releases and claims that it is for now."""
 
     override: Override
-    state: Standing
+    state: State
     releases: tuple[str, ...]
     claims: tuple[str, ...]
 
 
-def survey(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
+def override_report(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
     """Return every override that lies there, by name, and what it does."""
     releases = _releases(ledger, config)
     claims = _claims(ledger, config)
@@ -38,7 +38,7 @@ def survey(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
             tuple(sorted(releases.get(name, ()))),
             tuple(sorted(claims.get(name, ()))),
         )
-        standing: Standing = "in force" if any(entry) else "matches nothing"
+        standing: State = "in force" if any(entry) else "matches nothing"
         over = override.end is not None and override.end <= now
         if over or override not in config.in_force:
             standing, entry = "expired", ((), ())
@@ -69,7 +69,7 @@ def _releases(ledger: Ledger, config: Config) -> dict[str, set[str]]:
             for override, _ in release.shaping.by:
                 found.setdefault(override.name, set()).add(release.name)
             continue
-        stopped = denied(ledger, config, key)
+        stopped = denied_release(ledger, config, key)
         if stopped is not None:
             found.setdefault(stopped[1].name, set()).add(stopped[0].name)
     return found
@@ -79,7 +79,7 @@ def _claims(ledger: Ledger, config: Config) -> dict[str, set[str]]:
     """Return override → the subjects that it suspends, or would keep."""
     found: dict[str, set[str]] = {}
     for claim in ledger:
-        by = [suspended_by(claim, config), *kept_claims.keepers(claim, config)]
+        by = [suspended_by(claim, config), *kept_claims.keeping_overrides(claim, config)]
         for override in by:
             if override is not None:
                 found.setdefault(override.name, set()).add(f"{claim.subject} of {claim.demand}")

@@ -16,7 +16,7 @@ import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.config.config import CONFIG_ROOTS, Config
-from demandops.decision import State, rendered
+from demandops.decision import State, rendered_files
 from demandops.demand.claim import Claim
 from demandops.errors import InvalidInput
 from demandops.ledger import claim_file as ledger_format
@@ -164,7 +164,7 @@ class _Row:
         proof, self._proof = self._proof, None
         if alone:
             state = self._loaded(commit, entry)
-            files = rendered(state, _held_from(commit, state.config))
+            files = rendered_files(state, _held_from(commit, state.config))
             wanted = {path: _blob(text) for path, text in files.items()}
             return _differing(wanted, dict(_standing(commit.tree)))
         if proof is None or _reconfigured(proof, commit):

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pygit2 import Repository
 from pygit2.enums import SortMode
 
-from demandops.decision import State, consequence
+from demandops.decision import State, changeset_of_edit
 from demandops.demand.claim import Claim, Subject
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file as ledger_format
@@ -47,7 +47,7 @@ def held_back(
 
 def _faults(state: State, before: Snapshot, subject: Subject, read: Read) -> tuple[Fault, ...]:
     try:
-        consequence(state, before.state.ledger, [subject], read)
+        changeset_of_edit(state, before.state.ledger, [subject], read)
     except InvalidInput as error:
         return error.faults
     return ()

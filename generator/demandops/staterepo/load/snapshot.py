@@ -16,7 +16,7 @@ from rpds import HashTrieMap
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load as load_config
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.decision import State, rehearse
+from demandops.decision import State, try_configuration
 from demandops.demand.claim import Claim, ClaimKey, Subject
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file as ledger_format
@@ -255,7 +255,7 @@ def _tried(files: Mapping[str, str], state: State) -> Config:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config = load_config(files)
     if config.with_ended(state.config.ended) != state.config:
-        rehearse(State.of(config, Ledger()))
+        try_configuration(State.of(config, Ledger()))
     return config
 
 

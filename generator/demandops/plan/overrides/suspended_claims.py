@@ -20,7 +20,7 @@ _MOST_JUDGED = 100_000
 
 
 @dataclass(frozen=True, slots=True)
-class ClaimsInForce(Ledger):
+class UnsuspendedClaims(Ledger):
     """A ledger that does not show suspended claims. For reading only."""
 
     config: Config | None = field(default=None, compare=False)
@@ -43,11 +43,11 @@ class ClaimsInForce(Ledger):
         return self.config is None or suspended_by(claim, self.config) is None
 
 
-def in_force(ledger: Ledger, config: Config) -> Ledger:
+def without_suspended(ledger: Ledger, config: Config) -> Ledger:
     """Return what of the books is planned; the ledger itself where nothing denies a claim."""
-    if isinstance(ledger, ClaimsInForce) or not any(one.deny for one in config.in_force):
+    if isinstance(ledger, UnsuspendedClaims) or not any(one.deny for one in config.in_force):
         return ledger
-    return ClaimsInForce(ledger.claims, ledger.index, ledger.minutes, config)
+    return UnsuspendedClaims(ledger.claims, ledger.index, ledger.minutes, config)
 
 
 def suspended_by(claim: Claim, config: Config) -> Override | None:
@@ -79,7 +79,7 @@ def denied_by(traits: Traits, config: Config) -> Override | None:
     return None
 
 
-def suspended(ledger: Ledger, config: Config) -> Iterator[tuple[Claim, Override]]:
+def suspended_claims(ledger: Ledger, config: Config) -> Iterator[tuple[Claim, Override]]:
     """Yield every suspended claim, sorted, and the override that suspends it."""
     if not any(one.deny for one in config.in_force):
         return
