@@ -21,7 +21,7 @@ from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, Refused
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.service.timing.lease_expiry import LeaseClock
@@ -204,7 +204,7 @@ class World:
         self.state = replace(state, ledger=self.state.ledger)
         empty = replace(state, ledger=Ledger())
         self._standing = {**_skeleton(), **config, **rendered_files(empty)}
-        claims = {p: text for p, text in self.files.items() if ledger_format.kind_of(p)}
+        claims = {p: text for p, text in self.files.items() if claim_file.kind_of(p)}
         self.files = {**self._standing, **claims, **rendered_files(self.state)}
 
     def restart(self) -> None:
@@ -286,9 +286,9 @@ class World:
     def assert_sound(self) -> None:
         """The files say what the books say, and nothing else is there."""
         claims = [
-            ledger_format.read(text, path)
+            claim_file.read(text, path)
             for path, text in self.files.items()
-            if ledger_format.kind_of(path)
+            if claim_file.kind_of(path)
         ]
         assert rebuilt(claims) == self.state.ledger
         asked = rendered_files(self.state)

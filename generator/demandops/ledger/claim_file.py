@@ -126,7 +126,7 @@ class _ConnectionFile(_Claim):
     topics: dict[str, Annotated[_Route, BeforeValidator(_plain_route)]] = Field(min_length=1)
 
 
-def write(claim: Claim) -> str:
+def text_of(claim: Claim) -> str:
     """Return the text of a claim's file; the same claim gives the same bytes."""
     head: dict[str, Any] = {"apiVersion": LEDGER_API_VERSION}
     tail: dict[str, Any]

@@ -32,7 +32,7 @@ def path_of(name: str) -> str:
     return f"{MARKERS_ROOT}/{name}.yaml"
 
 
-def write(override: Override) -> str:
+def text_of(override: Override) -> str:
     """Return the text that says that an override ended at the time that it names."""
     assert override.end is not None  # noqa: S101 - only such a one ends
     return strict_yaml.dump(
@@ -62,7 +62,7 @@ def read(files: Mapping[str, str]) -> dict[str, str]:
     return ended
 
 
-def stale(paths: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
+def stale_markers(paths: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
     """Return the markers whose override is gone, or names another time by now."""
     ended = read(paths)
     fitting = {

@@ -119,7 +119,7 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     from asking import NOW
     from demandops.decision import decide
     from demandops.demand.approval_rule import proposed
-    from demandops.ledger import claim_file as ledger_format
+    from demandops.ledger import claim_file
 
     books = Books(policy(approval="required"))
     decision = decide(books.state, put(lease=60), NOW, books.files.get)
@@ -130,10 +130,10 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     assert claim.lease is not None
     assert claim.lease.until == UNSTARTED
     assert not claim.lease.has_started
-    path = ledger_format.path_of(claim.key)
-    text = ledger_format.write(claim)
+    path = claim_file.path_of(claim.key)
+    text = claim_file.text_of(claim)
     assert "until" not in text
-    assert ledger_format.read(text, path) == claim
+    assert claim_file.read(text, path) == claim
     found = {one.key for one in waiting.state.ledger.unstarted_claims()}
     assert found == {one.key for one in waiting.state.ledger.claims_of_demand("d")}
     later = claim.lease.begun(NOW)

@@ -18,7 +18,7 @@ from demandops.demand.demand_request import (
 )
 from demandops.demand.route import Route, united
 from demandops.errors import InvalidInput, Refused
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
 
@@ -59,17 +59,17 @@ class TestFiles:
 
     def test_topics_stay_readable(self) -> None:
         held = claim(Route("/b", "/c", qos=1, rate=0.5), Route("/a", "/b"))
-        text = ledger_format.write(held)
+        text = claim_file.text_of(held)
         assert text.endswith(
             "topics:\n  /a: /b\n  /b:\n    target: /c\n    qos: 1\n    rate: 0.5\n"
         )
-        assert ledger_format.read(text, ledger_format.path_of(held.key)) == held
+        assert claim_file.read(text, claim_file.path_of(held.key)) == held
 
     def test_a_file_of_before_there_were_options_is_read(self) -> None:
         held = claim(Route("/a", "/b"))
-        text = ledger_format.write(held)
+        text = claim_file.text_of(held)
         assert yaml.safe_load(text)["topics"] == {"/a": "/b"}
-        assert ledger_format.read(text, ledger_format.path_of(held.key)) == held
+        assert claim_file.read(text, claim_file.path_of(held.key)) == held
 
     @pytest.mark.parametrize(
         ("written", "expected"),
@@ -84,18 +84,18 @@ class TestFiles:
     )
     def test_they_are_read_strictly(self, written: str, expected: str) -> None:
         held = claim(Route("/a", "/b"))
-        text = ledger_format.write(held).replace("/a: /b", f"/a: {written}")
-        path = ledger_format.path_of(held.key)
+        text = claim_file.text_of(held).replace("/a: /b", f"/a: {written}")
+        path = claim_file.path_of(held.key)
         with pytest.raises(InvalidInput) as invalid:
-            ledger_format.read(text, path)
+            claim_file.read(text, path)
         (found,) = invalid.value.faults
         assert str(found).startswith(f"{path}: {expected}")
 
     def test_a_claim_of_a_type_that_is_open_is_not_read(self) -> None:
         held = claim(Route("/a", "/b"))
-        text = ledger_format.write(held).replace("type: mqtt", "type: auto")
+        text = claim_file.text_of(held).replace("type: mqtt", "type: auto")
         with pytest.raises(InvalidInput, match="type: is 'auto', but must be"):
-            ledger_format.read(text, ledger_format.path_of(held.key))
+            claim_file.read(text, claim_file.path_of(held.key))
 
 
 class TestContradictions:

@@ -19,7 +19,7 @@ from demandops.cli.output import (
 from demandops.cli.views import why_answer
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import StateRepoError, near, shown
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
 from demandops.render.gitops.paths import path_of
@@ -97,7 +97,7 @@ def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -
     Raises:
         StateRepoError: where it means nothing, or several things.
     """
-    if name.startswith(("clusters/", "bootstrap/", f"{ledger_format.LEDGER_ROOT}/")):
+    if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     found = [one for one in _by_name(repo, snapshot, name) if kind in (None, one.kind)]
     running = [one for one in found if one.release or _is_held(snapshot, one)]
@@ -126,7 +126,7 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
         found.append(_Asked("release", name, path, release))
     for kind in SubjectKind:
         subject = Subject(kind, name)
-        folder = ledger_format.folder_of(subject)
+        folder = claim_file.folder_of(subject)
         if ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
             found.append(_Asked(kind.value[:-1], name, folder, subject=subject))
     return found
@@ -146,7 +146,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Asked:
         raise StateRepoError(f"{shown(path)} is no file of the state repo, and never was")
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return _Asked("file", path, path)
-    return _Asked("claim" if ledger_format.kind_of(path) else "release", name, path)
+    return _Asked("claim" if claim_file.kind_of(path) else "release", name, path)
 
 
 def _denied(snapshot: Snapshot, asked: _Asked) -> dict[str, Any]:

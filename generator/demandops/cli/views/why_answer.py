@@ -8,7 +8,7 @@ from typing import Any
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import Claim, Subject
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
@@ -104,7 +104,7 @@ def _claim(claim: Claim, config: Config) -> dict[str, Any]:
         "requesters": list(claim.requesters),
         "since": claim.booked.isoformat(),
         "lease": {"seconds": lease.seconds, "until": lease.until.isoformat()} if lease else None,
-        "file": ledger_format.path_of(claim.key),
+        "file": claim_file.path_of(claim.key),
         "release_by": explanation.how_to_release(claim),
         "kept_by": _override(kept, ("keep",)) if kept else None,
         "suspended_by": _override(suspended, ("deny",)) if suspended else None,

@@ -28,38 +28,41 @@ def decommission(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple
     assert leaving is not None  # noqa: S101 - a request to decommission says what
     start, claims = ledger, dict[str, Claim]()
     if "node" in leaving.kinds:
-        claims |= {f"{c.subject} {c.demand}": c for c in claims_at(ledger, leaving.name)}
+        claims |= {f"{c.subject} {c.demand}": c for c in claims_needing(ledger, leaving.name)}
     if "requester" in leaving.kinds:
         held = ledger.claims_of_requester(leaving.name)
         claims |= {f"{c.subject} {c.demand}": c for c in held}
     for claim in claims.values():
-        ledger = ledger.replace(claim.key, _left_of(claim, leaving, now))
+        ledger = ledger.replace(claim.key, _reduced(claim, leaving, now))
     changes = claim_changes(start, ledger, [claim.key for claim in claims.values()])
     if not changes:
         raise Refused([_nothing_held(start, leaving)])
     return ledger, Changes(claims=changes)
 
 
-def claims_at(ledger: Ledger, node: str) -> list[Claim]:
+def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
     """Return the claims that need a node, in no order."""
     subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.applications_at(node)]
     subjects += [Subject(SubjectKind.CONNECTION, id) for id in ledger.connections_needing(node)]
     return [
-        claim for subject in subjects for claim in ledger.claims_on(subject) if needs(claim, node)
+        claim
+        for subject in subjects
+        for claim in ledger.claims_on(subject)
+        if needs_node(claim, node)
     ]
 
 
-def needs(claim: Claim, node: str) -> bool:
+def needs_node(claim: Claim, node: str) -> bool:
     """Tell whether a claim cannot stand as it is without a node."""
     if isinstance(claim, ApplicationClaim):
         return claim.node == node or any(t.source == node for _, t in claim.all_inputs())
     return node in (claim.source, claim.target, claim.broker)
 
 
-def _left_of(claim: Claim, leaving: Leaving, now: datetime) -> Claim | None:
+def _reduced(claim: Claim, leaving: Leaving, now: datetime) -> Claim | None:
     if "requester" in leaving.kinds and leaving.name in claim.requesters:
         return None
-    return _without_node(claim, leaving.name, now) if needs(claim, leaving.name) else claim
+    return _without_node(claim, leaving.name, now) if needs_node(claim, leaving.name) else claim
 
 
 def _without_node(claim: Claim, node: str, now: datetime) -> Claim | None:

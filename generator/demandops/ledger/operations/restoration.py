@@ -57,10 +57,10 @@ def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
     if not request.drop_newer:
         newer = [c for c in changes if c.before is not None and not is_kept(c.before)]
         if newer:
-            raise Refused(_newer(newer))
+            raise Refused(_newer_faults(newer))
     start = ledger
     for change in changes:
-        ledger = ledger.replace(change.key, _fresh(change, now))
+        ledger = ledger.replace(change.key, _with_full_lease(change, now))
     return ledger, Changes(claims=claim_changes(start, ledger, [change.key for change in changes]))
 
 
@@ -69,11 +69,11 @@ def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
     wanted = {claim.key: claim for claim in request.claims}
     gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in wanted]
     back = [ClaimChange(ledger.get(key), claim) for key, claim in wanted.items()]
-    back = [change for change in back if not _alike(change.before, change.after)]
+    back = [change for change in back if not _same(change.before, change.after)]
     return sorted([*gone, *back], key=lambda change: path_of(change.key))
 
 
-def _alike(one: Claim | None, other: Claim | None) -> bool:
+def _same(one: Claim | None, other: Claim | None) -> bool:
     if one is None or other is None:
         return one is other
     if is_kept(one):  # when it was kept is no part of what is asked
@@ -81,7 +81,7 @@ def _alike(one: Claim | None, other: Claim | None) -> bool:
     return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
 
 
-def _fresh(change: ClaimChange, now: datetime) -> Claim | None:
+def _with_full_lease(change: ClaimChange, now: datetime) -> Claim | None:
     claim = change.after
     if claim is None or claim.lease is None:
         return claim
@@ -90,7 +90,7 @@ def _fresh(change: ClaimChange, now: datetime) -> Claim | None:
     return replace(claim, lease=lease)
 
 
-def _newer(changes: list[ClaimChange]) -> Iterator[Fault]:
+def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
     for change in changes[:_SHOWN]:
         claim = change.before
         assert claim is not None  # noqa: S101 - the caller chose those
@@ -111,13 +111,13 @@ def faults(request: Restoration, ledger: Ledger, config: Config) -> Iterator[Fau
     for change in _changes(ledger, request):
         if change.after is None or is_kept(change.after):  # overrides keep or drop their own
             continue
-        asked = _asked(change.after)
+        asked = _request_for(change.after)
         for found in (*admission.faults(asked, config), *permission.faults(asked, config)):
             field = found.field.partition("].")[2] or found.field
             yield replace(found, field=field).within(path_of(change.key))
 
 
-def _asked(claim: Claim) -> DemandRequest:
+def _request_for(claim: Claim) -> DemandRequest:
     """Return the request that would book a claim today."""
     applications: Iterable[ApplicationDemand] = ()
     connections: Iterable[ConnectionDemand] = ()

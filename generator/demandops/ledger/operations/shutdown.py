@@ -35,14 +35,14 @@ def shut_down(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Le
     not_held: list[str] = []
     for subject, asked in _listed(request):
         # looked up in what was held at first: a second listing of a subject means the same claim
-        claim = _meant(start.claims_on(subject), request.id, asked)
+        claim = _matching_claim(start.claims_on(subject), request.id, asked)
         if claim is None:
             not_held.append(f"{subject} for {', '.join(asked.requesters)}")
             continue
-        not_held += [f"{subject}: {name}" for name in _subtracted(claim, asked, now)[1]]
+        not_held += [f"{subject}: {name}" for name in _subtract(claim, asked, now)[1]]
         left = ledger.get(claim.key)
         if left is not None:
-            ledger = ledger.replace(claim.key, _subtracted(left, asked, now)[0])
+            ledger = ledger.replace(claim.key, _subtract(left, asked, now)[0])
         keys.append(claim.key)
     changes = claim_changes(start, ledger, keys)
     if not changes:
@@ -50,17 +50,17 @@ def shut_down(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Le
     return ledger, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
 
 
-Asked: TypeAlias = ApplicationDemand | ConnectionDemand
+Demanded: TypeAlias = ApplicationDemand | ConnectionDemand
 
 
-def _listed(request: DemandRequest) -> Iterator[tuple[Subject, Asked]]:
+def _listed(request: DemandRequest) -> Iterator[tuple[Subject, Demanded]]:
     for app in request.applications:
         yield Subject(SubjectKind.APPLICATION, app.id), app
     for connection in request.connections:
         yield Subject(SubjectKind.CONNECTION, connection.id), connection
 
 
-def _meant(claims: Iterable[Claim], request: str, asked: Asked) -> Claim | None:
+def _matching_claim(claims: Iterable[Claim], request: str, asked: Demanded) -> Claim | None:
     """Return the claim that a shutdown means, or nothing: nothing is ever released by guess."""
     claims = [claim for claim in claims if _same_ends(claim, asked)]
     requesters = set(asked.requesters)
@@ -75,7 +75,7 @@ def _meant(claims: Iterable[Claim], request: str, asked: Asked) -> Claim | None:
     return meant[0] if len(meant) == 1 else None
 
 
-def _same_ends(claim: Claim, asked: Asked) -> bool:
+def _same_ends(claim: Claim, asked: Demanded) -> bool:
     if isinstance(claim, ApplicationClaim) and isinstance(asked, ApplicationDemand):
         return asked.node in ("", claim.node) and asked.appdef == claim.appdef
     if isinstance(claim, ConnectionClaim) and isinstance(asked, ConnectionDemand):
@@ -87,16 +87,16 @@ def _same_ends(claim: Claim, asked: Asked) -> bool:
     return False
 
 
-def _subtracted(claim: Claim, asked: Asked, now: datetime) -> tuple[Claim | None, list[str]]:
+def _subtract(claim: Claim, asked: Demanded, now: datetime) -> tuple[Claim | None, list[str]]:
     """Return what remains of ``claim`` (nothing: it is dropped) and what of it was not held."""
     if isinstance(claim, ApplicationClaim) and isinstance(asked, ApplicationDemand):
-        return _subtracted_inputs(claim, asked, now)
+        return _subtract_inputs(claim, asked, now)
     if isinstance(claim, ConnectionClaim) and isinstance(asked, ConnectionDemand):
-        return _subtracted_topics(claim, asked, now)
+        return _subtract_topics(claim, asked, now)
     raise AssertionError("a claim and what is asked are of one kind")  # pragma: no cover
 
 
-def _subtracted_inputs(
+def _subtract_inputs(
     claim: ApplicationClaim, asked: ApplicationDemand, now: datetime
 ) -> tuple[Claim | None, list[str]]:
     if not any(asked.inputs.values()):
@@ -121,7 +121,7 @@ def _subtracted_inputs(
     return replace(claim, inputs=MappingProxyType(rest), booked=now), missing
 
 
-def _subtracted_topics(
+def _subtract_topics(
     claim: ConnectionClaim, asked: ConnectionDemand, now: datetime
 ) -> tuple[Claim | None, list[str]]:
     if not asked.topics:

@@ -13,8 +13,7 @@ from datetime import datetime
 from demandops.config.config import Config
 from demandops.config.override import Override, written
 from demandops.demand.claim import ClaimKey, Subject
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger import ended_override_file
+from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 
@@ -51,7 +50,7 @@ def update_ledger(
         for one in expired_overrides(config, now)
         if one.name not in known or known[one.name].end != one.end
     ]
-    gone = ended_override_file.stale(marked, config.overrides)
+    gone = ended_override_file.stale_markers(marked, config.overrides)
     ended = {
         name: end
         for name, end in config.ended.items()
@@ -60,7 +59,9 @@ def update_ledger(
     ended |= {one.name: written(one.end) for one in late if one.end}
     config = config.with_ended(ended)
     files: dict[str, str | None] = dict.fromkeys(gone)
-    files |= {ended_override_file.path_of(one.name): ended_override_file.write(one) for one in late}
+    files |= {
+        ended_override_file.path_of(one.name): ended_override_file.text_of(one) for one in late
+    }
     touched = (*subjects, *kept_claims.kept_subjects(before[0]), *kept_claims.kept_subjects(ledger))
     settled, keys = kept_claims.update_kept_claims(
         before[0], ledger, dict.fromkeys(touched), (config, now)
@@ -76,7 +77,7 @@ def end_override(state: tuple[Ledger, Config], override: Override, now: datetime
         raise ValueError(f"{override.path} has no end")
     after = config.with_ended({**config.ended, override.name: written(override.end)})
     found = update_ledger(state, (ledger, after), (), {}, now)
-    marker = {ended_override_file.path_of(override.name): ended_override_file.write(override)}
+    marker = {ended_override_file.path_of(override.name): ended_override_file.text_of(override)}
     return LedgerUpdate(found.ledger, found.config, found.keys, {**found.files, **marker})
 
 
@@ -88,7 +89,7 @@ def changed_claim_files(
     for key in keys:
         claim = after.get(key)
         if claim != before.get(key):
-            files[ledger_format.path_of(key)] = ledger_format.write(claim) if claim else None
+            files[claim_file.path_of(key)] = claim_file.text_of(claim) if claim else None
     return files
 
 

@@ -13,7 +13,7 @@ from typing import Literal
 from demandops.config.config import Config
 from demandops.demand.route import Route
 from demandops.errors import Refused
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
@@ -72,9 +72,7 @@ def of_change(
     """
     config, engine, read = world
     files: dict[str, str | None] = {
-        ledger_format.path_of(change.key): ledger_format.write(change.after)
-        if change.after
-        else None
+        claim_file.path_of(change.key): claim_file.text_of(change.after) if change.after else None
         for change in claims
     }
     releases = []

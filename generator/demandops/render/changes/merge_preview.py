@@ -14,7 +14,7 @@ from demandops import strict_yaml
 from demandops.config.config import Config
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import Fault, InvalidInput
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
@@ -94,7 +94,7 @@ def _claim_files(ledger: Ledger, config: Config) -> dict[ReleaseKey, list[str]]:
     """Return by release the files of the claims that ask for it."""
     found: dict[ReleaseKey, list[str]] = {}
     for subject in (Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)):
-        files = [ledger_format.path_of(claim.key) for claim in ledger.claims_on(subject)]
+        files = [claim_file.path_of(claim.key) for claim in ledger.claims_on(subject)]
         for key in keys_of(ledger, config, subject):
             found.setdefault(key, []).extend(files)
     return found

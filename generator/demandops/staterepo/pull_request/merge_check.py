@@ -20,8 +20,7 @@ from demandops.config.override import written
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger import ended_override_file
+from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.lifecycle import expired_overrides, update_ledger
 from demandops.plan.release import Release
@@ -120,10 +119,10 @@ def _generated(path: str) -> bool:
 def _ledger(files: Mapping[str, str], faults: list[Fault]) -> Ledger:
     ledger = Ledger()
     for path, text in sorted(files.items()):
-        if ledger_format.kind_of(path) is None:
+        if claim_file.kind_of(path) is None:
             continue
         try:
-            claim = ledger_format.read(text, path)
+            claim = claim_file.read(text, path)
         except InvalidInput as error:
             faults += error.faults
         else:
@@ -169,7 +168,7 @@ def _taken_in(
         claim.subject
         for books in (old, new)
         for claim in books
-        if ledger_format.path_of(claim.key) in changed
+        if claim_file.path_of(claim.key) in changed
     ]
     before, after = (old, start.state.config), (new, state.config)
     taken = update_ledger(before, after, dict.fromkeys(subjects), _marked(files), now)

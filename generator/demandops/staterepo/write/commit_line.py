@@ -22,7 +22,7 @@ from demandops.config.override import Override
 from demandops.decision import Decision, State, changeset_of_edit, rendered_files
 from demandops.demand.claim import ClaimKey, Subject
 from demandops.errors import Fault, InvalidInput, StateRepoError
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.lifecycle import (
@@ -301,7 +301,7 @@ def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, st
         assert claim.lease is not None  # noqa: S101 - that is what was looked for
         begun = replace(claim, lease=claim.lease.begun(now))
         ledger = ledger.replace(claim.key, begun)
-        files[ledger_format.path_of(claim.key)] = ledger_format.write(begun)
+        files[claim_file.path_of(claim.key)] = claim_file.text_of(begun)
     return replace(state, ledger=ledger), files
 
 
