@@ -260,8 +260,8 @@ def test_a_list_of_the_message_that_it_does_not_take_is_refused(books: Books) ->
 def test_another_kind_for_a_claimed_application_is_refused(books: Books) -> None:
     books.send(goal([record("edge/x")]))
     assert books.faults(goal([application("edge/x", who=["vehicle01"])])) == [
-        "apps[0].type: 'object-detection-fusion' contradicts what stands: 'edge/x' is held by "
-        "vehicle00 as 'recorder'; use another application id"
+        "apps[0].type: 'object-detection-fusion' contradicts an existing claim: 'edge/x' is held "
+        "by vehicle00 as 'recorder'; use another application id"
     ]
 
 

@@ -251,7 +251,8 @@ def zenoh_bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | Non
 def _two_rates(route: Route, id: str, rate: float, other: str, node: str) -> Fault:
     return fault(
         "connections",
-        f"rate {route.rate} of '{route.read}' in '{id}' contradicts what stands: '{other}' carries "
+        f"rate {route.rate} of '{route.read}' in '{id}' contradicts an existing claim: '{other}' "
+        "carries "
         f"it from '{node}' with rate {rate}, and the node's bridge has one for each topic; use the "
         "same",
         code="conflict",

@@ -359,7 +359,7 @@ def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(
         gone = two.branch
         petra.merge(one.branch)
         assert one.outcome() == "booked"
-        with pytest.raises(Refused, match="contradicts what stands"):
+        with pytest.raises(Refused, match="contradicts an existing claim"):
             rig.receipt(two.ticket)
         rig.wait_until(lambda: gone not in branches(bare), "the branch is taken away")
 

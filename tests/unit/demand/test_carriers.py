@@ -195,7 +195,8 @@ class TestZenoh:
         before, _ = demanding.decide(before, asked, NOW, lambda path: None)
         other = demand("zenoh", {"/a": {"rate": 2}}, id="d", target="cloud")
         assert faults(before, other) == [
-            "connections: rate 2.0 of '/a' in 'd' contradicts what stands: 'c' carries it from "
+            "connections: rate 2.0 of '/a' in 'd' contradicts an existing claim: 'c' carries it "
+            "from "
             "'vehicle00' with rate 5.0, and the node's bridge has one for each topic; use the same"
         ]
 

@@ -118,8 +118,8 @@ class TestContradictions:
         value: Any = yaml.safe_load(stands)
         ledger = joined(Ledger(), Route("/a", "/b", **{option: value}))
         assert refusal(ledger, Route("/a", "/b")) == [
-            f"connections[0].topics[0].{option}: {option} {asked} of '/a' contradicts what stands: "
-            f"'c' is held by v with {option} {stands}; use the same, or a second connection"
+            f"connections[0].topics[0].{option}: {option} {asked} of '/a' contradicts an existing "
+            f"claim: 'c' is held by v with {option} {stands}; use the same, or a second connection"
         ]
         assert joined(ledger, Route("/a", "/b", **{option: value}), who="w") != ledger
 

@@ -12,55 +12,55 @@ from demandops.errors import Fault, fault
 
 
 def application_conflicts(
-    where: str, app: ApplicationDemand, standing: Iterable[ApplicationClaim]
+    where: str, app: ApplicationDemand, existing: Iterable[ApplicationClaim]
 ) -> Iterator[Fault]:
-    """Yield what of a demanded application contradicts claims that stand on it."""
-    for claim in standing:
+    """Yield why a demanded application contradicts existing claims on it."""
+    for claim in existing:
         held = f"'{app.id}' is held by {', '.join(claim.requesters)}"
         if claim.node != app.node:
             yield fault(
                 f"{where}.node",
-                f"'{app.node}' contradicts what stands: {held} on '{claim.node}'; ask for that "
-                "node, or wait until it is released",
+                f"'{app.node}' contradicts an existing claim: {held} on '{claim.node}'; ask for "
+                "that node, or wait until it is released",
                 code="conflict",
             )
             return
         if claim.appdef != app.appdef:
             yield fault(
                 f"{where}.appdef",
-                f"'{app.appdef}' contradicts what stands: {held} as '{claim.appdef}'; use another "
-                "application id",
+                f"'{app.appdef}' contradicts an existing claim: {held} as '{claim.appdef}'; use "
+                "another application id",
                 code="conflict",
             )
             return
         if claim.version != app.version:
             yield fault(
                 f"{where}.version",
-                f"'{app.version}' contradicts what stands: {held} in version '{claim.version}'; "
-                "ask for the same, or use another application id",
+                f"'{app.version}' contradicts an existing claim: {held} in version "
+                f"'{claim.version}'; ask for the same, or use another application id",
                 code="conflict",
             )
             return
 
 
 def connection_conflicts(
-    where: str, asked: ConnectionDemand, standing: Iterable[ConnectionClaim]
+    where: str, asked: ConnectionDemand, existing: Iterable[ConnectionClaim]
 ) -> Iterator[Fault]:
-    """Yield what of a demanded connection contradicts claims that stand on it."""
-    for claim in standing:
+    """Yield why a demanded connection contradicts existing claims on it."""
+    for claim in existing:
         held = f"'{asked.id}' is held by {', '.join(claim.requesters)}"
-        for name, wanted, stands in (
+        for name, wanted, current in (
             ("type", ConnectionType(asked.type).name, claim.type.name),
             ("source", asked.source, claim.source),
             ("target", asked.target, claim.target),
             ("broker", asked.broker, claim.broker),
         ):
-            if wanted == stands or (name == "broker" and not (wanted and stands)):
+            if wanted == current or (name == "broker" and not (wanted and current)):
                 continue
             yield fault(
                 f"{where}.{name}",
-                f"'{wanted}' contradicts what stands: {held} with {name} '{stands}'; use the same, "
-                "or another connection id",
+                f"'{wanted}' contradicts an existing claim: {held} with {name} '{current}'; use "
+                "the same, or another connection id",
                 code="conflict",
             )
             return
@@ -71,8 +71,8 @@ def connection_conflicts(
 def _route_conflicts(
     where: str, asked: Route, claim: ConnectionClaim, held: str
 ) -> Iterator[Fault]:
-    stands = claim.topics.get(asked.source)
-    if stands is None:
+    current = claim.topics.get(asked.source)
+    if current is None:
         for route in claim.topics.values() if asked.reverse else ():
             if route.reverse and route.target == asked.target:
                 yield fault(
@@ -82,17 +82,17 @@ def _route_conflicts(
                     code="conflict",
                 )
         return
-    if stands.target != asked.target:
+    if current.target != asked.target:
         yield fault(
             f"{where}.target",
-            f"'{asked.source}' goes to '{stands.target}' already: {held}; one source topic has "
+            f"'{asked.source}' goes to '{current.target}' already: {held}; one source topic has "
             "one target, use a second connection",
             code="conflict",
         )
-    for name, value, wanted in routes.differences(stands, asked):
+    for name, value, wanted in routes.differences(current, asked):
         yield fault(
             f"{where}.{name}",
-            f"{name} {wanted} of '{asked.source}' contradicts what stands: {held} with {name} "
-            f"{value}; use the same, or a second connection",
+            f"{name} {wanted} of '{asked.source}' contradicts an existing claim: {held} with "
+            f"{name} {value}; use the same, or a second connection",
             code="conflict",
         )

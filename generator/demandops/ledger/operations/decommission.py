@@ -1,9 +1,8 @@
 """Decommissioning: what remains of the claims when a node or a requester leaves for good.
 
-With a node goes what cannot be without it: the applications at it, the inputs that come from it,
-the connections that end at it; in whosever name. With a requester go the claims in its name, as by
-a shutdown: a claim stands in the name of all its requesters together, and what is left in those of
-the others alone nobody would ever give up.
+For a node, its applications, the inputs from it and the connections that end at it are released,
+whoever requested them. For a requester, all its claims are released, as by a shutdown. That
+includes shared claims: if they stayed for the other requesters alone, nobody would release them.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ def decommission(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple
     """Release all that a node or a requester holds.
 
     Raises:
-        Refused: where it holds nothing.
+        Refused: if it holds nothing.
     """
     leaving = request.leaving
-    assert leaving is not None  # noqa: S101 - a request to decommission says what
+    assert leaving is not None  # noqa: S101 - a decommission request names it
     start, claims = ledger, dict[str, Claim]()
     if "node" in leaving.kinds:
         claims |= {f"{c.subject} {c.demand}": c for c in claims_needing(ledger, leaving.name)}
@@ -53,7 +52,7 @@ def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
 
 
 def needs_node(claim: Claim, node: str) -> bool:
-    """Tell whether a claim cannot stand as it is without a node."""
+    """Return whether a claim depends on a node."""
     if isinstance(claim, ApplicationClaim):
         return claim.node == node or any(t.source == node for _, t in claim.all_inputs())
     return node in (claim.source, claim.target, claim.broker)
@@ -81,7 +80,7 @@ def _without_node(claim: Claim, node: str, now: datetime) -> Claim | None:
 
 
 def _nothing_held(ledger: Ledger, leaving: Leaving) -> Fault:
-    """Say that nothing is held, with a name that comes near: a typo must show."""
+    """Return the fault that nothing is held. A similar name helps to find a typo."""
     names = [ledger.indexed_names("requester")] if "requester" in leaving.kinds else []
     names += (
         [ledger.indexed_names("node"), ledger.indexed_names("link")]

@@ -1,9 +1,8 @@
-"""Going back: the claims of an earlier commit, booked again as they stood there.
+"""A restoration: the claims of an earlier commit are booked again.
 
-What was booked since goes only where that is wanted. A claim that comes back has the lease that it
-had, for its full term from now on: with its old end it would be released at once. Claims of
-overrides' own are nobody's demand: whether they come or go is settled as after every change
-(:mod:`demandops.plan.overrides.kept_claims`).
+Claims that were booked since are released only if the request says so. A lease that comes back runs
+for its full term from now on, because its old end may have passed. Claims that an override keeps
+are no demand: they are updated as after every change (:mod:`demandops.plan.overrides.kept_claims`).
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ _SHOWN = 20
 
 @dataclass(frozen=True, slots=True)
 class Restoration(DemandRequest):
-    """A request to go back to the books of a commit.
+    """A request to restore the ledger of an earlier commit.
 
-    ``to`` is the commit, ``made`` when it was made, ``claims`` what it held; ``by`` and ``email``
-    are who asks for it.
+    ``to`` is the commit, ``made`` its time and ``claims`` its ledger. ``by`` and ``email`` name who
+    asks for it.
     """
 
     to: str = ""
@@ -47,10 +46,10 @@ class Restoration(DemandRequest):
 
 
 def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Make the books what they were.
+    """Make the ledger what it was.
 
     Raises:
-        Refused: where that would drop or undo what was booked since, and it may not.
+        Refused: if that drops or undoes newer claims, and ``drop_newer`` is not set.
     """
     assert isinstance(request, Restoration)  # noqa: S101 - the operation says so
     changes = _changes(ledger, request)
@@ -65,7 +64,7 @@ def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
-    """Return what going back changes; a claim whose lease alone was renewed stays as it is."""
+    """Return what the restoration changes; a claim whose lease alone differs stays as it is."""
     wanted = {claim.key: claim for claim in request.claims}
     gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in wanted]
     back = [ClaimChange(ledger.get(key), claim) for key, claim in wanted.items()]
@@ -76,7 +75,7 @@ def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
 def _same(one: Claim | None, other: Claim | None) -> bool:
     if one is None or other is None:
         return one is other
-    if is_kept(one):  # when it was kept is no part of what is asked
+    if is_kept(one):  # when the override kept it does not matter
         one = replace(one, booked=other.booked)
     return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
 
@@ -93,26 +92,26 @@ def _with_full_lease(change: ClaimChange, now: datetime) -> Claim | None:
 def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
     for change in changes[:_SHOWN]:
         claim = change.before
-        assert claim is not None  # noqa: S101 - the caller chose those
-        what = "drop" if change.after is None else "undo a change of"
+        assert claim is not None  # noqa: S101 - the caller passes existing claims
+        effect = "drop" if change.after is None else "undo a change of"
         message = (
-            f"would {what} the claim of {', '.join(claim.requesters)} on {claim.subject}, booked "
+            f"would {effect} the claim of {', '.join(claim.requesters)} on {claim.subject}, booked "
             f"{claim.booked:%Y-%m-%d %H:%M:%S} UTC (request '{claim.request}')"
         )
         yield fault("", message, code="newer").within(path_of(claim.key))
     more = len(changes) - _SHOWN
-    rest = f"and {more} more; " if more > 0 else ""
-    message = f"{rest}what was booked since stays unless it is to go as well (--drop-newer)"
+    others = f"and {more} more; " if more > 0 else ""
+    message = f"{others}newer claims stay; use --drop-newer to release them as well"
     yield fault("", message, code="newer")
 
 
 def faults(request: Restoration, ledger: Ledger, config: Config) -> Iterator[Fault]:
-    """Yield why claims that come back are not possible any more, by what is configured now."""
+    """Yield why restored claims are not valid in the current configuration."""
     for change in _changes(ledger, request):
-        if change.after is None or is_kept(change.after):  # overrides keep or drop their own
+        if change.after is None or is_kept(change.after):  # overrides decide about these
             continue
-        asked = _request_for(change.after)
-        for found in (*admission.faults(asked, config), *permission.faults(asked, config)):
+        booking = _request_for(change.after)
+        for found in (*admission.faults(booking, config), *permission.faults(booking, config)):
             field = found.field.partition("].")[2] or found.field
             yield replace(found, field=field).within(path_of(change.key))
 

@@ -1,4 +1,4 @@
-"""Releasing: which claims a shutdown means, and what remains of them."""
+"""A shutdown: which claims it means, and what remains of them."""
 
 from __future__ import annotations
 
@@ -29,12 +29,16 @@ from demandops.ledger.ledger import Changes, Ledger, claim_changes
 
 
 def shut_down(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Release what a shutdown lists; raise :class:`Refused` where nothing of it is held."""
+    """Release what a shutdown lists.
+
+    Raises:
+        Refused: if none of it is held.
+    """
     start = ledger
     keys: list[ClaimKey] = []
     not_held: list[str] = []
     for subject, asked in _listed(request):
-        # looked up in what was held at first: a second listing of a subject means the same claim
+        # look in ``start``: a subject that is listed twice means the same claim both times
         claim = _matching_claim(start.claims_on(subject), request.id, asked)
         if claim is None:
             not_held.append(f"{subject} for {', '.join(asked.requesters)}")
@@ -61,13 +65,13 @@ def _listed(request: DemandRequest) -> Iterator[tuple[Subject, Demanded]]:
 
 
 def _matching_claim(claims: Iterable[Claim], request: str, asked: Demanded) -> Claim | None:
-    """Return the claim that a shutdown means, or nothing: nothing is ever released by guess."""
+    """Return the claim that a shutdown means, or ``None`` if that is not certain."""
     claims = [claim for claim in claims if _same_ends(claim, asked)]
     requesters = set(asked.requesters)
-    made = demand_id(request, requesters)
+    own_id = demand_id(request, requesters)
     exact = [claim for claim in claims if set(claim.requesters) == requesters]
     meant = (
-        [claim for claim in exact if claim.demand == made]
+        [claim for claim in exact if claim.demand == own_id]
         or [claim for claim in exact if claim.request == request]
         or exact
         or [claim for claim in claims if set(claim.requesters) >= requesters]
@@ -88,12 +92,12 @@ def _same_ends(claim: Claim, asked: Demanded) -> bool:
 
 
 def _subtract(claim: Claim, asked: Demanded, now: datetime) -> tuple[Claim | None, list[str]]:
-    """Return what remains of ``claim`` (nothing: it is dropped) and what of it was not held."""
+    """Return what remains of a claim, if anything, and which topics it did not hold."""
     if isinstance(claim, ApplicationClaim) and isinstance(asked, ApplicationDemand):
         return _subtract_inputs(claim, asked, now)
     if isinstance(claim, ConnectionClaim) and isinstance(asked, ConnectionDemand):
         return _subtract_topics(claim, asked, now)
-    raise AssertionError("a claim and what is asked are of one kind")  # pragma: no cover
+    raise AssertionError("the claim is of the kind that the shutdown lists")  # pragma: no cover
 
 
 def _subtract_inputs(
@@ -101,7 +105,7 @@ def _subtract_inputs(
 ) -> tuple[Claim | None, list[str]]:
     if not any(asked.inputs.values()):
         return None, []
-    rest: dict[str, tuple[InputTopic, ...]] = {}
+    remaining: dict[str, tuple[InputTopic, ...]] = {}
     missing = []
     for role in sorted({*claim.inputs, *asked.inputs}):
         held = claim.inputs.get(role, ())
@@ -113,12 +117,12 @@ def _subtract_inputs(
                 missing.append(f"{role} {topic.topic} of {topic.source}")
         left = tuple(topic for topic in held if topic not in gone)
         if left:
-            rest[role] = left
-    if not rest:
+            remaining[role] = left
+    if not remaining:
         return None, missing
-    if rest == dict(claim.inputs):
+    if remaining == dict(claim.inputs):
         return claim, missing
-    return replace(claim, inputs=MappingProxyType(rest), booked=now), missing
+    return replace(claim, inputs=MappingProxyType(remaining), booked=now), missing
 
 
 def _subtract_topics(
@@ -128,16 +132,16 @@ def _subtract_topics(
         return None, []
     gone = {route.source for route in asked.topics}
     missing = [f"topic {topic}" for topic in sorted(gone - set(claim.topics))]
-    rest = {source: route for source, route in claim.topics.items() if source not in gone}
-    if not rest:
+    remaining = {source: route for source, route in claim.topics.items() if source not in gone}
+    if not remaining:
         return None, missing
-    if rest == dict(claim.topics):
+    if remaining == dict(claim.topics):
         return claim, missing
-    return replace(claim, topics=MappingProxyType(rest), booked=now), missing
+    return replace(claim, topics=MappingProxyType(remaining), booked=now), missing
 
 
 def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
-    """Say that a shutdown finds nothing, with the claims that come near: a typo must show."""
+    """Return the fault of a shutdown that matches no claim. Similar claims help to find a typo."""
     near = [
         f"{claim.subject} for {', '.join(claim.requesters)} (request '{claim.request}')"
         for subject, _ in _listed(request)
@@ -154,6 +158,6 @@ def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
     shown = "; ".join(dict.fromkeys(near[:5])) or "none"
     return fault(
         where,
-        f"nothing that the shutdown lists is held; claims that come near: {shown}",
+        f"nothing that the shutdown lists is held; similar claims: {shown}",
         code="not-held",
     )
