@@ -175,7 +175,7 @@ def _booked(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger
     refusals = refusals or list(quota.faults(state.ledger, ledger, changes, config))
     if refusals:
         raise Refused(refusals)
-    return kept_claims.with_kept_claims(state.ledger, ledger, changes, asked, (config, now))
+    return kept_claims.with_kept_claims(state.ledger, ledger, changes, asked, config, now)
 
 
 def admit(

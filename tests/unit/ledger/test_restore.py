@@ -77,7 +77,7 @@ def test_what_was_booked_since_is_refused_and_listed() -> None:
         f"{newer.booked:%Y-%m-%d %H:%M:%S} UTC (request '{newer.request}')"
     )
     assert told.value.faults[1].message == (
-        "newer claims stay; use --drop-newer to release them as well"
+        "newer claims stay; use --drop-newer to undo them as well"
     )
 
 

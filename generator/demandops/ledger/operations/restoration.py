@@ -101,7 +101,7 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
         yield fault("", message, code="newer").within(path_of(claim.key))
     more = len(changes) - _SHOWN
     others = f"and {more} more; " if more > 0 else ""
-    message = f"{others}newer claims stay; use --drop-newer to release them as well"
+    message = f"{others}newer claims stay; use --drop-newer to undo them as well"
     yield fault("", message, code="newer")
 
 

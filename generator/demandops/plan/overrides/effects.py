@@ -1,7 +1,6 @@
-"""What overrides make of a planned release: another version, place, number or image, or none.
+"""The effects of overrides on a planned release: version, node, replicas, images, or denial.
 
-Applied to the releases that a demand touches and to no others. Values are patched when they are
-rendered, for a template gives them.
+The rendering patches values, because a template makes them.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ _CLIENT_IMAGES: dict[type[MqttEnd | RosEnd | Bridge], str] = {
 
 
 def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release | None:
-    """Return a release as the overrides in force have it, or nothing where one denies it.
+    """Return a release with the effects of all overrides, or ``None`` if one denies it.
 
     Raises:
-        Refused: where the node that it is moved to is gone.
+        Refused: if an override moves it to a node that is gone.
     """
     if not config.in_force:
         return release
@@ -47,7 +46,7 @@ def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release
     kept = {claim.demand.removeprefix(KEPT) for claim in claims if claim.demand.startswith(KEPT)}
     by = []
     for override in config.in_force:
-        effects = _effects(release, override, config) if selects(override, traits, config) else ()
+        effects = effects_on(release, override, config) if selects(override, traits, config) else ()
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
         if effects:
@@ -56,7 +55,7 @@ def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release
 
 
 def service_denied_by(release: Release, ledger: Ledger, config: Config) -> Override | None:
-    """Return the override that keeps a service from running, or nothing."""
+    """Return the override that denies a service, or ``None``."""
     if not isinstance(release, ServiceRelease) or not any(one.deny for one in config.in_force):
         return None
     return denied_by(_traits(release, _claims(release, ledger)), config)
@@ -65,7 +64,7 @@ def service_denied_by(release: Release, ledger: Ledger, config: Config) -> Overr
 def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
-    """Return a release with the effects of these overrides, who comes last wins."""
+    """Return a release with the effects of these overrides; the last one wins."""
     by = tuple(by)
     if not by:
         return release
@@ -85,11 +84,7 @@ def apply_effects(
 
 
 def effects_on(release: Release, override: Override, config: Config) -> tuple[str, ...]:
-    """Return what an override would do to a release, were it selected."""
-    return _effects(release, override, config)
-
-
-def _effects(release: Release, override: Override, config: Config) -> tuple[str, ...]:
+    """Return the effects that an override has on a release that it selects."""
     if isinstance(release, ServiceRelease):
         images = set(release.service.images)
         known = config.charts[release.service.chart].versions()

@@ -1,7 +1,7 @@
-"""The claims in force: the books without those that an override's ``deny`` suspends.
+"""Claims that an override's ``deny`` suspends, and a view of the ledger without them.
 
-A suspended claim stays booked and is planned as if it were not there. What is planned asks this
-view, which judges just the claims that it comes across; there is no second ledger to keep up.
+A suspended claim stays booked but is not planned. The planner reads the view, which checks each
+claim when it is read. So there is no second ledger to keep up to date.
 """
 
 from __future__ import annotations
@@ -15,43 +15,43 @@ from demandops.demand.claim import Claim, Subject
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.selectors import Traits, fits, traits_of
 
-_MOST_JUDGED = 100_000
-"""Claims that are remembered as judged: a shared service has each of its claims looked at often."""
+_MOST_CACHED = 100_000
+"""How many results are cached. The claims of a shared service are read often."""
 
 
 @dataclass(frozen=True, slots=True)
 class UnsuspendedClaims(Ledger):
-    """A ledger that does not show suspended claims. For reading only."""
+    """A read-only view of a ledger without suspended claims."""
 
     config: Config | None = field(default=None, compare=False)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
-        """Return the claims on ``subject`` that are in force, sorted by demand id."""
-        return tuple(claim for claim in Ledger.claims_on(self, subject) if self._stands(claim))
+        """Return the claims on ``subject`` that are not suspended, sorted by demand id."""
+        return tuple(claim for claim in Ledger.claims_on(self, subject) if self._is_active(claim))
 
     def is_carried_to(self, target: str, topic: str) -> bool:
-        """Tell whether some connection in force brings ``topic`` to the node ``target``."""
+        """Return whether a claimed connection brings ``topic`` to the node ``target``."""
         return bool(self.connections_bringing(target, topic))
 
     def _ids(self, *entry: str) -> tuple[str, ...]:
         found = ((key, self.get(key)) for key in self.index.get(entry) or ())
         return tuple(
-            sorted({key.subject.id for key, claim in found if claim and self._stands(claim)})
+            sorted({key.subject.id for key, claim in found if claim and self._is_active(claim)})
         )
 
-    def _stands(self, claim: Claim) -> bool:
+    def _is_active(self, claim: Claim) -> bool:
         return self.config is None or suspended_by(claim, self.config) is None
 
 
 def without_suspended(ledger: Ledger, config: Config) -> Ledger:
-    """Return what of the books is planned; the ledger itself where nothing denies a claim."""
+    """Return a view of the ledger without suspended claims."""
     if isinstance(ledger, UnsuspendedClaims) or not any(one.deny for one in config.in_force):
         return ledger
     return UnsuspendedClaims(ledger.claims, ledger.index, ledger.minutes, config)
 
 
 def suspended_by(claim: Claim, config: Config) -> Override | None:
-    """Return the override that suspends a claim, the highest where several do, or nothing."""
+    """Return the highest override that suspends a claim, or ``None``."""
     if not config.in_force:
         return None
     traits = traits_of(claim)
@@ -59,16 +59,16 @@ def suspended_by(claim: Claim, config: Config) -> Override | None:
         return config.judged[traits]
     except KeyError:
         pass
-    if len(config.judged) >= _MOST_JUDGED:
+    if len(config.judged) >= _MOST_CACHED:
         config.judged.clear()
     found = config.judged[traits] = denied_by(traits, config)
     return found
 
 
 def denied_by(traits: Traits, config: Config) -> Override | None:
-    """Return the override that denies this, or nothing.
+    """Return the highest override that denies something with these traits, or ``None``.
 
-    A selector that names services denies these releases, and not what asks for them.
+    A selector that names services denies the releases of these services, never a claim or demand.
     """
     for override in reversed(config.in_force):
         if override.deny and any(
@@ -80,7 +80,7 @@ def denied_by(traits: Traits, config: Config) -> Override | None:
 
 
 def suspended_claims(ledger: Ledger, config: Config) -> Iterator[tuple[Claim, Override]]:
-    """Yield every suspended claim, sorted, and the override that suspends it."""
+    """Yield every suspended claim and the override that suspends it, sorted by subject."""
     if not any(one.deny for one in config.in_force):
         return
     for claim in sorted(ledger, key=lambda one: (str(one.subject), one.demand)):

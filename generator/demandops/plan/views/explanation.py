@@ -1,7 +1,4 @@
-"""Why a release runs: the claims that ask for it, and the files of people that shaped it.
-
-The auditor's view of a plan; pure, and no part of what is written.
-"""
+"""The explanation of a release: the claims that need it, and people's files that shape it."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ from demandops.plan.release_keys import all_keys, keys_of
 
 @dataclass(frozen=True, slots=True)
 class ShapingFile:
-    """A file that people own, which of its entries shaped a release, and what that says."""
+    """A file of people, its entry that shapes a release, and what the entry decides."""
 
     file: str
     entry: str
@@ -38,7 +35,7 @@ class ShapingFile:
 
 
 def release_named(ledger: Ledger, config: Config, name: str) -> Release | None:
-    """Return the release of a name, or nothing where none of that name runs."""
+    """Return the release with a name, or ``None`` if none runs."""
     releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
     return next((release for release in releases if release and release.name == name), None)
 
@@ -50,7 +47,7 @@ def release_names(ledger: Ledger, config: Config) -> list[str]:
 
 
 def releases_of(ledger: Ledger, config: Config, subject: Subject) -> list[Release]:
-    """Return the releases that run because something holds an application or a connection."""
+    """Return the releases that run because of claims on an application or a connection."""
     releases = (
         plan(ledger, config, key) for key in dict.fromkeys(keys_of(ledger, config, subject))
     )
@@ -58,11 +55,11 @@ def releases_of(ledger: Ledger, config: Config, subject: Subject) -> list[Releas
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
-    """Return the claims that ask for a release, the first that was booked first.
+    """Return the claims that need a release, sorted by their booking time.
 
     Args:
-        ledger: the books without suspended claims.
-        release: what runs.
+        ledger: the ledger without suspended claims.
+        release: the release that runs.
     """
     claims: Iterable[Claim]
     if isinstance(release, ServiceRelease):
@@ -75,7 +72,7 @@ def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
 
 
 def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
-    """Tell whether a claim on an application needs this service of it."""
+    """Return whether a claim on an application needs this service of it."""
     if release.service.each is None:
         return True
     topics = claim.inputs.get(release.service.each, ())
@@ -83,7 +80,7 @@ def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
 
 
 def how_to_release(claim: Claim) -> str:
-    """Return how its requesters give a claim up."""
+    """Return how the requesters release a claim."""
     if is_kept(claim):
         return f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(KEPT)}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):
@@ -92,7 +89,7 @@ def how_to_release(claim: Claim) -> str:
 
 
 def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
-    """Return the files of people that say what a release is, and where."""
+    """Return people's files that decide what a release is and where it runs."""
     found = [ShapingFile(ROOT_FILE, "gitops", f"written for {config.repository.gitops}")]
     of_kind = _service if isinstance(release, ServiceRelease) else _client
     found += of_kind(release, config)
@@ -104,7 +101,7 @@ def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
 def denied_release_named(
     ledger: Ledger, config: Config, name: str
 ) -> tuple[Release, Override] | None:
-    """Return the release of a name that claims need, and the override that denies it."""
+    """Return the denied release with a name and the override that denies it, or ``None``."""
     for key in all_keys(ledger, config):
         found = denied_release(ledger, config, key)
         if found is not None and found[0].name == name:
@@ -113,12 +110,12 @@ def denied_release_named(
 
 
 def keeping_override(claim: Claim, config: Config) -> Override | None:
-    """Return the override whose own claim this is, or nothing where somebody asks for it."""
+    """Return the override that keeps this claim, or ``None`` if a demand holds it."""
     return config.overrides.get(claim.demand.removeprefix(KEPT)) if is_kept(claim) else None
 
 
 def _service(release: Release, config: Config) -> Iterator[ShapingFile]:
-    assert isinstance(release, ServiceRelease)  # noqa: S101 - the caller chose by that
+    assert isinstance(release, ServiceRelease)  # noqa: S101 - the caller checks the type
     folder = f"appdefs/{release.appdef}"
     yield ShapingFile(f"{folder}/appdef.yaml", f"services.{release.key.service}", "what it is")
     yield ShapingFile(

@@ -213,7 +213,7 @@ class CommitLine:
         files: dict[str, str | None] = {}
         for subject in subjects:
             ledger, own = kept_claims.update_kept_claims(
-                books, state.ledger, [subject], (state.config, now)
+                books, state.ledger, [subject], state.config, now
             )
             tried = replace(state, ledger=ledger)
             try:
