@@ -390,7 +390,7 @@ class TestParameters:
         assert [(found.field, found.message) for found in refused.value.faults] == [
             (
                 "parameters.rate",
-                "'fast' is no number, and the application definition takes the max",
+                "'fast' is not a number, but the application definition takes the max",
             )
         ]
 

@@ -1,6 +1,6 @@
-"""From claims to releases.
+"""The planner: :func:`plan` derives the release at a key from claims.
 
-:func:`plan` derives one release by its key (:mod:`demandops.plan.release_keys`).
+Keys come from :mod:`demandops.plan.release_keys`.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from demandops.plan.release_keys import ReleaseKey, appdef_of, keys_of
 
 
 def plan(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
-    """Return the release at ``key`` as overrides shape it, or nothing where no claim needs it.
+    """Return the release at ``key`` with the effects of overrides, or ``None`` if it must not run.
 
     Raises:
-        Refused: where claims contradict each other in a parameter, or what a claim names is no
-            longer in the configuration.
+        Refused: if claims contradict each other in a parameter, or if the configuration no longer
+            has what a claim names.
     """
     ledger = without_suspended(ledger, config)
     release = _unshaped(ledger, config, key)
@@ -39,7 +39,7 @@ def plan(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
 def denied_release(
     ledger: Ledger, config: Config, key: ReleaseKey
 ) -> tuple[Release, Override] | None:
-    """Return the release that is needed at ``key`` and the override that denies it, or nothing."""
+    """Return the release at ``key`` and the override that denies it, or ``None``."""
     ledger = without_suspended(ledger, config)
     release = _unshaped(ledger, config, key)
     by = effects.service_denied_by(release, ledger, config) if release else None
@@ -56,7 +56,7 @@ def _unshaped(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None
 
 def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease | None:
     named = (key.application,) if key.application is not None else None
-    users = tuple(  # an application may run elsewhere by now, or as something else
+    users = tuple(  # skip applications that moved or changed their definition
         application
         for application in named or ledger.applications_taking(str(key.source), str(key.topic))
         if key in keys_of(ledger, config, Subject(SubjectKind.APPLICATION, application))
@@ -98,10 +98,10 @@ def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease 
 
 
 def _chart(config: Config, service: Service, claims: Iterable[ApplicationClaim]) -> ChartSource:
-    """Return the chart in the version that the claims ask for, the default where it has none.
+    """Return the chart in the version that the claims ask for, or the default version.
 
     Raises:
-        Refused: where applications that share the service ask for different ones.
+        Refused: if applications that share the service ask for different versions.
     """
     chart = config.charts[service.chart]
     asked = {claim.version: chart.at(claim.version) or chart for claim in claims}
@@ -110,7 +110,7 @@ def _chart(config: Config, service: Service, claims: Iterable[ApplicationClaim])
             f"{source.version} (for '{version}')" for version, source in sorted(asked.items())
         )
         message = (
-            f"{service.chart} is shared and asked for in versions {versions}; ask for the same"
+            f"demands that share {service.chart} ask for versions {versions}; ask for the same"
         )
         raise Refused([fault("version", message, code="conflict")])
     return next(iter(asked.values()))
@@ -172,8 +172,8 @@ def _united(claims: Iterable[ApplicationClaim], role: str) -> tuple[InputTopic, 
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     """Return the release name of a service instance.
 
-    A source's usual topic (``topics`` of its inventory entry) needs no mention:
-    ``od-edge-vehicle00``. Others carry a slug of the topic.
+    The name leaves out a source's usual topic (``topics`` of its inventory entry):
+    ``od-edge-vehicle00``. For other topics it has a slug of the topic.
     """
     if key.application is not None:
         return naming.object_name(service.prefix, key.application)

@@ -115,7 +115,7 @@ def test_where_no_other_broker_would_do_it_is_refused_whole(bare: Path, demandop
     assert demandops("decommission", "edge", "--state-repo", bare) == (
         1,
         "",
-        "error: broker: connection 'vehicle01/edge' finds no broker; add one to "
+        "error: broker: connection 'vehicle01/edge' has no broker; add one to "
         "inventory/brokers.yaml\n",
     )
     assert rig.tip(bare) == tip

@@ -362,7 +362,7 @@ class TestWhatPeopleDidInGit:
         ("kind", "node", "left", "expected"),
         [
             ("zenoh", "vehicle00", {}, "node: 'vehicle00' carries Zenoh connections, but has no"),
-            ("ros", "edge", {}, "connections: connection 'c' finds no end with a wan address any"),
+            ("ros", "edge", {}, "connections: connection 'c' has no end with a wan address any"),
             ("ros", "vehicle00", {}, "connections: 'c': the message type of '/a' is not known"),
         ],
     )
