@@ -115,8 +115,8 @@ def _mqtt_end(
     claims: tuple[ConnectionClaim, ...], config: Config, key: EndKey, topics: dict[str, Route]
 ) -> MqttEnd:
     first = claims[0]
-    wanted = next((claim.broker for claim in claims if claim.broker), "")
-    broker = choose_broker(wanted, first.source, first.target, config)
+    named = next((claim.broker for claim in claims if claim.broker), "")
+    broker = choose_broker(named, first.source, first.target, config)
     if broker is None:
         raise Refused(
             [

@@ -43,15 +43,15 @@ def with_implied_connections(
             topic = foreign.topic
             if (app.node, topic.topic) in brought or not _is_valid(app, topic, config):
                 continue
-            wanted = _connection(app, topic.source, topic.topic, ledger)
-            same = (wanted.id, wanted.source, wanted.target)
+            needed = _connection(app, topic.source, topic.topic, ledger)
+            same = (needed.id, needed.source, needed.target)
             known = next((c for c in connections if (c.id, c.source, c.target) == same), None)
             if known is None:
                 connections.append(
-                    replace(wanted, because=f"applications[{index}].{foreign.field}")
+                    replace(needed, because=f"applications[{index}].{foreign.field}")
                 )
                 continue
-            topics = dict.fromkeys((*known.topics, *wanted.topics))
+            topics = dict.fromkeys((*known.topics, *needed.topics))
             connections[connections.index(known)] = replace(known, topics=tuple(topics))
     return replace(request, connections=tuple(connections))
 
@@ -76,13 +76,13 @@ class ForeignInput:
 def foreign_inputs(app: ApplicationDemand, config: Config) -> list[ForeignInput]:
     """Return the topics that must be carried to the application's node."""
     appdef = config.appdefs[app.appdef]
-    wanted = set()
+    needed = set()
     for service in appdef.services.values():
         if service.each is not None and service.placement == "application":
-            wanted.add(service.each)
-        wanted |= set(service.inputs.values())
+            needed.add(service.each)
+        needed |= set(service.inputs.values())
     found = []
-    for name in sorted(wanted):
+    for name in sorted(needed):
         producer_name, _, output = name.partition(".")
         producer = appdef.services[producer_name] if output else None
         if producer is not None and producer.placement != "source":

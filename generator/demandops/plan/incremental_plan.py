@@ -61,16 +61,16 @@ class IncrementalPlan:
         for subject in [unit for unit in stale if unit in self._keys]:
             if subject not in ledger.claims:
                 del self._keys[subject]
-        wanted = {key for keys in self._keys.values() for key in keys}
-        gone = self._planned - wanted
+        needed = {key for keys in self._keys.values() for key in keys}
+        gone = self._planned - needed
         found: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
-        for key in sorted(wanted - self._planned | (wanted & stale), key=repr):
+        for key in sorted(needed - self._planned | (needed & stale), key=repr):
             found[key] = self._traced(
                 ledger,
                 key,
                 lambda seen, of=key: plan(seen, self._config, of),  # type: ignore[misc]
             )
-        self._planned = wanted
+        self._planned = needed
         return found
 
     def _traced(self, ledger: Ledger, unit: _Unit, work: Callable[[Ledger], T]) -> T:

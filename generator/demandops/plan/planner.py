@@ -104,16 +104,16 @@ def _chart(config: Config, service: Service, claims: Iterable[ApplicationClaim])
         Refused: if applications that share the service ask for different versions.
     """
     chart = config.charts[service.chart]
-    asked = {claim.version: chart.at(claim.version) or chart for claim in claims}
-    if len({source.version for source in asked.values()}) > 1:
+    charts = {claim.version: chart.at(claim.version) or chart for claim in claims}
+    if len({source.version for source in charts.values()}) > 1:
         versions = " and ".join(
-            f"{source.version} (for '{version}')" for version, source in sorted(asked.items())
+            f"{source.version} (for '{version}')" for version, source in sorted(charts.items())
         )
         message = (
             f"demands that share {service.chart} ask for versions {versions}; ask for the same"
         )
         raise Refused([fault("version", message, code="conflict")])
-    return next(iter(asked.values()))
+    return next(iter(charts.values()))
 
 
 def _requesters(claims: Iterable[ApplicationClaim]) -> tuple[str, ...]:
@@ -206,5 +206,5 @@ def _replicas(scaling: Scaling, topics: int) -> int:
     """Return the replicas for ``topics`` inputs, within the appdef's bounds."""
     if scaling.topics_per_replica is None:
         return scaling.min
-    wanted = -(-topics // scaling.topics_per_replica)
-    return max(scaling.min, min(scaling.max, wanted))
+    needed = -(-topics // scaling.topics_per_replica)
+    return max(scaling.min, min(scaling.max, needed))

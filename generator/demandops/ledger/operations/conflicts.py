@@ -44,55 +44,55 @@ def application_conflicts(
 
 
 def connection_conflicts(
-    where: str, asked: ConnectionDemand, existing: Iterable[ConnectionClaim]
+    where: str, demanded: ConnectionDemand, existing: Iterable[ConnectionClaim]
 ) -> Iterator[Fault]:
     """Yield why a demanded connection contradicts existing claims on it."""
     for claim in existing:
-        held = f"'{asked.id}' is held by {', '.join(claim.requesters)}"
-        for name, wanted, current in (
-            ("type", ConnectionType(asked.type).name, claim.type.name),
-            ("source", asked.source, claim.source),
-            ("target", asked.target, claim.target),
-            ("broker", asked.broker, claim.broker),
+        held = f"'{demanded.id}' is held by {', '.join(claim.requesters)}"
+        for name, new, current in (
+            ("type", ConnectionType(demanded.type).name, claim.type.name),
+            ("source", demanded.source, claim.source),
+            ("target", demanded.target, claim.target),
+            ("broker", demanded.broker, claim.broker),
         ):
-            if wanted == current or (name == "broker" and not (wanted and current)):
+            if new == current or (name == "broker" and not (new and current)):
                 continue
             yield fault(
                 f"{where}.{name}",
-                f"'{wanted}' contradicts an existing claim: {held} with {name} '{current}'; use "
+                f"'{new}' contradicts an existing claim: {held} with {name} '{current}'; use "
                 "the same, or another connection id",
                 code="conflict",
             )
             return
-        for index, route in enumerate(asked.topics):
+        for index, route in enumerate(demanded.topics):
             yield from _route_conflicts(f"{where}.topics[{index}]", route, claim, held)
 
 
 def _route_conflicts(
-    where: str, asked: Route, claim: ConnectionClaim, held: str
+    where: str, demanded: Route, claim: ConnectionClaim, held: str
 ) -> Iterator[Fault]:
-    current = claim.topics.get(asked.source)
+    current = claim.topics.get(demanded.source)
     if current is None:
-        for route in claim.topics.values() if asked.reverse else ():
-            if route.reverse and route.target == asked.target:
+        for route in claim.topics.values() if demanded.reverse else ():
+            if route.reverse and route.target == demanded.target:
                 yield fault(
                     f"{where}.target",
-                    f"'{asked.target}' is carried back to '{route.source}' already: {held}; one "
+                    f"'{demanded.target}' is carried back to '{route.source}' already: {held}; one "
                     "topic goes to one place, use a second connection",
                     code="conflict",
                 )
         return
-    if current.target != asked.target:
+    if current.target != demanded.target:
         yield fault(
             f"{where}.target",
-            f"'{asked.source}' goes to '{current.target}' already: {held}; one source topic has "
+            f"'{demanded.source}' goes to '{current.target}' already: {held}; one source topic has "
             "one target, use a second connection",
             code="conflict",
         )
-    for name, value, wanted in routes.differences(current, asked):
+    for name, old, new in routes.differences(current, demanded):
         yield fault(
             f"{where}.{name}",
-            f"{name} {wanted} of '{asked.source}' contradicts an existing claim: {held} with "
-            f"{name} {value}; use the same, or a second connection",
+            f"{name} {new} of '{demanded.source}' contradicts an existing claim: {held} with "
+            f"{name} {old}; use the same, or a second connection",
             code="conflict",
         )

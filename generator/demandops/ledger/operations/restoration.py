@@ -65,9 +65,9 @@ def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
     """Return what the restoration changes; a claim whose lease alone differs stays as it is."""
-    wanted = {claim.key: claim for claim in request.claims}
-    gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in wanted]
-    back = [ClaimChange(ledger.get(key), claim) for key, claim in wanted.items()]
+    restored = {claim.key: claim for claim in request.claims}
+    gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in restored]
+    back = [ClaimChange(ledger.get(key), claim) for key, claim in restored.items()]
     back = [change for change in back if not _same(change.before, change.after)]
     return sorted([*gone, *back], key=lambda change: path_of(change.key))
 

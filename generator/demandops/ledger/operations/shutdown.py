@@ -37,16 +37,16 @@ def shut_down(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Le
     start = ledger
     keys: list[ClaimKey] = []
     not_held: list[str] = []
-    for subject, asked in _listed(request):
+    for subject, listed in _listed(request):
         # look in ``start``: a subject that is listed twice means the same claim both times
-        claim = _matching_claim(start.claims_on(subject), request.id, asked)
+        claim = _matching_claim(start.claims_on(subject), request.id, listed)
         if claim is None:
-            not_held.append(f"{subject} for {', '.join(asked.requesters)}")
+            not_held.append(f"{subject} for {', '.join(listed.requesters)}")
             continue
-        not_held += [f"{subject}: {name}" for name in _subtract(claim, asked, now)[1]]
+        not_held += [f"{subject}: {name}" for name in _subtract(claim, listed, now)[1]]
         left = ledger.get(claim.key)
         if left is not None:
-            ledger = ledger.replace(claim.key, _subtract(left, asked, now)[0])
+            ledger = ledger.replace(claim.key, _subtract(left, listed, now)[0])
         keys.append(claim.key)
     changes = claim_changes(start, ledger, keys)
     if not changes:
@@ -64,10 +64,10 @@ def _listed(request: DemandRequest) -> Iterator[tuple[Subject, Demanded]]:
         yield Subject(SubjectKind.CONNECTION, connection.id), connection
 
 
-def _matching_claim(claims: Iterable[Claim], request: str, asked: Demanded) -> Claim | None:
+def _matching_claim(claims: Iterable[Claim], request: str, listed: Demanded) -> Claim | None:
     """Return the claim that a shutdown means, or ``None`` if that is not certain."""
-    claims = [claim for claim in claims if _same_ends(claim, asked)]
-    requesters = set(asked.requesters)
+    claims = [claim for claim in claims if _same_ends(claim, listed)]
+    requesters = set(listed.requesters)
     own_id = demand_id(request, requesters)
     exact = [claim for claim in claims if set(claim.requesters) == requesters]
     meant = (
@@ -79,38 +79,38 @@ def _matching_claim(claims: Iterable[Claim], request: str, asked: Demanded) -> C
     return meant[0] if len(meant) == 1 else None
 
 
-def _same_ends(claim: Claim, asked: Demanded) -> bool:
-    if isinstance(claim, ApplicationClaim) and isinstance(asked, ApplicationDemand):
-        return asked.node in ("", claim.node) and asked.appdef == claim.appdef
-    if isinstance(claim, ConnectionClaim) and isinstance(asked, ConnectionDemand):
+def _same_ends(claim: Claim, listed: Demanded) -> bool:
+    if isinstance(claim, ApplicationClaim) and isinstance(listed, ApplicationDemand):
+        return listed.node in ("", claim.node) and listed.appdef == claim.appdef
+    if isinstance(claim, ConnectionClaim) and isinstance(listed, ConnectionDemand):
         return (
-            asked.source in ("", claim.source)
-            and asked.target in ("", claim.target)
-            and asked.type in (ConnectionType.AUTO.value, claim.type.value)
+            listed.source in ("", claim.source)
+            and listed.target in ("", claim.target)
+            and listed.type in (ConnectionType.AUTO.value, claim.type.value)
         )
     return False
 
 
-def _subtract(claim: Claim, asked: Demanded, now: datetime) -> tuple[Claim | None, list[str]]:
+def _subtract(claim: Claim, listed: Demanded, now: datetime) -> tuple[Claim | None, list[str]]:
     """Return what remains of a claim, if anything, and which topics it did not hold."""
-    if isinstance(claim, ApplicationClaim) and isinstance(asked, ApplicationDemand):
-        return _subtract_inputs(claim, asked, now)
-    if isinstance(claim, ConnectionClaim) and isinstance(asked, ConnectionDemand):
-        return _subtract_topics(claim, asked, now)
+    if isinstance(claim, ApplicationClaim) and isinstance(listed, ApplicationDemand):
+        return _subtract_inputs(claim, listed, now)
+    if isinstance(claim, ConnectionClaim) and isinstance(listed, ConnectionDemand):
+        return _subtract_topics(claim, listed, now)
     raise AssertionError("the claim is of the kind that the shutdown lists")  # pragma: no cover
 
 
 def _subtract_inputs(
-    claim: ApplicationClaim, asked: ApplicationDemand, now: datetime
+    claim: ApplicationClaim, listed: ApplicationDemand, now: datetime
 ) -> tuple[Claim | None, list[str]]:
-    if not any(asked.inputs.values()):
+    if not any(listed.inputs.values()):
         return None, []
     remaining: dict[str, tuple[InputTopic, ...]] = {}
     missing = []
-    for role in sorted({*claim.inputs, *asked.inputs}):
+    for role in sorted({*claim.inputs, *listed.inputs}):
         held = claim.inputs.get(role, ())
         gone: set[InputTopic] = set()
-        for topic in asked.inputs.get(role, ()):
+        for topic in listed.inputs.get(role, ()):
             found = {t for t in held if t.topic == topic.topic and topic.source in ("", t.source)}
             gone |= found
             if not found:
@@ -126,11 +126,11 @@ def _subtract_inputs(
 
 
 def _subtract_topics(
-    claim: ConnectionClaim, asked: ConnectionDemand, now: datetime
+    claim: ConnectionClaim, listed: ConnectionDemand, now: datetime
 ) -> tuple[Claim | None, list[str]]:
-    if not asked.topics:
+    if not listed.topics:
         return None, []
-    gone = {route.source for route in asked.topics}
+    gone = {route.source for route in listed.topics}
     missing = [f"topic {topic}" for topic in sorted(gone - set(claim.topics))]
     remaining = {source: route for source, route in claim.topics.items() if source not in gone}
     if not remaining:
@@ -149,11 +149,11 @@ def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
     ]
     where = "applications[0].id" if request.applications else "connections[0].id"
     if not near:
-        wanted = set(request.requesters())
+        requesters = set(request.requesters())
         near = [
             f"{claim.subject} for {', '.join(claim.requesters)}"
             for claim in sorted(ledger, key=lambda claim: (str(claim.subject), claim.demand))
-            if wanted & set(claim.requesters)
+            if requesters & set(claim.requesters)
         ]
     shown = "; ".join(dict.fromkeys(near[:5])) or "none"
     return fault(

@@ -34,12 +34,16 @@ def faults(
         and change.before.booked == change.after.booked
         for change in changes.claims
     }
-    for subject, where, asked in _listed(request):
+    for subject, where, demanded in _listed(request):
         if renewed.get(subject, True):
             continue
         for override in denying:
-            field = _denied(
-                override, where, asked, list(_runs(asked, subject, after, config)), config
+            field = _denied_field(
+                override,
+                where,
+                demanded,
+                list(_service_traits(demanded, subject, after, config)),
+                config,
             )
             if field:
                 yield fault(field, _message(override), code="denied")
@@ -56,48 +60,54 @@ def _listed(
         yield subject, f"connections[{index}]", connection
 
 
-def _runs(
-    asked: ApplicationDemand | ConnectionDemand, subject: Subject, after: Ledger, config: Config
+def _service_traits(
+    demanded: ApplicationDemand | ConnectionDemand, subject: Subject, after: Ledger, config: Config
 ) -> Iterator[Traits]:
     """Yield the traits of the services that an application needs."""
-    if not isinstance(asked, ApplicationDemand):
+    if not isinstance(demanded, ApplicationDemand):
         return
     for key in keys_including_suspended(after, config, subject):
         if isinstance(key, ServiceKey):
             yield Traits(
-                (key.node,), asked.requesters, (asked.id,), (asked.appdef,), service=key.service
+                (key.node,),
+                demanded.requesters,
+                (demanded.id,),
+                (demanded.appdef,),
+                service=key.service,
             )
 
 
-def _denied(
+def _denied_field(
     override: Override,
     where: str,
-    asked: ApplicationDemand | ConnectionDemand,
+    demanded: ApplicationDemand | ConnectionDemand,
     services: list[Traits],
     config: Config,
 ) -> str:
-    """Return the field that makes an override deny what is asked, or an empty text."""
+    """Return the field that makes an override deny a demanded subject, or an empty text."""
     for selector in override.select:
-        for traits in services if selector.services else [traits_of(asked)]:
+        for traits in services if selector.services else [traits_of(demanded)]:
             if fits(selector, traits, config):
-                return f"{where}.{_field(selector, asked, config)}"
+                return f"{where}.{_matched_field(selector, demanded, config)}"
     return ""
 
 
-def _field(selector: Selector, asked: ApplicationDemand | ConnectionDemand, config: Config) -> str:
+def _matched_field(
+    selector: Selector, demanded: ApplicationDemand | ConnectionDemand, config: Config
+) -> str:
     """Return the field that a selector matches; of several, the most specific one."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:
         who = selector.requesters
-        index = next(i for i, name in enumerate(asked.requesters) if matches(name, who))
+        index = next(i for i, name in enumerate(demanded.requesters) if matches(name, who))
         return f"requesters[{index}]"
     if selector.services or selector.appdefs:
         return "appdef"
-    if isinstance(asked, ApplicationDemand):
+    if isinstance(demanded, ApplicationDemand):
         return "node"
-    at_source = not selector.nodes or matches(asked.source, selector.nodes)
-    return "source" if at_source and has_labels(selector, asked.source, config) else "target"
+    at_source = not selector.nodes or matches(demanded.source, selector.nodes)
+    return "source" if at_source and has_labels(selector, demanded.source, config) else "target"
 
 
 def _message(override: Override) -> str:
