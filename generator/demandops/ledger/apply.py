@@ -1,4 +1,4 @@
-"""The ledger's one operation: :func:`apply` carries out a request.
+"""The one way to change the ledger: :func:`apply` carries out a request.
 
 What each operation means: ``docs/architecture.md``, "Booking".
 """

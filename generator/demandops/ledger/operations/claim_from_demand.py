@@ -72,7 +72,7 @@ def connection_claim(
 
 
 def _with_booking_time(claim: AnyClaim, current: Claim | None) -> AnyClaim:
-    """Return a claim with the current one's time if they differ in nothing else but the lease."""
+    """Return a claim with the current claim's booking time if only the lease differs."""
     if current is None:
         return claim
     kept = replace(claim, booked=current.booked)

@@ -1,7 +1,7 @@
 """Decommissioning: what remains of the claims when a node or a requester leaves for good.
 
 For a node, its applications, the inputs from it and the connections that end at it are released,
-whoever requested them. For a requester, all its claims are released, as by a shutdown. That
+even if others requested them. For a requester, all its claims are released, as by a shutdown. That
 includes shared claims: if they stayed for the other requesters alone, nobody would release them.
 """
 

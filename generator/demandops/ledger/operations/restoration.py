@@ -51,7 +51,7 @@ def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
     Raises:
         Refused: if that drops or undoes newer claims, and ``drop_newer`` is not set.
     """
-    assert isinstance(request, Restoration)  # noqa: S101 - the operation says so
+    assert isinstance(request, Restoration)  # noqa: S101 - apply() checks the operation
     changes = _changes(ledger, request)
     if not request.drop_newer:
         newer = [c for c in changes if c.before is not None and not is_kept(c.before)]

@@ -1,6 +1,6 @@
 """Selectors: which releases, claims and demands an override is for.
 
-Knows nothing of what an override does to them.
+Does not know what an override does to them.
 """
 
 from __future__ import annotations

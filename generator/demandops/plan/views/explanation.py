@@ -27,7 +27,7 @@ from demandops.plan.release_keys import all_keys, keys_of
 
 @dataclass(frozen=True, slots=True)
 class ShapingFile:
-    """A file of people, its entry that shapes a release, and what the entry decides."""
+    """A file that people write, its entry that shapes a release, and what the entry decides."""
 
     file: str
     entry: str
