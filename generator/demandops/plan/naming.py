@@ -62,8 +62,7 @@ def topic_part(id: str, extra: str = "") -> str:
 
 
 def ros_name(release: str) -> str:
-    """Return a ROS node name for a release. ROS allows no dash; release names have no "
-    "underscore."""
+    """Return a ROS node name for a release. ROS forbids dashes in names."""
     return release.replace("-", "_")
 
 

@@ -58,8 +58,7 @@ class Shaping:
 
     @property
     def held(self) -> bool:
-        """Whether a ``hold`` applies that no higher override changes: the file then stays as it "
-        "is."""
+        """Whether a ``hold`` applies that no higher override changes, so the file stays."""
         held = False
         for _, effects in self.by:
             held = "hold" in effects or (held and set(effects) <= {"keep"})
