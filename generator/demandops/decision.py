@@ -1,8 +1,8 @@
-"""One demand, decided: from the goal as it came to the files that a commit will hold.
+"""The decision on one demand: from the goal to the files of a commit.
 
-The stages before this one composed into a pure function: parse, admit, book, plan, render. It
-reads the state repo only through the ``read`` it is given and writes nothing, so a dry run, a
-replay on a moved remote and the real thing are the same call.
+It composes the stages before it into a pure function: parse, admit, book, plan, render. It reads
+the state repo only through ``read`` and writes nothing. So a dry run, a replay on a moved remote
+and the real run are the same call.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from demandops.demand import (
 from demandops.demand.claim import Subject
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, InvalidInput, Refused
-from demandops.ledger import apply as booking
-from demandops.ledger import restoration
-from demandops.ledger.apply import Changes, Ledger
-from demandops.ledger.restoration import Restoration
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Changes, Ledger
+from demandops.ledger.operations import restoration
+from demandops.ledger.operations.restoration import Restoration
 from demandops.plan import implied_connections
 from demandops.plan.checks import denial, quota
 from demandops.plan.connection_clients import is_bridged
 from demandops.plan.overrides import kept_claims
-from demandops.plan.overrides.claims_in_force import in_force
-from demandops.plan.release_keys import affected, all_keys
+from demandops.plan.overrides.suspended_claims import without_suspended
+from demandops.plan.release_keys import affected_keys, all_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
 from demandops.render.changes.changeset import FileReader, ReleaseChange
@@ -56,12 +56,12 @@ _OUTCOMES: dict[Operation, Outcome] = {
 }
 
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
-"""Yields why a request comes too soon after others of its requesters."""
+"""Yields a fault if a request comes too soon after others of its requesters."""
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What a demand is judged against: the configuration and the books at one commit."""
+    """The configuration and the ledger at one commit."""
 
     config: Config
     engine: Engine
@@ -75,9 +75,9 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What a demand does. ``files`` is empty where it changes nothing.
+    """What a demand does. ``files`` is empty if it changes nothing.
 
-    ``approval`` names what asks for a person's approval first: access domains, rules, appdefs.
+    ``approval`` names the access domains, rules and appdefs that require a person's approval first.
     """
 
     request: DemandRequest
@@ -89,12 +89,14 @@ class Decision:
     warnings: tuple[str, ...]
     approval: tuple[str, ...] = ()
     overrides: tuple[str, ...] = ()
-    """The files of the overrides that shaped what is written."""
+    """The files of the overrides that shaped the rendered files."""
 
     @property
     def lease_s(self) -> int | None:
-        """For how many seconds the demand holds unless it is renewed; nothing: without end."""
-        claims = self.state.ledger.of_demand(self.request.demand) if self.request.demand else ()
+        """The shortest lease of the demand, in seconds; ``None`` if it has no lease."""
+        claims = (
+            self.state.ledger.claims_of_demand(self.request.demand) if self.request.demand else ()
+        )
         claims = claims or tuple(change.after for change in self.changes.claims if change.after)
         return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
 
@@ -107,36 +109,36 @@ def decide(
     on_stage: Callable[[Stage], None] = lambda stage: None,
     throttle: Throttle = lambda request, config: (),
 ) -> Decision:
-    """Decide a goal of the reference's action or of our own.
+    """Decide on a goal of the reference's action or of our own.
 
     Args:
-        state: configuration and books to judge against.
+        state: the configuration and ledger to decide on.
         goal: the goal as plain data (:mod:`demandops.demand.deployment_request_goal`,
-            :mod:`demandops.demand.demand_goal`),
-            or a request of the generator's own, which is not checked again.
+            :mod:`demandops.demand.demand_goal`), or a request that the generator makes itself,
+            which is not checked again.
         now: when the demand was received, with time zone.
-        read: gives the text of a file of the state repo as it is, or nothing.
-        on_stage: told when the demand is admitted and when it is booked.
-        throttle: asked last before a request is admitted.
+        read: returns the current text of a file in the state repo, or ``None``.
+        on_stage: called when the demand is admitted and when it is booked.
+        throttle: checked last before a request is admitted.
 
     Raises:
-        Refused: with every fault, named by the wire's fields; nothing is to be written then.
-        InvalidInput: where the state repo's own files keep a valid demand from being rendered.
+        Refused: with every fault, by the goal's fields. Nothing may be written then.
+        InvalidInput: if a file of the state repo prevents the rendering of a valid demand.
     """
     request = goal if isinstance(goal, DemandRequest) else admit(state, goal, throttle)
     if isinstance(request, Restoration):
-        impossible = list(restoration.faults(request, state.ledger, state.config))
-        if impossible:
-            raise Refused(impossible)
+        faults = list(restoration.faults(request, state.ledger, state.config))
+        if faults:
+            raise Refused(faults)
     on_stage("admitted")
     try:
-        ledger, changes = _booked(state, request, now)
-        keys = affected(state.ledger, ledger, state.config, changes.subjects())
-        made = changeset.build_changeset(
+        ledger, changes = _book(state, request, now)
+        keys = affected_keys(state.ledger, ledger, state.config, changes.subjects())
+        rendered = changeset.build_changeset(
             state.ledger, ledger, changes.claims, keys, (state.config, state.engine, read)
         )
     except Refused as error:
-        raise Refused(_in_goals_words(error.faults, request, state.config)) from None
+        raise Refused(_with_goal_fields(error.faults, request, state.config)) from None
     on_stage("booked")
     outcome: Outcome = "unchanged"
     if changes.claims:
@@ -146,34 +148,34 @@ def decide(
         outcome=outcome,
         state=replace(state, ledger=ledger),
         changes=changes,
-        files=made.files if changes.claims else {},
-        releases=made.releases,
+        files=rendered.files if changes.claims else {},
+        releases=rendered.releases,
         warnings=(
-            *_uncarried(request, ledger, state.config),
-            *_bridged(request, state.config),
-            *made.blocked,
+            *_missing_connections(request, ledger, state.config),
+            *_already_bridged(request, state.config),
+            *rendered.blocked,
             *denial.warnings(request, ledger, state.config),
         ),
         approval=approval_rule.asked_by(
             request, ((c.before, c.after) for c in changes.claims), state.config
         ),
-        overrides=made.overrides,
+        overrides=rendered.overrides,
     )
 
 
-def _booked(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Book a request; what overrides keep gives way to it, and what it gives up they may keep.
+def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+    """Book a request. It replaces kept claims; overrides may keep what it releases.
 
     Raises:
-        Refused: where the books, an override or a quota do not allow it.
+        Refused: if existing claims, an override or a quota forbid it.
     """
-    asked, config = kept_claims.requested(request), state.config
-    ledger, changes = booking.apply(kept_claims.giving_way(state.ledger, asked), request, now)
+    subjects, config = kept_claims.requested_subjects(request), state.config
+    ledger, changes = apply(kept_claims.without_kept_claims(state.ledger, subjects), request, now)
     refusals = list(denial.faults(request, ledger, changes, config))
     refusals = refusals or list(quota.faults(state.ledger, ledger, changes, config))
     if refusals:
         raise Refused(refusals)
-    return kept_claims.settled(state.ledger, ledger, changes, asked, (config, now))
+    return kept_claims.with_kept_claims(state.ledger, ledger, changes, subjects, config, now)
 
 
 def admit(
@@ -182,7 +184,7 @@ def admit(
     """Parse a goal and check it against the configuration, its access domains and the throttle.
 
     Raises:
-        Refused: with every fault of form and content together.
+        Refused: with every fault, of form and of content.
     """
     config = state.config
     if isinstance(goal, dict) and decommission_goal.is_decommission(goal):
@@ -190,74 +192,78 @@ def admit(
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         request, faults = demand_goal.parse(goal)
         request = permission.with_terms(request, config)
-        request = implied_connections.with_connections(request, state.ledger, config)
+        request = implied_connections.with_implied_connections(request, state.ledger, config)
     else:
         parsed, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if parsed is None:
             raise Refused(faults)
         request = permission.with_terms(parsed, config)
     request = transport_choice.resolved(request, config, state.ledger.type_of)
-    told = {found.field for found in faults}
-    found_in_content = [*admission.faults(request, config), *permission.faults(request, config)]
-    content = _in_goals_words(found_in_content, request, config)
-    # what could not be read is not said to be missing
-    unread = bool(told & {"apps", "applications", "connections"})
+    malformed = {found.field for found in faults}
+    content_faults = [*admission.faults(request, config), *permission.faults(request, config)]
+    content = _with_goal_fields(content_faults, request, config)
+    # do not report as missing what could not be read
+    unread = bool(malformed & {"apps", "applications", "connections"})
     faults += [
         found
         for found in content
-        if not _told(found.field, told) and not (unread and found.code == "empty")
+        if not _overlaps(found.field, malformed) and not (unread and found.code == "empty")
     ]
     faults = faults or list(throttle(request, config))
     if faults:
-        raise Refused(sorted(dict.fromkeys(faults), key=lambda found: _subject(found.field)))
+        raise Refused(sorted(dict.fromkeys(faults), key=lambda found: _subject_of(found.field)))
     return request
 
 
 def form_faults(goal: object) -> list[Fault]:
-    """Return what of a goal has not the form of one: unknown fields, wrong types."""
+    """Return the faults in a goal's form: unknown fields, wrong types."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         return demand_goal.form_faults(goal)
     return deployment_request_goal.form_faults(goal)
 
 
-def consequence(
+def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
-    """Return what a change of the books that a person made asks of the rendered files."""
-    keys = affected(before, state.ledger, state.config, subjects)
+    """Return the changes of rendered files that a person's change of claims requires."""
+    keys = affected_keys(before, state.ledger, state.config, subjects)
     return changeset.build_changeset(
         before, state.ledger, (), keys, (state.config, state.engine, read)
     )
 
 
-def rendered(state: State, standing: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
-    """Return every generated file that the state asks for.
+def rendered_files(
+    state: State, current: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, str]:
+    """Return every generated file that the state requires, path → text.
 
     Args:
-        standing: the generated files as they are, of which overrides may hold some.
+        current: the current generated files; an override with ``hold`` keeps some of them.
     """
     keys = all_keys(state.ledger, state.config)
-    return changeset.render_all(state.ledger, state.config, state.engine, keys, standing)
+    return changeset.render_all(state.ledger, state.config, state.engine, keys, current)
 
 
-def _told(field: str, told: Iterable[str]) -> bool:
-    """Tell whether a field, or one around or inside it, was faulted for its form already."""
+def _overlaps(field: str, others: Iterable[str]) -> bool:
+    """Return whether a field equals, contains or is inside one of the others."""
     return any(
-        field == known
-        or field.startswith((f"{known}.", f"{known}["))
-        or known.startswith((f"{field}.", f"{field}["))
-        for known in told
+        field == other
+        or field.startswith((f"{other}.", f"{other}["))
+        or other.startswith((f"{field}.", f"{field}["))
+        for other in others
     )
 
 
-def _subject(field: str) -> tuple[str, int]:
-    """Return what a fault is about, so that faults of one subject are told together."""
+def _subject_of(field: str) -> tuple[str, int]:
+    """Return the subject of a field, to report faults of one subject together."""
     match = _SUBJECT.match(field)
     return (match[1], int(match[2])) if match else ("", 0)
 
 
-def _in_goals_words(faults: Iterable[Fault], request: DemandRequest, config: Config) -> list[Fault]:
-    """Return faults named by the fields of the goal that the request came as."""
+def _with_goal_fields(
+    faults: Iterable[Fault], request: DemandRequest, config: Config
+) -> list[Fault]:
+    """Return the faults with the field names of the original goal."""
 
     def field(path: str) -> str:
         if request.operation is Operation.DECOMMISSION:
@@ -269,23 +275,23 @@ def _in_goals_words(faults: Iterable[Fault], request: DemandRequest, config: Con
     return [replace(found, field=field(found.field)) for found in faults]
 
 
-def _uncarried(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
+def _missing_connections(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
     """Yield a warning for each input that no connection brings to the application's node."""
     if not request.operation.asks:
         return
-    ledger = in_force(ledger, config)
+    ledger = without_suspended(ledger, config)
     for app in request.applications:
         for foreign in implied_connections.foreign_inputs(app, config):
             topic = foreign.topic
-            if not ledger.carries(app.node, topic.topic):
+            if not ledger.is_carried_to(app.node, topic.topic):
                 yield (
                     f"application '{app.id}': no connection carries {foreign.name} {topic.topic} "
                     f"of '{topic.source}' to '{app.node}'"
                 )
 
 
-def _bridged(request: DemandRequest, config: Config) -> Iterator[str]:
-    """Yield a warning for each topic that the initial deployment carries already."""
+def _already_bridged(request: DemandRequest, config: Config) -> Iterator[str]:
+    """Yield a warning for each topic that the initial deployment already carries."""
     if not request.operation.asks:
         return
     for connection in request.connections:
@@ -298,15 +304,15 @@ def _bridged(request: DemandRequest, config: Config) -> Iterator[str]:
                 )
 
 
-def explain(error: InvalidInput) -> str:
+def refusal_text(error: InvalidInput) -> str:
     """Return a refusal as ``<code>: <field>: <remedy>``, one line for each fault."""
     return "\n".join(f"{found.code}: {found}" for found in error.faults)
 
 
-def rehearse(state: State) -> None:
-    """Try every appdef and every override in force on invented demands.
+def try_configuration(state: State) -> None:
+    """Render trial demands for every appdef and every override in effect.
 
     Raises:
-        Refused, InvalidInput: naming the template, the values or the override that does not work.
+        Refused, InvalidInput: with the template, the values or the override that does not work.
     """
     trial_render.render_trial_demands(state.config, state.engine)

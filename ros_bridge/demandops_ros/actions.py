@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from application_manager_interfaces.action import DeploymentRequest
 from builtin_interfaces.msg import Duration
 from demandops.cluster.health import Level
-from demandops.decision import explain
+from demandops.decision import refusal_text
 from demandops.errors import (
     DemandOpsError,
     InvalidInput,
@@ -115,7 +115,7 @@ def _text(outcome: Receipt | BaseException) -> str:
         lines += [f"not held: {item}" for item in outcome.not_held]
         return "\n".join(lines)
     if isinstance(outcome, InvalidInput):
-        return explain(outcome)
+        return refusal_text(outcome)
     if isinstance(outcome, Withdrawn):
         return str(outcome)
     return f"{_code(outcome)}: {outcome if isinstance(outcome, DemandOpsError) else repr(outcome)}"

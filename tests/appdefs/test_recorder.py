@@ -30,8 +30,8 @@ from asking import (
 from demandops.cli.main import run
 from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from demandops.errors import Refused
-from demandops.ledger import apply as booking
-from demandops.ledger.apply import Ledger
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import all_keys
@@ -260,8 +260,8 @@ def test_a_list_of_the_message_that_it_does_not_take_is_refused(books: Books) ->
 def test_another_kind_for_a_claimed_application_is_refused(books: Books) -> None:
     books.send(goal([record("edge/x")]))
     assert books.faults(goal([application("edge/x", who=["vehicle01"])])) == [
-        "apps[0].type: 'object-detection-fusion' contradicts what stands: 'edge/x' is held by "
-        "vehicle00 as 'recorder'; use another application id"
+        "apps[0].type: 'object-detection-fusion' contradicts an existing claim: 'edge/x' is held "
+        "by vehicle00 as 'recorder'; use another application id"
     ]
 
 
@@ -301,7 +301,7 @@ class TestParameters:
                 ),
             ),
         )
-        return booking.apply(ledger, request, NOW + timedelta(minutes=minute))[0]
+        return apply(ledger, request, NOW + timedelta(minutes=minute))[0]
 
     @staticmethod
     def planned(books: Books, ledger: Ledger, service: str = "recorder") -> dict[str, object]:
@@ -390,15 +390,15 @@ class TestParameters:
         assert [(found.field, found.message) for found in refused.value.faults] == [
             (
                 "parameters.rate",
-                "'fast' is no number, and the application definition takes the max",
+                "'fast' is not a number, but the application definition takes the max",
             )
         ]
 
     def test_parameters_are_in_the_values(self, books: Books) -> None:
         ledger = self.book(Ledger(), "a", rate=7, title="{{ x }}\n: 'y'", labels=["yes", "1e3"])
-        from demandops.decision import State, rendered
+        from demandops.decision import State, rendered_files
 
-        files = rendered(State(books.config, books.state.engine, ledger))
+        files = rendered_files(State(books.config, books.state.engine, ledger))
         (text,) = (text for path, text in files.items() if "/rec-" in path)
         values = yaml.safe_load(text)["spec"]["values"]
         assert values["rate"] == 7

@@ -16,9 +16,10 @@ import pygit2
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
-from demandops.decision import State, admit, rendered
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger, apply
+from demandops.decision import State, admit, rendered_files
+from demandops.ledger import claim_file
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Ledger
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo import new_repo
 from demandops.staterepo.git import tree as trees
@@ -119,8 +120,8 @@ def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
         for place in range(VEHICLES_PER_EDGE):
             request = admit(state, goal(edge_id(number), f"v{number:05d}x{place}"))
             ledger, _ = apply(ledger, request, now)
-    files |= {ledger_format.path_of(claim.key): ledger_format.write(claim) for claim in ledger}
-    files |= rendered(State(config, state.engine, ledger))
+    files |= {claim_file.path_of(claim.key): claim_file.text_of(claim) for claim in ledger}
+    files |= rendered_files(State(config, state.engine, ledger))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
     tree = trees.write(repo, None, files)

@@ -14,8 +14,8 @@ from pathlib import Path
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
-from demandops.decision import State, decide, rendered
-from demandops.ledger.apply import Ledger
+from demandops.decision import State, decide, rendered_files
+from demandops.ledger.ledger import Ledger
 from demandops.staterepo import new_repo
 
 HERE = Path(__file__).parent
@@ -49,7 +49,7 @@ def start(case: str) -> tuple[State, dict[str, str]]:
         files[path.relative_to(overlay).as_posix()] = path.read_text()
     config = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
     state = State.of(config, Ledger())
-    return state, rendered(state)
+    return state, rendered_files(state)
 
 
 def play(case: str) -> Iterator[tuple[str, dict[str, str]]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 import pytest
-from demandops.decision import rendered
+from demandops.decision import rendered_files
 
 from tests.golden.cases import CASES, EXPERIMENT, HERE, play, requests_of, start
 
@@ -59,4 +59,4 @@ def test_a_further_requester_changes_the_ledger_and_no_release() -> None:
 
 def test_rendering_from_the_books_alone_gives_the_same_bytes() -> None:
     state, standing = start("experiment")
-    assert rendered(state) == standing
+    assert rendered_files(state) == standing

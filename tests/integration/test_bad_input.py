@@ -187,7 +187,7 @@ class TestDefectsOfTheReference:
         assert refused(request_json(perception(shutdown=True))) == [
             (
                 "apps[0].header.id",
-                "nothing that the shutdown lists is held; claims that come near: none",
+                "nothing that the shutdown lists is held; similar claims: none",
             )
         ]
         assert state.tip == before
@@ -445,7 +445,7 @@ class TestRefusals:
         assert refused(request_json(asked)) == [
             (
                 "apps[0].header.node_id",
-                "'cloud' contradicts what stands: 'edge/object_detection_fusion' is held by "
+                "'cloud' contradicts an existing claim: 'edge/object_detection_fusion' is held by "
                 "vehicle00 on 'edge'; ask for that node, or wait until it is released",
             )
         ]

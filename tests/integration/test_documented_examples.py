@@ -15,9 +15,9 @@ from click.testing import CliRunner
 from demandops.cli.main import cli
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
-from demandops.decision import State, decide, explain, rendered
+from demandops.decision import State, decide, refusal_text, rendered_files
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.render.output_check import check_files
 from demandops.staterepo import new_repo
@@ -92,7 +92,7 @@ def test_the_policy_of_the_documentation_refuses_as_it_says(
     goal["applications"] = [application | {"node": node, "inputs": inputs}]
     with pytest.raises(Refused) as refused:
         decided(on, goal)
-    said = explain(refused.value)
+    said = refusal_text(refused.value)
     assert said == block("policy.md", start).strip()
     assert decided(on, demand()).outcome == "booked"
 
@@ -101,11 +101,11 @@ def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
     policy = block("policy.md", "apiVersion: demandops/v1\nkind: AccessDomains")
     on = state(**{"policy/access-domains.yaml": policy})
     path = "bootstrap/c-its.yaml"
-    _, manifests = rendered(on)[path].split("\n---\n", 1)
+    _, manifests = rendered_files(on)[path].split("\n---\n", 1)
     check_files({path: manifests})  # against the schema of Kubernetes
     kinds = [item["kind"] for item in yaml.safe_load_all(manifests)]
     assert kinds.count("NetworkPolicy") == 1
-    assert "NetworkPolicy" not in rendered(state())[path]
+    assert "NetworkPolicy" not in rendered_files(state())[path]
 
 
 def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:

@@ -122,9 +122,9 @@ def test_check_says_what_an_override_would_do_and_warns_of_idle_ones(
     found = demandops("check", clone)
     assert found.code == 0
     assert found.err.splitlines() == [
-        "warning: overrides/idle.yaml: matches nothing at present; mend select if it should",
-        "warning: overrides/over.yaml: expired at 2020-01-01T00:00:00Z and applies no more; remove "
-        "the file, or write a later time",
+        "warning: overrides/idle.yaml: matches nothing now; if it should, correct select",
+        "warning: overrides/over.yaml: expired at 2020-01-01T00:00:00Z and no longer applies; "
+        "remove the file, or write a later time",
     ]
     told = "  ~ od-edge-vehicle00 (object-detection on edge for vehicle00)"
     assert told in found.out.splitlines()

@@ -18,11 +18,11 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.config.file_model import Frozen, parse_file
 from demandops.config.load import load
 from demandops.config.policy import seconds_of
-from demandops.decision import Decision, State, decide, rendered
+from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, Refused
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger import claim_file
+from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.service.timing.lease_expiry import LeaseClock
 from demandops.service.timing.rate_limit import RateLimit
@@ -203,9 +203,9 @@ class World:
         """Take a configuration in, and write what follows of it."""
         self.state = replace(state, ledger=self.state.ledger)
         empty = replace(state, ledger=Ledger())
-        self._standing = {**_skeleton(), **config, **rendered(empty)}
-        claims = {p: text for p, text in self.files.items() if ledger_format.kind_of(p)}
-        self.files = {**self._standing, **claims, **rendered(self.state)}
+        self._standing = {**_skeleton(), **config, **rendered_files(empty)}
+        claims = {p: text for p, text in self.files.items() if claim_file.kind_of(p)}
+        self.files = {**self._standing, **claims, **rendered_files(self.state)}
 
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
@@ -286,12 +286,12 @@ class World:
     def assert_sound(self) -> None:
         """The files say what the books say, and nothing else is there."""
         claims = [
-            ledger_format.read(text, path)
+            claim_file.read(text, path)
             for path, text in self.files.items()
-            if ledger_format.kind_of(path)
+            if claim_file.kind_of(path)
         ]
         assert rebuilt(claims) == self.state.ledger
-        asked = rendered(self.state)
+        asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())
         assert not names, f"these are there and not asked for, or the other way round: {names}"

@@ -56,7 +56,7 @@ class Config:
     ended: Mapping[str, str] = field(default_factory=dict)
     in_force: tuple[Override, ...] = ()
     judged: dict[Hashable, Override | None] = field(default_factory=dict, compare=False, repr=False)
-    """What was found denied, kept by :mod:`demandops.plan.overrides.claims_in_force`."""
+    """What was found denied, kept by :mod:`demandops.plan.overrides.suspended_claims`."""
 
     def with_ended(self, ended: Mapping[str, str]) -> Config:
         """Return the configuration with these overrides ended."""

@@ -1,4 +1,4 @@
-"""Stage 3, what is booked: the set of claims, how requests change it, and how it is written.
+"""Stage 3, what is booked: the set of claims, the operations on it, and its files.
 
-Pure: no clock, no disk, no Git. Knows nothing of what runs because of a claim.
+Pure: no clock, no disk, no Git. Does not know what runs because of a claim.
 """

@@ -1,6 +1,6 @@
-"""The ledger's one operation: :func:`apply` books a request, renews or releases what it holds.
+"""The one way to change the ledger: :func:`apply` carries out a request.
 
-As a whole or not at all, and it says what changed. Semantics: ``docs/architecture.md``, "Booking".
+What each operation means: ``docs/architecture.md``, "Booking".
 """
 
 from __future__ import annotations
@@ -8,44 +8,45 @@ from __future__ import annotations
 from datetime import datetime
 
 from demandops.demand.demand_request import DemandRequest, Operation
-from demandops.ledger import named_demand
-from demandops.ledger.decommission import decommission
-from demandops.ledger.join import join
-from demandops.ledger.ledger import Changes, ClaimChange, Ledger
-from demandops.ledger.restoration import restore
-from demandops.ledger.shutdown import release
-
-__all__ = ["Changes", "ClaimChange", "Ledger", "apply"]
+from demandops.ledger.ledger import Changes, Ledger
+from demandops.ledger.operations.decommission import decommission
+from demandops.ledger.operations.demand_release import release_demand
+from demandops.ledger.operations.join import join
+from demandops.ledger.operations.lease_end import release_ended
+from demandops.ledger.operations.lease_renewal import renew_leases
+from demandops.ledger.operations.put import put
+from demandops.ledger.operations.restoration import restore
+from demandops.ledger.operations.shutdown import shut_down
 
 
 def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Carry out what ``request`` asks: book, replace, renew, release.
+    """Book, replace, renew or release what ``request`` asks for.
 
     Args:
-        ledger: what is booked.
+        ledger: the claims before the request.
         request: an admitted request (:mod:`demandops.demand.admission`).
-        now: when it was received, with time zone; kept in claims that change.
+        now: when the request was received, with time zone; claims that change keep it.
 
     Returns:
         The new ledger and what changed. Booking twice changes nothing.
 
     Raises:
-        Refused: with every contradiction to a standing claim, or where what is to be released or
-            renewed is not held. Nothing is booked then.
+        Refused: with every conflict with an existing claim, or if the request releases or renews
+            what is not held. Nothing is booked then.
     """
     match request.operation:
         case Operation.JOIN:
             return join(ledger, request, now)
         case Operation.SHUTDOWN:
-            return release(ledger, request, now)
+            return shut_down(ledger, request, now)
         case Operation.PUT:
-            return named_demand.put(ledger, request, now)
+            return put(ledger, request, now)
         case Operation.RELEASE:
-            return named_demand.release(ledger, request)
+            return release_demand(ledger, request)
         case Operation.RENEW:
-            return named_demand.renew(ledger, request, now)
+            return renew_leases(ledger, request, now)
         case Operation.EXPIRE:
-            return named_demand.expire(ledger, request, now)
+            return release_ended(ledger, request, now)
         case Operation.DECOMMISSION:
             return decommission(ledger, request, now)
         case Operation.ROLLBACK:

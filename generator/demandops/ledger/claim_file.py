@@ -1,8 +1,8 @@
-"""How claims are written: one YAML file each, with a schema version.
+"""Claim files: one YAML file for each claim, with a schema version.
 
-``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``: ``hh`` fans the folders out (a
-Git tree with 100,000 entries costs 100 ms a commit), path segments are slugs with a hash of the
-exact id, and the exact ids stand inside and must match, so that a moved file is noticed.
+The path is ``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``. ``hh`` spreads the
+folders, because a Git tree with 100,000 entries costs 100 ms a commit. Path segments are slugs with
+a hash of the exact id. The file holds the exact ids, so a moved file is noticed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
 
 
 def segment(exact: str) -> str:
-    """Return a path segment for an id: readable, safe on every file system, and never shared."""
+    """Return a path segment for an id: readable, safe on every file system, and unique."""
     digest = hashlib.sha256(exact.encode()).hexdigest()[:16]
     slug = re.sub(r"[^a-z0-9]+", "-", exact.lower()).strip("-")[:40].rstrip("-")
     return f"{slug}-{digest}" if slug else digest
@@ -90,7 +90,7 @@ def _plain_route(value: object) -> object:
 class _Lease(Frozen):
     seconds: int = Field(ge=1, le=LONGEST_S)
     slack: int = Field(default=0, ge=0, le=LONGEST_S)
-    until: Timestamp | None = None  # not yet: the claim was proposed, and is not taken in
+    until: Timestamp | None = None  # None: the lease starts with the approval
 
     def lease(self) -> Lease:
         until = _time(self.until) if self.until else UNSTARTED
@@ -126,8 +126,8 @@ class _ConnectionFile(_Claim):
     topics: dict[str, Annotated[_Route, BeforeValidator(_plain_route)]] = Field(min_length=1)
 
 
-def write(claim: Claim) -> str:
-    """Return the text of a claim's file; the same claim gives the same bytes."""
+def text_of(claim: Claim) -> str:
+    """Return the text of a claim's file. The same claim gives the same bytes."""
     head: dict[str, Any] = {"apiVersion": LEDGER_API_VERSION}
     tail: dict[str, Any]
     if isinstance(claim, ApplicationClaim):
@@ -184,7 +184,7 @@ def read(text: str, path: str) -> Claim:
     """Parse a claim's file.
 
     Raises:
-        InvalidInput: with every fault, among them a file that stands where its ids do not say.
+        InvalidInput: with every fault, also if the path does not match the ids in the file.
     """
     try:
         data = strict_yaml.load(text)
@@ -269,7 +269,7 @@ def _connection(file: _ConnectionFile) -> Claim:
 
 
 def kind_of(path: str) -> SubjectKind | None:
-    """Return which kind of claim a path of the ledger holds, or nothing for other files."""
+    """Return the kind of claim that a path holds, or ``None`` for other files."""
     parts = path.split("/")
     if len(parts) != 5 or parts[0] != LEDGER_ROOT or not path.endswith(".yaml"):
         return None

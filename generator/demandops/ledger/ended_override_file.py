@@ -1,8 +1,8 @@
-"""Markers: which overrides ended, and when, as files of the ledger.
+"""Markers: files of the ledger that record which overrides ended, and when.
 
-Whether an override applies must follow from the repo alone, or a replay and ``verify`` would give
-other bytes than the day did. So the generator commits that one ended, and a person's file that
-names a later time is in force again.
+Only the repo may decide whether an override applies: a replay and ``verify`` must give the same
+bytes as the original run. So the generator commits a marker when an override ends. If a person
+then writes a later end into the override, it is in effect again.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ def path_of(name: str) -> str:
     return f"{MARKERS_ROOT}/{name}.yaml"
 
 
-def write(override: Override) -> str:
-    """Return the text that says that an override ended at the time that it names."""
-    assert override.end is not None  # noqa: S101 - only such a one ends
+def text_of(override: Override) -> str:
+    """Return the text of the marker of an override that reached its end."""
+    assert override.end is not None  # noqa: S101 - only an override with an end ends
     return strict_yaml.dump(
         {
             "apiVersion": LEDGER_API_VERSION,
@@ -48,7 +48,7 @@ def write(override: Override) -> str:
 def read(files: Mapping[str, str]) -> dict[str, str]:
     """Return override → the time at which it ended.
 
-    What is no marker says nothing; :func:`stale` has it removed.
+    Files that are not markers are skipped; :func:`stale_markers` lists them for removal.
     """
     ended = {}
     for path, text in files.items():
@@ -62,12 +62,12 @@ def read(files: Mapping[str, str]) -> dict[str, str]:
     return ended
 
 
-def stale(paths: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
-    """Return the markers whose override is gone, or names another time by now."""
+def stale_markers(paths: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
+    """Return the markers whose override is gone or has another end."""
     ended = read(paths)
-    fitting = {
+    current = {
         path_of(name)
         for name, override in overrides.items()
         if override.end is not None and ended.get(name) == written(override.end)
     }
-    return sorted({*paths} - fitting)
+    return sorted({*paths} - current)

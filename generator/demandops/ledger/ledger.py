@@ -1,6 +1,6 @@
-"""The books: which demand holds which subject, as a set of persistent maps.
+"""The ledger: which demand holds which subject, as a set of persistent maps.
 
-A :class:`Ledger` never changes: a new one costs what a request touches and not what is booked.
+A :class:`Ledger` never changes. A new one costs what a request touches, not what is booked.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Claims: TypeAlias = "HashTrieMap[str, Claim]"
 
 @dataclass(frozen=True, slots=True)
 class ClaimChange:
-    """One claim before and after; nothing before it was booked, nothing after it was released."""
+    """One claim before and after: ``None`` before it is booked and after it is released."""
 
     before: Claim | None
     after: Claim | None
@@ -44,7 +44,7 @@ class ClaimChange:
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What a request did: the claims that changed and what of a shutdown was not held."""
+    """The claims that a request changed, and what a shutdown listed that was not held."""
 
     claims: tuple[ClaimChange, ...] = ()
     not_held: tuple[str, ...] = ()
@@ -62,79 +62,79 @@ Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """All claims, with an index for each question that a request asks.
+    """All claims, and an index of them.
 
-    ``index`` maps what :func:`entries` says of a claim to the claims of which it holds.
-    ``minutes`` are those in which some lease ends: the next end is found without looking at all.
+    ``index`` maps each entry of :func:`index_entries` to the claims that have it.
+    ``minutes`` are those in which a lease ends. They give the next end without a full scan.
     """
 
     claims: HashTrieMap[Subject, Claims] = field(default_factory=HashTrieMap)
     index: Index = field(default_factory=HashTrieMap)
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
 
-    def of(self, subject: Subject) -> tuple[Claim, ...]:
+    def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
         held = self.claims.get(subject)
         return tuple(held[demand] for demand in sorted(held)) if held else ()
 
-    def application(self, application: str) -> tuple[ApplicationClaim, ...]:
+    def application_claims(self, application: str) -> tuple[ApplicationClaim, ...]:
         """Return the claims on an application."""
-        claims = self.of(Subject(SubjectKind.APPLICATION, application))
+        claims = self.claims_on(Subject(SubjectKind.APPLICATION, application))
         return tuple(claim for claim in claims if isinstance(claim, ApplicationClaim))
 
-    def connection(self, connection: str) -> tuple[ConnectionClaim, ...]:
+    def connection_claims(self, connection: str) -> tuple[ConnectionClaim, ...]:
         """Return the claims on a connection."""
-        claims = self.of(Subject(SubjectKind.CONNECTION, connection))
+        claims = self.claims_on(Subject(SubjectKind.CONNECTION, connection))
         return tuple(claim for claim in claims if isinstance(claim, ConnectionClaim))
 
     def type_of(self, connection: str) -> ConnectionType | None:
-        """Return the type of a connection that something holds, or nothing."""
-        claims = self.connection(connection)
+        """Return the type of a connection that a claim holds, or ``None``."""
+        claims = self.connection_claims(connection)
         return claims[0].type if claims else None
 
     def subjects(self, kind: SubjectKind) -> list[str]:
-        """Return the ids of all subjects of a kind that something holds, sorted."""
+        """Return the ids of all subjects of a kind that have claims, sorted."""
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
-    def taking(self, source: str, topic: str) -> tuple[str, ...]:
-        """Return the applications that take ``topic`` of ``source`` in, sorted."""
+    def applications_taking(self, source: str, topic: str) -> tuple[str, ...]:
+        """Return the applications that have ``topic`` of ``source`` as an input, sorted."""
         return self._ids("takes", source, topic)
 
-    def bringing(self, target: str, topic: str) -> tuple[str, ...]:
+    def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         """Return the connections that bring ``topic`` to the node ``target``, sorted."""
         return self._ids("brings", target, topic)
 
-    def carries(self, target: str, topic: str) -> bool:
-        """Tell whether some connection brings ``topic`` to the node ``target``."""
+    def is_carried_to(self, target: str, topic: str) -> bool:
+        """Return whether a connection brings ``topic`` to the node ``target``."""
         return ("brings", target, topic) in self.index
 
-    def of_demand(self, demand: str) -> tuple[Claim, ...]:
+    def claims_of_demand(self, demand: str) -> tuple[Claim, ...]:
         """Return the claims of one demand, sorted by subject."""
         return self._claims("demand", demand)
 
-    def of_requester(self, requester: str) -> tuple[Claim, ...]:
-        """Return the claims in a requester's name, sorted by subject and demand."""
+    def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
+        """Return the claims of a requester, sorted by subject and demand."""
         return self._claims("requester", requester)
 
-    def at_node(self, node: str) -> tuple[str, ...]:
-        """Return the applications that run on a node or take a topic of it in, sorted."""
+    def applications_at(self, node: str) -> tuple[str, ...]:
+        """Return the applications that run on a node or have an input from it, sorted."""
         return self._ids("node", node)
 
-    def next_end(self) -> datetime | None:
-        """Return when the first lease ends, or nothing where there is none."""
+    def next_lease_end(self) -> datetime | None:
+        """Return when the first lease ends, or ``None`` if there is no lease."""
         if not self.minutes:
             return None
         first = self._claims(_ENDS, min(self.minutes))
         return min(claim.lease.ends for claim in first if claim.lease)
 
-    def unstarted(self) -> tuple[Claim, ...]:
-        """Return the claims whose lease has not begun: approved, and not yet taken in."""
+    def unstarted_claims(self) -> tuple[Claim, ...]:
+        """Return the approved claims whose lease the generator has not started yet."""
         later = (minute for minute in self.minutes if minute >= _minute(UNSTARTED))
         found = (claim for minute in sorted(later) for claim in self._claims(_ENDS, minute))
         return tuple(claim for claim in found if claim.lease and not claim.lease.has_started)
 
-    def ended(self, now: datetime) -> tuple[Claim, ...]:
-        """Return the claims whose lease ended before ``now``, the first to end first."""
+    def ended_claims(self, now: datetime) -> tuple[Claim, ...]:
+        """Return the claims whose lease ended before ``now``, sorted by its end."""
         over = (minute for minute in self.minutes if minute <= _minute(now))
         ended = [
             (claim.lease.ends, claim)
@@ -152,17 +152,17 @@ class Ledger:
         found = (self.get(key) for key in keys)
         return tuple(claim for claim in found if claim is not None)
 
-    def at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
+    def connections_at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
         """Return the connections of a type that end at ``node``, sorted."""
         return self._ids("link", kind.name, node)
 
-    def connected(self, node: str) -> tuple[str, ...]:
-        """Return the connections that end at a node or go by a broker that was asked for there."""
-        found = {id for kind in ConnectionType for id in self.at(kind, node)}
+    def connections_needing(self, node: str) -> tuple[str, ...]:
+        """Return the connections that end at a node or name its broker, sorted."""
+        found = {id for kind in ConnectionType for id in self.connections_at(kind, node)}
         return tuple(sorted(found | set(self._ids("broker", node))))
 
-    def names(self, entry: str) -> set[str]:
-        """Return what the index has of one kind, the requesters say; costs as much as there is."""
+    def indexed_names(self, entry: str) -> set[str]:
+        """Return all names of one kind of index entry, such as ``requester``. Scans the index."""
         return {known[-1] for known in self.index if known[0] == entry}
 
     def get(self, key: ClaimKey) -> Claim | None:
@@ -171,19 +171,19 @@ class Ledger:
         return held.get(key.demand) if held else None
 
     def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
-        """Return the ledger with the claim at ``key`` set, or gone where ``claim`` is nothing."""
+        """Return the ledger with ``claim`` at ``key``, or with no claim there if it is ``None``."""
         held = self.claims.get(key.subject, HashTrieMap())
         old = held.get(key.demand)
         if old == claim:
             return self
         held = held.insert(key.demand, claim) if claim else held.remove(key.demand)
         claims = self.claims.insert(key.subject, held) if held else self.claims.remove(key.subject)
-        before, after = entries(old), entries(claim)
+        before, after = index_entries(old), index_entries(claim)
         index, minutes = self.index, self.minutes
         for entry in before - after:
-            rest = index[entry].remove(key)
-            index = index.insert(entry, rest) if rest else index.remove(entry)
-            if not rest and entry[0] == _ENDS:
+            others = index[entry].remove(key)
+            index = index.insert(entry, others) if others else index.remove(entry)
+            if not others and entry[0] == _ENDS:
                 minutes = minutes.remove(entry[1])
         for entry in after - before:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
@@ -191,12 +191,17 @@ class Ledger:
                 minutes = minutes.insert(entry[1])
         return Ledger(claims, index, minutes)
 
-    def restored(self, subject: Subject, other: Ledger) -> Ledger:
-        """Return the ledger with the claims on ``subject`` as they are in ``other``."""
+    def without(self, claims: Iterable[Claim]) -> Ledger:
+        """Return the ledger without these claims."""
         ledger = self
-        for claim in self.of(subject):
+        for claim in claims:
             ledger = ledger.replace(claim.key, None)
-        for claim in other.of(subject):
+        return ledger
+
+    def with_claims_from(self, subject: Subject, other: Ledger) -> Ledger:
+        """Return the ledger with the claims on ``subject`` as they are in ``other``."""
+        ledger = self.without(self.claims_on(subject))
+        for claim in other.claims_on(subject):
             ledger = ledger.replace(claim.key, claim)
         return ledger
 
@@ -210,8 +215,8 @@ class Ledger:
         return sum(len(claims) for claims in self.claims.values())
 
 
-def entries(claim: Claim | None) -> set[Entry]:
-    """Return what a claim is found by."""
+def index_entries(claim: Claim | None) -> set[Entry]:
+    """Return the index entries of a claim."""
     if claim is None:
         return set()
     found: set[Entry] = {("demand", claim.demand)}
@@ -234,11 +239,13 @@ def entries(claim: Claim | None) -> set[Entry]:
 
 
 def _minute(moment: datetime) -> str:
-    """Return the minute of a moment, in UTC and so that texts sort as times do."""
+    """Return the minute of a time, in UTC, as a text that sorts like the time."""
     return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
 
 
-def differences(before: Ledger, after: Ledger, keys: Iterable[ClaimKey]) -> tuple[ClaimChange, ...]:
-    """Return the claims at ``keys`` that are not the same in both ledgers."""
+def claim_changes(
+    before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
+) -> tuple[ClaimChange, ...]:
+    """Return the claims at ``keys`` that differ between two ledgers."""
     changes = (ClaimChange(before.get(key), after.get(key)) for key in dict.fromkeys(keys))
     return tuple(change for change in changes if change.before != change.after)

@@ -1,4 +1,4 @@
-"""Stage 4, what should run: releases derived from claims, for what a demand affects only.
+"""Stage 4, what should run: releases derived from claims.
 
-Knows the ledger and the configuration; nothing of Helm, Flux or files.
+Knows the ledger and the configuration, but not Helm, Flux or files.
 """

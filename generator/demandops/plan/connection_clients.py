@@ -1,7 +1,7 @@
-"""From claims on connections to communication clients.
+"""The communication clients of claimed connections.
 
-MQTT and ROS connections have a client of their own at each end. Zenoh connections share one
-bridge on each node, for two on one host and ROS domain do not work.
+MQTT and ROS connections have a client of their own at each end. Zenoh connections share one bridge
+on each node, because two bridges on one host and ROS domain do not work.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from demandops.demand.demand_request import ConnectionType
 from demandops.demand.route import Route
 from demandops.demand.transport_choice import choose_broker, message_type, misfits
 from demandops.errors import Fault, Refused, fault
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan import naming
-from demandops.plan.release import Address, Bridge, MqttEnd, RosEnd, place
+from demandops.plan.release import Address, Bridge, MqttEnd, RosEnd, node_and_domain
 
 Side = Literal["source", "target"]
 
 
 @dataclass(frozen=True, slots=True)
 class EndKey:
-    """One end of a connection that has clients of its own."""
+    """One end of an MQTT or ROS connection."""
 
     connection: str
     side: Side
@@ -42,9 +42,9 @@ class BridgeKey:
     node: str
 
 
-def keys_of(ledger: Ledger, connection: str) -> Iterator[EndKey | BridgeKey]:
-    """Yield the clients that run because a connection is held."""
-    claims = ledger.connection(connection)
+def client_keys(ledger: Ledger, connection: str) -> Iterator[EndKey | BridgeKey]:
+    """Yield the keys of the clients that a connection needs."""
+    claims = ledger.connection_claims(connection)
     if not claims:
         return
     if claims[0].type is ConnectionType.ZENOH:
@@ -56,28 +56,28 @@ def keys_of(ledger: Ledger, connection: str) -> Iterator[EndKey | BridgeKey]:
 
 
 def connection_topics(claims: Iterable[ConnectionClaim]) -> dict[str, Route]:
-    """Return the routes by source topic, united over a connection's claims and sorted."""
+    """Return the routes of all claims on a connection by source topic, sorted."""
     return routes.united(route for claim in claims for route in claim.topics.values())
 
 
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
-    """Tell whether the initial deployment carries a topic between two ends already.
+    """Return whether the initial deployment already carries a topic between two ends.
 
-    It keeps names, so a route that gives the topic another name is not carried by it.
+    It keeps topic names, so it does not carry a route that renames the topic.
     """
-    giving, taking = route.ends(source, target)
-    node = config.nodes.get(giving)
+    sender, receiver = route.ends(source, target)
+    node = config.nodes.get(sender)
     if node is None or route.source != route.target:
         return False
-    return route.read in node.bridged.get(taking, ())
+    return route.read in node.bridged.get(receiver, ())
 
 
-def carried(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[str, Route]:
+def carried_routes(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[str, Route]:
     """Return the routes that a connection's clients must carry: those not bridged already.
 
     Raises:
-        Refused: where a person wrote a claim that its type cannot carry, or took out of the
-            inventory what it needs.
+        Refused: if a person wrote a claim that its type cannot carry, or removed what it needs from
+            the inventory.
     """
     first = claims[0]
     topics = {
@@ -85,25 +85,25 @@ def carried(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[str, Ro
         for name, route in connection_topics(claims).items()
         if not is_bridged(route, first.source, first.target, config)
     }
-    found = list(misfits(first.type, topics.values(), (first.source, first.target), config))
-    if found:
+    problems = list(misfits(first.type, topics.values(), (first.source, first.target), config))
+    if problems:
         raise Refused(
             replace(one, field="connections", message=f"'{first.connection}': {one.message}")
-            for one in found
+            for one in problems
         )
     return topics
 
 
-def end(ledger: Ledger, config: Config, key: EndKey) -> MqttEnd | RosEnd | None:
-    """Return one end of a connection, or nothing where it carries no topic.
+def connection_end(ledger: Ledger, config: Config, key: EndKey) -> MqttEnd | RosEnd | None:
+    """Return one end of a connection, or ``None`` if it carries no topic.
 
     Raises:
-        Refused: where the configuration no longer has what the connection needs.
+        Refused: if the configuration no longer has what the connection needs.
     """
-    claims = ledger.connection(key.connection)
+    claims = ledger.connection_claims(key.connection)
     if not claims or claims[0].type is ConnectionType.ZENOH:
         return None
-    topics = carried(claims, config)
+    topics = carried_routes(claims, config)
     if not topics:
         return None
     if claims[0].type is ConnectionType.MQTT:
@@ -115,21 +115,21 @@ def _mqtt_end(
     claims: tuple[ConnectionClaim, ...], config: Config, key: EndKey, topics: dict[str, Route]
 ) -> MqttEnd:
     first = claims[0]
-    wanted = next((claim.broker for claim in claims if claim.broker), "")
-    broker = choose_broker(wanted, first.source, first.target, config)
+    named = next((claim.broker for claim in claims if claim.broker), "")
+    broker = choose_broker(named, first.source, first.target, config)
     if broker is None:
         raise Refused(
             [
                 fault(
                     "broker",
-                    f"connection '{key.connection}' finds no broker; add one to "
+                    f"connection '{key.connection}' has no broker; add one to "
                     "inventory/brokers.yaml",
                     code="no-broker",
                 )
             ]
         )
     own, peer = _own_and_peer(first, key)
-    node, domain = place(config, own)
+    node, domain = node_and_domain(config, own)
     return MqttEnd(
         connection=key.connection,
         side=key.side,
@@ -149,7 +149,7 @@ def _own_and_peer(claim: ConnectionClaim, key: EndKey) -> tuple[str, str]:
 
 
 def _ros_end(ledger: Ledger, config: Config, key: EndKey, topics: dict[str, Route]) -> RosEnd:
-    claim = ledger.connection(key.connection)[0]
+    claim = ledger.connection_claims(key.connection)[0]
     ends = (claim.source, claim.target)
     typed = {
         name: replace(route, type=message_type(route, route.ends(*ends)[0], config))
@@ -157,19 +157,19 @@ def _ros_end(ledger: Ledger, config: Config, key: EndKey, topics: dict[str, Rout
     }
     listener = _listener(claim, config)
     if listener is None:
-        raise _stuck(key.connection, "finds no end with a wan address any more; restore it")
+        raise _unsupported(key.connection, "has no end with a wan address any longer; restore one")
     address = _address(key.connection, listener)
-    for other in ledger.at(ConnectionType.ROS, listener.id):
+    for other in ledger.connections_at(ConnectionType.ROS, listener.id):
         if other == key.connection or _address(other, listener) != address:
             continue
-        if _listener(ledger.connection(other)[0], config) is listener:
-            raise _stuck(
+        if _listener(ledger.connection_claims(other)[0], config) is listener:
+            raise _unsupported(
                 key.connection,
                 f"would listen on port {address.port} of '{listener.id}', as '{other}' does; use "
                 "another connection id, or widen firstPort and lastPort of its wan",
             )
     own, peer = _own_and_peer(claim, key)
-    node, domain = place(config, own)
+    node, domain = node_and_domain(config, own)
     return RosEnd(
         connection=key.connection,
         side=key.side,
@@ -183,13 +183,13 @@ def _ros_end(ledger: Ledger, config: Config, key: EndKey, topics: dict[str, Rout
     )
 
 
-def _stuck(connection: str, reason: str) -> Refused:
+def _unsupported(connection: str, reason: str) -> Refused:
     message = f"connection '{connection}' {reason}"
     return Refused([fault("connections", message, code="unsupported-connection-type")])
 
 
 def _listener(claim: ConnectionClaim, config: Config) -> Node | None:
-    """Return the end that the other connects to: the target where it can be reached."""
+    """Return the end that the other connects to: the target if it has a wan address."""
     for id in (claim.target, claim.source):
         node = config.nodes.get(id)
         if node is not None and node.wan is not None:
@@ -198,33 +198,33 @@ def _listener(claim: ConnectionClaim, config: Config) -> Node | None:
 
 
 def _address(connection: str, listener: Node) -> Address:
-    """Return where a connection's routers meet: a port that follows from its id alone."""
+    """Return where a connection's routers meet; the port depends on the connection id alone."""
     wan = listener.wan
-    assert wan is not None  # noqa: S101 - that makes it the listener
+    assert wan is not None  # noqa: S101 - a listener has one
     ports = wan.last_port - wan.first_port + 1
     return Address(wan.host, wan.first_port + _number(connection) % ports, wan.transport)
 
 
 @lru_cache(maxsize=65_536)
 def _number(connection: str) -> int:
-    """Return a number of a connection's id; kept, for all that share a node are compared."""
+    """Return a number for a connection id; cached, because all ids of a node are compared."""
     return int(naming.digest("port", connection), 16)
 
 
-def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
-    """Return a node's Zenoh bridge, or nothing where no connection needs it.
+def zenoh_bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
+    """Return a node's Zenoh bridge, or ``None`` if no connection needs it.
 
     Raises:
-        Refused: where two connections want different rates of one topic, or the configuration no
+        Refused: if two connections ask for different rates of one topic, or the configuration no
             longer has what they need.
     """
     publishers: dict[str, tuple[float, str]] = {}
     subscribers: set[str] = set()
     connections: dict[str, str] = {}
-    for id in ledger.at(ConnectionType.ZENOH, key.node):
-        claims = ledger.connection(id)
+    for id in ledger.connections_at(ConnectionType.ZENOH, key.node):
+        claims = ledger.connection_claims(id)
         source, target = claims[0].source, claims[0].target
-        for route in carried(claims, config).values():
+        for route in carried_routes(claims, config).values():
             connections[id] = target if key.node == source else source
             if key.node != route.ends(source, target)[0]:
                 subscribers.add(route.written)
@@ -234,7 +234,7 @@ def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
                 raise Refused([_two_rates(route, id, rate, other, key.node)])
     if not connections:
         return None
-    node, domain = place(config, key.node)
+    node, domain = node_and_domain(config, key.node)
     return Bridge(
         name=naming.object_name("zenoh", key.node),
         node=node,
@@ -251,7 +251,8 @@ def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
 def _two_rates(route: Route, id: str, rate: float, other: str, node: str) -> Fault:
     return fault(
         "connections",
-        f"rate {route.rate} of '{route.read}' in '{id}' contradicts what stands: '{other}' carries "
+        f"rate {route.rate} of '{route.read}' in '{id}' contradicts an existing claim: '{other}' "
+        "carries "
         f"it from '{node}' with rate {rate}, and the node's bridge has one for each topic; use the "
         "same",
         code="conflict",
@@ -259,10 +260,10 @@ def _two_rates(route: Route, id: str, rate: float, other: str, node: str) -> Fau
 
 
 def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
-    """Return where a bridge connects to: its routers, and peers that do not connect to it.
+    """Return the endpoints that a bridge connects to: its routers, and some of its peers.
 
-    Of two that can both be reached, the one whose id comes first connects, so that there is one
-    link between them whatever they carry.
+    If two peers can reach each other, only the one whose id sorts first connects. So there is one
+    link between them.
     """
     if node.zenoh is None:
         raise Refused(
@@ -270,7 +271,7 @@ def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
                 fault(
                     "node",
                     f"'{node.id}' carries Zenoh connections, but has no zenoh in "
-                    "inventory/nodes.yaml any more; restore it",
+                    "inventory/nodes.yaml any longer; restore it",
                     code="unsupported-connection-type",
                 )
             ]

@@ -1,7 +1,7 @@
-"""Connections that a demand leaves out: its inputs of other nodes must come by something.
+"""Connections that a demand needs for inputs from other nodes, but does not list.
 
-A derived connection is claimed like one that was listed, by the demand that needs it. So it is
-shared with others, follows when the demand moves its application, and goes with it.
+The demand claims such a connection as if it had listed it. So the connection is shared with other
+demands, changes when the application moves, and is released with the demand.
 """
 
 from __future__ import annotations
@@ -17,18 +17,20 @@ from demandops.demand.demand_request import (
 )
 from demandops.demand.route import Route
 from demandops.identifiers import topic_problem
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import outputs
 from demandops.plan.release import ServiceKey
 
 
-def with_connections(request: DemandRequest, ledger: Ledger, config: Config) -> DemandRequest:
-    """Return the request with a connection for each input that would not arrive otherwise.
+def with_implied_connections(
+    request: DemandRequest, ledger: Ledger, config: Config
+) -> DemandRequest:
+    """Return the request with a connection for each input that no listed connection brings.
 
-    One that others hold and that brings the topic already is joined; else the two nodes share one
-    connection of their own. None is derived from a faulty input, which is told as it is.
+    A connection that already brings the topic is joined. Otherwise the two nodes get a connection
+    of their own. A faulty input adds none; admission reports it.
     """
-    found = list(request.connections)
+    connections = list(request.connections)
     brought = {
         (route.ends(connection.source, connection.target)[1], route.written)
         for connection in request.connections
@@ -39,20 +41,22 @@ def with_connections(request: DemandRequest, ledger: Ledger, config: Config) -> 
             continue
         for foreign in foreign_inputs(app, config):
             topic = foreign.topic
-            if (app.node, topic.topic) in brought or not _sound(app, topic, config):
+            if (app.node, topic.topic) in brought or not _is_valid(app, topic, config):
                 continue
-            wanted = _connection(app, topic.source, topic.topic, ledger)
-            same = (wanted.id, wanted.source, wanted.target)
-            known = next((c for c in found if (c.id, c.source, c.target) == same), None)
+            needed = _connection(app, topic.source, topic.topic, ledger)
+            same = (needed.id, needed.source, needed.target)
+            known = next((c for c in connections if (c.id, c.source, c.target) == same), None)
             if known is None:
-                found.append(replace(wanted, because=f"applications[{index}].{foreign.field}"))
+                connections.append(
+                    replace(needed, because=f"applications[{index}].{foreign.field}")
+                )
                 continue
-            topics = dict.fromkeys((*known.topics, *wanted.topics))
-            found[found.index(known)] = replace(known, topics=tuple(topics))
-    return replace(request, connections=tuple(found))
+            topics = dict.fromkeys((*known.topics, *needed.topics))
+            connections[connections.index(known)] = replace(known, topics=tuple(topics))
+    return replace(request, connections=tuple(connections))
 
 
-def _sound(app: ApplicationDemand, topic: InputTopic, config: Config) -> bool:
+def _is_valid(app: ApplicationDemand, topic: InputTopic, config: Config) -> bool:
     return {app.node, topic.source} <= config.domain_of.keys() and not topic_problem(topic.topic)
 
 
@@ -60,8 +64,8 @@ def _sound(app: ApplicationDemand, topic: InputTopic, config: Config) -> bool:
 class ForeignInput:
     """A topic of another node that an application needs at its own.
 
-    ``name`` is the role, or ``<service>.<output>`` of what a service at that node makes of one;
-    ``field`` is where in the application the topic behind it is listed.
+    ``name`` is the role, or ``<service>.<output>`` if a service at the other node makes the topic.
+    ``field`` is the application's field that lists the original topic.
     """
 
     name: str
@@ -70,15 +74,15 @@ class ForeignInput:
 
 
 def foreign_inputs(app: ApplicationDemand, config: Config) -> list[ForeignInput]:
-    """Return all that must be carried to the application's node."""
+    """Return the topics that must be carried to the application's node."""
     appdef = config.appdefs[app.appdef]
-    wanted = set()
+    needed = set()
     for service in appdef.services.values():
         if service.each is not None and service.placement == "application":
-            wanted.add(service.each)
-        wanted |= set(service.inputs.values())
+            needed.add(service.each)
+        needed |= set(service.inputs.values())
     found = []
-    for name in sorted(wanted):
+    for name in sorted(needed):
         producer_name, _, output = name.partition(".")
         producer = appdef.services[producer_name] if output else None
         if producer is not None and producer.placement != "source":
@@ -100,13 +104,13 @@ def foreign_inputs(app: ApplicationDemand, config: Config) -> list[ForeignInput]
 def _connection(
     app: ApplicationDemand, source: str, topic: str, ledger: Ledger
 ) -> ConnectionDemand:
-    assert app.connect is not None  # noqa: S101 - the caller has looked
-    for id in ledger.bringing(app.node, topic):
-        for standing in ledger.connection(id):
-            route = standing.topics.get(topic)
-            ends = (standing.source, standing.target)
+    assert app.connect is not None  # noqa: S101 - the caller checks it
+    for id in ledger.connections_bringing(app.node, topic):
+        for claim in ledger.connection_claims(id):
+            route = claim.topics.get(topic)
+            ends = (claim.source, claim.target)
             if ends == (source, app.node) and route is not None and not route.reverse:
-                return _demand(app, id, standing.type.value, source, route)
+                return _demand(app, id, claim.type.value, source, route)
     return _demand(app, f"derived/{source}/{app.node}", app.connect, source, Route(topic, topic))
 
 

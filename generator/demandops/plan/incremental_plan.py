@@ -1,8 +1,8 @@
-"""Plans brought forward from one ledger to another, by what each was seen to read.
+"""A plan that is updated from one ledger to the next, by what each release read of the ledger.
 
-Planning is a function of ledger and configuration. Where nothing that it read of the ledger has
-changed the result is the same, so only the others are planned again. It does not presume which
-releases a claim affects: a proof must not take that over from the generator.
+Planning is a function of ledger and configuration. If nothing that a release read has changed, its
+plan is the same; only the others are planned again. The generator predicts which releases a claim
+affects. A proof must not rely on that prediction, so it records the reads instead.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, TypeAlias, TypeVar, cast
 
 from demandops.config.config import Config
 from demandops.demand.claim import Subject
-from demandops.ledger.ledger import ClaimChange, Ledger, entries
+from demandops.ledger.ledger import ClaimChange, Ledger, index_entries
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, keys_of
@@ -23,11 +23,11 @@ _Unit: TypeAlias = "Subject | ReleaseKey"
 _Read: TypeAlias = "Subject | tuple[str, ...]"
 
 _ALL: _Read = ("all",)
-"""What somebody read who went through the whole ledger."""
+"""A read of the whole ledger."""
 
 
 class IncrementalPlan:
-    """The plan of one configuration, for one ledger after the other."""
+    """The plan of one configuration for a sequence of ledgers."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -38,17 +38,17 @@ class IncrementalPlan:
     def advance(
         self, ledger: Ledger, changes: Iterable[ClaimChange]
     ) -> dict[ReleaseKey, Release | None]:
-        """Plan anew what the changes may have changed; all, the first time.
+        """Plan the releases again that the changes may affect; the first time, all of them.
 
         Args:
-            ledger: the books after the changes.
-            changes: every claim that is not what it was.
+            ledger: the ledger after the changes.
+            changes: every claim that changed.
 
         Returns:
-            The releases that were planned anew; nothing for one that does not run (any more).
+            The releases that were planned again; ``None`` for one that does not run.
 
         Raises:
-            Refused: as :func:`demandops.plan.planner.plan`; the plan must then be made afresh.
+            Refused: as :func:`demandops.plan.planner.plan`. Do not use this plan afterwards.
         """
         stale = {unit for read in _changed(changes) for unit in self._readers.pop(read, ())}
         for subject in ledger.claims:
@@ -58,19 +58,19 @@ class IncrementalPlan:
                     subject,
                     lambda seen, of=subject: tuple(keys_of(seen, self._config, of, strict=True)),  # type: ignore[misc]
                 )
-        for subject in [one for one in stale if one in self._keys]:
+        for subject in [unit for unit in stale if unit in self._keys]:
             if subject not in ledger.claims:
                 del self._keys[subject]
-        wanted = {key for keys in self._keys.values() for key in keys}
-        gone = self._planned - wanted
+        needed = {key for keys in self._keys.values() for key in keys}
+        gone = self._planned - needed
         found: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
-        for key in sorted(wanted - self._planned | (wanted & stale), key=repr):
+        for key in sorted(needed - self._planned | (needed & stale), key=repr):
             found[key] = self._traced(
                 ledger,
                 key,
                 lambda seen, of=key: plan(seen, self._config, of),  # type: ignore[misc]
             )
-        self._planned = wanted
+        self._planned = needed
         return found
 
     def _traced(self, ledger: Ledger, unit: _Unit, work: Callable[[Ledger], T]) -> T:
@@ -79,7 +79,7 @@ class IncrementalPlan:
             Ledger(
                 cast(Any, _Recording(ledger.claims, reads)),
                 cast(Any, _Recording(ledger.index, reads)),
-                cast(Any, None),  # when leases end is no part of a plan
+                cast(Any, None),  # planning does not read when leases end
             )
         )
         for read in reads:
@@ -88,15 +88,15 @@ class IncrementalPlan:
 
 
 def _changed(changes: Iterable[ClaimChange]) -> set[_Read]:
-    """Return whatever reads otherwise after the changes."""
+    """Return the reads whose result may differ after the changes."""
     reads: set[_Read] = {_ALL}
     for change in changes:
-        reads |= {change.key.subject, *entries(change.before), *entries(change.after)}
+        reads |= {change.key.subject, *index_entries(change.before), *index_entries(change.after)}
     return reads
 
 
 class _Recording:
-    """A map of the ledger that notes what is read of it."""
+    """A map of the ledger that records which keys are read."""
 
     def __init__(self, map: Any, reads: set[_Read]) -> None:  # noqa: ANN401 - either map
         self._map, self._reads = map, reads

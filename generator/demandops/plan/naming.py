@@ -1,8 +1,8 @@
 """Names of Kubernetes objects and of derived topics.
 
-A name is a function of its own subject only, and two different ids never give one name: where
-making an id fit loses something, a hash of the exact id is appended (DNS-1123, at most 53
-characters, Helm's limit for a release name).
+A name depends on its own subject only, and two different ids never give the same name. If an id
+must be shortened or changed to fit, a hash of the exact id is appended. Object names follow
+DNS-1123 and have at most 53 characters, Helm's limit for a release name.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _MAX_TOKEN = 120
 
 
 def digest(*ids: str) -> str:
-    """Return the hash that tells ids apart; a list of ids is not the same as their joined text."""
+    """Return a hash of a list of ids; it differs from the hash of their joined text."""
     exact = json.dumps(ids, ensure_ascii=True)
     return hashlib.sha256(exact.encode()).hexdigest()[:_HASH]
 
@@ -29,9 +29,9 @@ def digest(*ids: str) -> str:
 def object_name(prefix: str, *ids: str) -> str:
     """Return the name of a Kubernetes object for ``ids``.
 
-    ``od``, ``edge``, ``vehicle00`` gives ``od-edge-vehicle00``. An id is lossy when it is no label,
-    or holds a dash beside other ids (``a-b``, ``c`` must not meet ``a``, ``b-c``), or ends like a
-    hash of ours; then, as when the name grows too long, the hash is appended.
+    ``od``, ``edge``, ``vehicle00`` gives ``od-edge-vehicle00``. A hash is appended if an id is not
+    a valid label, if one of several ids has a dash (``a-b``, ``c`` must differ from ``a``,
+    ``b-c``), if the name ends like a hash, or if it is too long.
     """
     plain = "-".join((prefix, *ids)) if prefix else "-".join(ids)
     exact = all(_LABEL.fullmatch(part) for part in ids)
@@ -49,8 +49,8 @@ def object_name(prefix: str, *ids: str) -> str:
 def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name (``vehicle00``, ``edge/fusion``).
 
-    ``extra`` tells further instances of the same id apart, such as a source's second point cloud;
-    it appears as a slug with a hash.
+    ``extra`` distinguishes further instances of the same id, such as a source's second point cloud.
+    It appears as a slug with a hash.
     """
     exact = not extra and len(id) <= _MAX_TOKEN and _TOPIC_PATH.fullmatch(id)
     if exact and not _LOOKS_HASHED.fullmatch(id):
@@ -62,7 +62,7 @@ def topic_part(id: str, extra: str = "") -> str:
 
 
 def ros_name(release: str) -> str:
-    """Return a ROS node name for a release: names allow no dash, and ours hold no underscore."""
+    """Return a ROS node name for a release. ROS forbids dashes in names."""
     return release.replace("-", "_")
 
 

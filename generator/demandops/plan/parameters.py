@@ -1,6 +1,6 @@
-"""One value for each parameter of a service, from the claims that give one.
+"""The parameters of a service, merged from its claims.
 
-The appdef says how several values become one; where it does not, they must agree.
+The appdef says how several values become one. If it does not, they must agree.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from demandops.errors import Refused, fault
 def merged(
     definitions: Mapping[str, Parameter], claims: Iterable[ApplicationClaim]
 ) -> dict[str, object]:
-    """Return the value of every parameter, over the claims of all applications concerned.
+    """Return the value of every parameter, merged over all claims.
 
     Raises:
-        Refused: where two claims give values that neither agree nor can be merged.
+        Refused: if two claims give values that differ and cannot be merged.
     """
     claims = list(claims)
     values: dict[str, object] = {}
     for name, parameter in sorted(definitions.items()):
         given = [claim for claim in claims if name in claim.parameters]
-        values[name] = _one(name, parameter, given) if given else parameter.default
+        values[name] = _merged_value(name, parameter, given) if given else parameter.default
     return values
 
 
-def _one(name: str, parameter: Parameter, claims: list[ApplicationClaim]) -> object:
+def _merged_value(name: str, parameter: Parameter, claims: list[ApplicationClaim]) -> object:
     given = [claim.parameters[name] for claim in claims]
     if parameter.merge == "latest":
         return max(claims, key=lambda claim: (claim.booked, claim.demand)).parameters[name]
@@ -51,7 +51,7 @@ def _one(name: str, parameter: Parameter, claims: list[ApplicationClaim]) -> obj
                 [
                     fault(
                         f"parameters.{name}",
-                        f"{odd!r} is no number, and the application "
+                        f"{odd!r} is not a number, but the application "
                         f"definition takes the {parameter.merge}",
                     )
                 ]

@@ -1,6 +1,6 @@
-"""From claims to releases.
+"""The planner: :func:`plan` derives the release at a key from claims.
 
-:func:`plan` derives one release by its key (:mod:`demandops.plan.release_keys`).
+Keys come from :mod:`demandops.plan.release_keys`.
 """
 
 from __future__ import annotations
@@ -15,56 +15,58 @@ from demandops.config.registry import ChartSource
 from demandops.demand.claim import ApplicationClaim, Subject, SubjectKind
 from demandops.demand.demand_request import InputTopic
 from demandops.errors import Refused, fault
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan import connection_clients, naming, parameters
 from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.overrides import effects
-from demandops.plan.overrides.claims_in_force import in_force
-from demandops.plan.release import Release, ServiceKey, ServiceRelease, place
+from demandops.plan.overrides.suspended_claims import without_suspended
+from demandops.plan.release import Release, ServiceKey, ServiceRelease, node_and_domain
 from demandops.plan.release_keys import ReleaseKey, appdef_of, keys_of
 
 
 def plan(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
-    """Return the release at ``key`` as overrides shape it, or nothing where no claim needs it.
+    """Return the release at ``key`` with the effects of overrides, or ``None`` if it must not run.
 
     Raises:
-        Refused: where claims contradict each other in a parameter, or what a claim names is no
-            longer in the configuration.
+        Refused: if claims contradict each other in a parameter, or if the configuration no longer
+            has what a claim names.
     """
-    ledger = in_force(ledger, config)
+    ledger = without_suspended(ledger, config)
     release = _unshaped(ledger, config, key)
-    return effects.shaped(release, ledger, config) if release else None
+    return effects.apply_overrides(release, ledger, config) if release else None
 
 
-def denied(ledger: Ledger, config: Config, key: ReleaseKey) -> tuple[Release, Override] | None:
-    """Return the release that is needed at ``key`` and the override that denies it, or nothing."""
-    ledger = in_force(ledger, config)
+def denied_release(
+    ledger: Ledger, config: Config, key: ReleaseKey
+) -> tuple[Release, Override] | None:
+    """Return the release at ``key`` and the override that denies it, or ``None``."""
+    ledger = without_suspended(ledger, config)
     release = _unshaped(ledger, config, key)
-    by = effects.denying(release, ledger, config) if release else None
+    by = effects.service_denied_by(release, ledger, config) if release else None
     return (release, by) if release and by else None
 
 
 def _unshaped(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
     if isinstance(key, EndKey):
-        return connection_clients.end(ledger, config, key)
+        return connection_clients.connection_end(ledger, config, key)
     if isinstance(key, BridgeKey):
-        return connection_clients.bridge(ledger, config, key)
+        return connection_clients.zenoh_bridge(ledger, config, key)
     return _service(ledger, config, key)
 
 
 def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease | None:
     named = (key.application,) if key.application is not None else None
-    users = tuple(  # an application may run elsewhere by now, or as something else
+    users = tuple(  # skip applications that moved or changed their definition
         application
-        for application in named or ledger.taking(str(key.source), str(key.topic))
+        for application in named or ledger.applications_taking(str(key.source), str(key.topic))
         if key in keys_of(ledger, config, Subject(SubjectKind.APPLICATION, application))
     )
-    claims = tuple(claim for user in users for claim in ledger.application(user))
+    claims = tuple(claim for user in users for claim in ledger.application_claims(user))
     if not claims:
         return None
     appdef = appdef_of(config, claims[0].appdef)
     service = appdef.services[key.service]
-    node, domain = place(config, key.node)
+    node, domain = node_and_domain(config, key.node)
     if service.each is not None:
         claims = tuple(claim for claim in claims if _takes(claim, service.each, key))
         inputs = {service.each: _shared_input(claims, service.each, key)}
@@ -96,22 +98,22 @@ def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease 
 
 
 def _chart(config: Config, service: Service, claims: Iterable[ApplicationClaim]) -> ChartSource:
-    """Return the chart in the version that the claims ask for, the default where it has none.
+    """Return the chart in the version that the claims ask for, or the default version.
 
     Raises:
-        Refused: where applications that share the service ask for different ones.
+        Refused: if applications that share the service ask for different versions.
     """
     chart = config.charts[service.chart]
-    asked = {claim.version: chart.at(claim.version) or chart for claim in claims}
-    if len({source.version for source in asked.values()}) > 1:
+    charts = {claim.version: chart.at(claim.version) or chart for claim in claims}
+    if len({source.version for source in charts.values()}) > 1:
         versions = " and ".join(
-            f"{source.version} (for '{version}')" for version, source in sorted(asked.items())
+            f"{source.version} (for '{version}')" for version, source in sorted(charts.items())
         )
         message = (
-            f"{service.chart} is shared and asked for in versions {versions}; ask for the same"
+            f"demands that share {service.chart} ask for versions {versions}; ask for the same"
         )
         raise Refused([fault("version", message, code="conflict")])
-    return next(iter(asked.values()))
+    return next(iter(charts.values()))
 
 
 def _requesters(claims: Iterable[ApplicationClaim]) -> tuple[str, ...]:
@@ -170,8 +172,8 @@ def _united(claims: Iterable[ApplicationClaim], role: str) -> tuple[InputTopic, 
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     """Return the release name of a service instance.
 
-    A source's usual topic (``topics`` of its inventory entry) needs no mention:
-    ``od-edge-vehicle00``. Others carry a slug of the topic.
+    The name leaves out a source's usual topic (``topics`` of its inventory entry):
+    ``od-edge-vehicle00``. For other topics it has a slug of the topic.
     """
     if key.application is not None:
         return naming.object_name(service.prefix, key.application)
@@ -204,5 +206,5 @@ def _replicas(scaling: Scaling, topics: int) -> int:
     """Return the replicas for ``topics`` inputs, within the appdef's bounds."""
     if scaling.topics_per_replica is None:
         return scaling.min
-    wanted = -(-topics // scaling.topics_per_replica)
-    return max(scaling.min, min(scaling.max, wanted))
+    needed = -(-topics // scaling.topics_per_replica)
+    return max(scaling.min, min(scaling.max, needed))

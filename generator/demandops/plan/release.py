@@ -1,4 +1,4 @@
-"""What planning gives: releases, one for each service instance and communication client."""
+"""Releases: the plan's result, one for each service instance and communication client."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from demandops.errors import Refused, fault
 class ServiceKey:
     """One instance of a service.
 
-    ``application`` is set for a service that runs once for each application; ``source`` and
-    ``topic`` for one that runs once for each topic and is shared by all who ask for it.
+    ``application`` is set if the service runs once for each application. ``source`` and ``topic``
+    are set if it runs once for each topic; all applications that use the topic share it.
     """
 
     service: str
@@ -35,12 +35,12 @@ class ServiceKey:
 
 @dataclass(frozen=True, slots=True)
 class Shaping:
-    """The overrides that shape a release with the effects of each, who comes last wins."""
+    """The overrides that shape a release, with the effects of each; the last one wins."""
 
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
     def image(self, image: str, config: Config) -> Image:
-        """Return an image of the registry as the overrides pin it."""
+        """Return an image of the registry, with the pins of overrides."""
         found = config.images[image]
         for override, effects in self.by:
             if "images" in effects and override.images and image in override.images:
@@ -58,7 +58,7 @@ class Shaping:
 
     @property
     def held(self) -> bool:
-        """Whether the release stays as it is rendered: nothing higher than a hold changes it."""
+        """Whether a ``hold`` applies that no higher override changes, so the file stays."""
         held = False
         for _, effects in self.by:
             held = "hold" in effects or (held and set(effects) <= {"keep"})
@@ -90,7 +90,7 @@ class ServiceRelease:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionEnd:
-    """The desired state of one end of a connection: one communication client of its own."""
+    """The desired state of one end of a connection: one communication client."""
 
     type: ClassVar[ConnectionType]
 
@@ -104,7 +104,7 @@ class ConnectionEnd:
     shaping: Shaping = field(default=UNSHAPED, kw_only=True)
 
     def reads(self, route: Route) -> bool:
-        """Tell whether this end takes the topic in from ROS, and the other gives it out."""
+        """Return whether this end reads the topic from ROS, and the other end publishes it."""
         return route.reverse is (self.side == "target")
 
 
@@ -116,7 +116,7 @@ class MqttEnd(ConnectionEnd):
 
     broker: Broker
     channel: str
-    """What this connection's MQTT topics start with, the same at both ends."""
+    """The prefix of this connection's MQTT topics, the same at both ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,12 +127,12 @@ class RosEnd(ConnectionEnd):
 
     listens: bool
     address: Address
-    """Where the end that listens does so, the same at both ends."""
+    """The address of the end that listens, the same at both ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A host and port that DDS Routers meet at."""
+    """A host and port at which DDS Routers meet."""
 
     host: str
     port: int
@@ -143,8 +143,8 @@ class Address:
 class Bridge:
     """The desired state of a node's Zenoh bridge, which serves all its Zenoh connections.
 
-    ``publishers`` are the topics that it takes from the node's ROS graph, ``subscribers`` those
-    that it gives to it, ``rates`` the most messages a second of a topic that it takes.
+    ``publishers`` are the topics that it reads from the node's ROS graph, ``subscribers`` those
+    that it publishes there. ``rates`` limits the messages per second of a topic that it reads.
     """
 
     name: str
@@ -162,11 +162,11 @@ class Bridge:
 Release = ServiceRelease | MqttEnd | RosEnd | Bridge
 
 
-def place(config: Config, node_id: str) -> tuple[Node, AccessDomain]:
+def node_and_domain(config: Config, node_id: str) -> tuple[Node, AccessDomain]:
     """Return a node and its access domain.
 
     Raises:
-        Refused: where what is in use was taken out of the inventory or the access domains.
+        Refused: if a node in use was removed from the inventory or its access domain.
     """
     node, domain = config.nodes.get(node_id), config.domain_of.get(node_id)
     if node is None or domain is None:
@@ -175,7 +175,7 @@ def place(config: Config, node_id: str) -> tuple[Node, AccessDomain]:
             [
                 fault(
                     "node",
-                    f"'{node_id}' is in use, but not in {missing}; restore it, or give up "
+                    f"'{node_id}' is in use, but not in {missing}; restore it, or release "
                     f"what it holds: demandops decommission {shlex.quote(node_id)}",
                     code="unknown-node",
                 ).within(NODES_FILE if node is None else DOMAINS_FILE)

@@ -1,7 +1,7 @@
-"""Which releases follow from claims: their keys, without what is in them.
+"""The keys of releases that follow from claims.
 
-:func:`affected` names the releases that a change of claims may touch, so that the cost of a demand
-does not grow with the number of others. :mod:`demandops.plan.planner` derives each.
+:func:`affected_keys` names the releases that a change of claims may touch, so the cost of a demand
+does not grow with the number of others. :mod:`demandops.plan.planner` derives each release.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import Refused, fault
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan import connection_clients
 from demandops.plan.connection_clients import BridgeKey, EndKey
-from demandops.plan.overrides.claims_in_force import in_force
+from demandops.plan.overrides.suspended_claims import without_suspended
 from demandops.plan.release import ServiceKey
 
 ReleaseKey = ServiceKey | EndKey | BridgeKey
@@ -24,22 +24,24 @@ ReleaseKey = ServiceKey | EndKey | BridgeKey
 def keys_of(
     ledger: Ledger, config: Config, subject: Subject, *, strict: bool = False
 ) -> Iterator[ReleaseKey]:
-    """Yield what must run because ``subject`` is held and no override denies it.
+    """Yield the keys of the releases that the claims on ``subject`` need, except suspended claims.
 
-    Of an application whose definition is gone nobody can say: nothing, or where ``strict`` it is
-    refused, for what runs must not stop because somebody deleted a file that it still needs.
+    If an application's definition is missing, yield none, or refuse if ``strict``: what runs must
+    not stop because a file that it needs was deleted.
     """
-    yield from keys_booked(in_force(ledger, config), config, subject, strict=strict)
+    yield from keys_including_suspended(
+        without_suspended(ledger, config), config, subject, strict=strict
+    )
 
 
-def keys_booked(
+def keys_including_suspended(
     ledger: Ledger, config: Config, subject: Subject, *, strict: bool = False
 ) -> Iterator[ReleaseKey]:
-    """Yield what ``subject`` needs by the claims of ``ledger``, suspended or not."""
+    """Yield the keys of the releases that all claims on ``subject`` in ``ledger`` need."""
     if subject.kind is SubjectKind.CONNECTION:
-        yield from connection_clients.keys_of(ledger, subject.id)
+        yield from connection_clients.client_keys(ledger, subject.id)
         return
-    claims = ledger.application(subject.id)
+    claims = ledger.application_claims(subject.id)
     if not claims:
         return
     known = strict or claims[0].appdef in config.appdefs
@@ -58,13 +60,13 @@ def keys_booked(
             yield ServiceKey(name, node, source=source, topic=topic)
 
 
-def affected(
+def affected_keys(
     before: Ledger, after: Ledger, config: Config, subjects: Iterable[Subject]
 ) -> tuple[ReleaseKey, ...]:
-    """Return every release that a change of ``subjects`` may have added, altered or removed.
+    """Return the key of every release that a change of ``subjects`` may add, change or remove.
 
     Raises:
-        Refused: where the definition of what is to run from now on is gone.
+        Refused: if an application definition that ``after`` needs is missing.
     """
     keys = (
         key
@@ -76,10 +78,10 @@ def affected(
 
 
 def all_keys(ledger: Ledger, config: Config) -> tuple[ReleaseKey, ...]:
-    """Return every release that the ledger asks for.
+    """Return the key of every release that the ledger needs.
 
     Raises:
-        Refused: where the definition of an application that is held is gone.
+        Refused: if the definition of a claimed application is missing.
     """
     subjects = [Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)]
     keys = (key for s in subjects for key in keys_of(ledger, config, s, strict=True))
@@ -90,7 +92,7 @@ def appdef_of(config: Config, name: str) -> ApplicationDefinition:
     """Return an application definition by name.
 
     Raises:
-        Refused: where the state repo has none.
+        Refused: if the state repo has none.
     """
     appdef = config.appdefs.get(name)
     if appdef is None:

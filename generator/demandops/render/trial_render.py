@@ -21,7 +21,7 @@ def render_trial_demands(config: Config, engine: Engine) -> None:
     Raises:
         Refused, InvalidInput: naming the template, the values or the override that does not work.
     """
-    invented = trial_demands.releases(config)
+    invented = trial_demands.trial_releases(config)
     faults = [
         fault
         for releases in invented.values()
@@ -29,7 +29,7 @@ def render_trial_demands(config: Config, engine: Engine) -> None:
     ]
     for override in () if faults else config.in_force:
         overridden = [
-            list(trial_demands.overridden(override, releases, appdef, config))
+            list(trial_demands.overridden_releases(override, releases, appdef, config))
             for appdef, releases in invented.items()
         ]
         failed = [_render_faults(releases, config, engine) for releases in overridden if releases]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from demandops.errors import Refused, fault
-from demandops.ledger.restoration import Restoration
+from demandops.ledger.operations.restoration import Restoration
 from demandops.settings import API_VERSION
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.load.rollback_source import restoration

@@ -8,10 +8,10 @@ from demandops.decision import Decision, State
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import DemandRequest
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
-from demandops.plan.release_keys import ReleaseKey, affected, all_keys, keys_of
+from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, keys_of
 from demandops.render.gitops.argocd import project_of
 
 
@@ -22,7 +22,7 @@ def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
     keys: dict[ReleaseKey, None] = {}
     for subject in dict.fromkeys(subjects):
         keys |= dict.fromkeys(keys_of(after, config, subject))
-    keys |= dict.fromkeys(affected(before, after, config, decision.changes.subjects()))
+    keys |= dict.fromkeys(affected_keys(before, after, config, decision.changes.subjects()))
     found = []
     for key in keys:
         new = plan(after, config, key)
@@ -50,7 +50,7 @@ def of_state(state: State) -> list[tuple[Release, Target]]:
 
 
 def _asked(request: DemandRequest, ledger: Ledger) -> list[Subject]:
-    subjects = [claim.subject for claim in ledger.of_demand(request.demand)]
+    subjects = [claim.subject for claim in ledger.claims_of_demand(request.demand)]
     if request.operation.asks:
         subjects += [Subject(SubjectKind.APPLICATION, app.id) for app in request.applications]
         subjects += [Subject(SubjectKind.CONNECTION, one.id) for one in request.connections]

@@ -15,7 +15,7 @@ from typing import Any, Literal
 from demandops.cluster.health import Target
 from demandops.decision import Outcome
 from demandops.errors import Refused, fault
-from demandops.ledger.apply import ClaimChange
+from demandops.ledger.ledger import ClaimChange
 from demandops.staterepo.write.journal import JournalEntry
 
 log = logging.getLogger("demandops")

@@ -14,9 +14,9 @@ from demandops import __version__, strict_yaml
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.decision import State, rendered
+from demandops.decision import State, rendered_files
 from demandops.errors import StateRepoError
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.settings import MAIN_BRANCH, RENDER_VERSION, data_folder
 from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees
@@ -43,7 +43,7 @@ def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
     for path in PIPELINES:
         found[path] = re.sub(r"demandops==\S+", f"demandops=={__version__}", found[path])
     config = load({p: text for p, text in found.items() if p.split("/")[0] in CONFIG_ROOTS})
-    return found | rendered(State.of(config, Ledger()))
+    return found | rendered_files(State.of(config, Ledger()))
 
 
 def _read(folder: Path, prefix: str) -> dict[str, str]:

@@ -13,7 +13,7 @@ from pygit2 import Commit
 from demandops import settings
 from demandops.config.config import Config
 from demandops.errors import Fault, InvalidInput, StateRepoError
-from demandops.ledger.restoration import Restoration
+from demandops.ledger.operations.restoration import Restoration
 from demandops.render.changes.changeset import FileReader
 from demandops.staterepo.audit import commit_signatures, verification
 from demandops.staterepo.audit.verification import Verdict

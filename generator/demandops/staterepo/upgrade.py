@@ -24,7 +24,7 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State
 from demandops.errors import InvalidInput, StateRepoError, fault
 from demandops.ledger import ended_override_file
-from demandops.plan.overrides.lifecycle import TakenIn, taken_in
+from demandops.plan.overrides.lifecycle import LedgerUpdate, update_ledger
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import planned_releases
 from demandops.render.gitops.controller_switch import SwitchSteps, switch_steps
@@ -123,7 +123,7 @@ def upgrade(
 
 def _planned(
     repository: StateRepository, wish: UpgradeRequest, now: datetime, progress: Progress
-) -> tuple[Upgrade, CommitLine, TakenIn]:
+) -> tuple[Upgrade, CommitLine, LedgerUpdate]:
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
     line, old = CommitLine(repository, snapshot), snapshot.state.config
@@ -150,7 +150,7 @@ def _taken_in(
     state: State,
     marked: Mapping[str, str],
     now: datetime,
-) -> TakenIn:
+) -> LedgerUpdate:
     """Return the books with what people changed since the generator's last commit taken in."""
     objects = repository.objects
     last = commit_log.last_generated(objects, tip.commit)
@@ -159,7 +159,7 @@ def _taken_in(
     keys = {claim.key for books in (before.ledger, after) for claim in books}
     subjects = {key.subject for key in keys if before.ledger.get(key) != after.get(key)}
     books = (before.ledger, before.config)
-    return taken_in(books, (after, state.config), sorted(subjects, key=str), marked, now)
+    return update_ledger(books, (after, state.config), sorted(subjects, key=str), marked, now)
 
 
 def _refuse_held(state: State) -> None:
@@ -210,7 +210,7 @@ def _person(objects: Repository, now: datetime) -> Signature:
     return Signature(who.name, who.email, int(now.timestamp()), 0)
 
 
-def _message(made: Upgrade, taken: TakenIn) -> str:
+def _message(made: Upgrade, taken: LedgerUpdate) -> str:
     old, new = made.old.repository, made.new.repository
     moved = old.gitops != new.gitops
     title = "Render everything anew"

@@ -17,7 +17,7 @@ import pytest
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.decision import State
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.staterepo import new_repo
 
 from tests import demanding

@@ -25,7 +25,7 @@ import pygit2
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.decision import State, decide
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.service import Generator, Receipt, Ticket
 from demandops.staterepo import new_repo, reader

@@ -95,7 +95,7 @@ def test_however_it_is_merged_the_demand_is_booked_and_the_files_fit(
 def assert_rendered(bare: Path) -> None:
     """What stands below clusters/ is what the books and the configuration give."""
     import pygit2
-    from demandops.decision import rendered
+    from demandops.decision import rendered_files
     from demandops.staterepo.git import tree as trees
     from demandops.staterepo.load import snapshot as snapshots
 
@@ -103,7 +103,7 @@ def assert_rendered(bare: Path) -> None:
     state = snapshots.load(repo, "main").state
     stands = trees.texts(repo.revparse_single("main").peel(pygit2.Tree), ("clusters",))
     stands = {path: text for path, text in stands.items() if path.endswith(".yaml")}
-    wanted = {p: t for p, t in rendered(state).items() if p.startswith("clusters/")}
+    wanted = {p: t for p, t in rendered_files(state).items() if p.startswith("clusters/")}
     assert stands == {path: text for path, text in wanted.items() if path.endswith(".yaml")}
 
 
@@ -359,7 +359,7 @@ def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(
         gone = two.branch
         petra.merge(one.branch)
         assert one.outcome() == "booked"
-        with pytest.raises(Refused, match="contradicts what stands"):
+        with pytest.raises(Refused, match="contradicts an existing claim"):
             rig.receipt(two.ticket)
         rig.wait_until(lambda: gone not in branches(bare), "the branch is taken away")
 

@@ -115,7 +115,7 @@ def test_where_no_other_broker_would_do_it_is_refused_whole(bare: Path, demandop
     assert demandops("decommission", "edge", "--state-repo", bare) == (
         1,
         "",
-        "error: broker: connection 'vehicle01/edge' finds no broker; add one to "
+        "error: broker: connection 'vehicle01/edge' has no broker; add one to "
         "inventory/brokers.yaml\n",
     )
     assert rig.tip(bare) == tip
@@ -165,7 +165,7 @@ def test_as_a_requester_only_a_node_keeps_what_is_at_it(bare: Path, demandops: C
         assert of(generator, "edge/fusion-1") == []
         topics = [
             topic.topic
-            for claim in generator.snapshot.state.ledger.application("edge/fusion-2")
+            for claim in generator.snapshot.state.ledger.application_claims("edge/fusion-2")
             for _, topic in claim.all_inputs()
         ]
     assert "/stations/station00/pointcloud" in topics

@@ -369,7 +369,9 @@ def test_a_goal_is_told_why_it_waits_and_can_be_taken_back_meanwhile(
             rig.receipt(goes)
         with pytest.raises(NotAnswered):
             stays.future.result(0)
-        assert generator.snapshot.state.ledger.of_requester("user1"), "what is known can be read"
+        assert generator.snapshot.state.ledger.claims_of_requester("user1"), (
+            "what is known can be read"
+        )
         server.faults.away = False
         assert rig.receipt(stays).outcome == "booked"
     assert rig.operations(bare)[-1] == "op-2"
@@ -444,10 +446,10 @@ def test_a_lease_that_ends_while_the_remote_is_away_goes_when_it_is_back(
         server.faults.away = True
         refused = server.refused
         rig.wait_until(lambda: server.refused > refused + 3, "the end of the lease is tried")
-        assert generator.snapshot.state.ledger.of_demand("short")
+        assert generator.snapshot.state.ledger.claims_of_demand("short")
         server.faults.away = False
         rig.wait_until(
-            lambda: not generator.snapshot.state.ledger.of_demand("short"), "it is released"
+            lambda: not generator.snapshot.state.ledger.claims_of_demand("short"), "it is released"
         )
     assert newest(bare).one("Operation") == "expire"
     rig.assert_sound(bare)

@@ -122,7 +122,7 @@ def test_a_demand_that_the_new_tip_makes_impossible_is_refused_with_the_reason(
         with rig.running(url, data=tmp_path / "another-machine") as other:
             rig.book(other, elsewhere)
         ticket = generator.submit(goal(6))  # the same application, on the edge
-        with pytest.raises(Refused, match="contradicts what stands"):
+        with pytest.raises(Refused, match="contradicts an existing claim"):
             rig.receipt(ticket)
         assert rig.book(generator, goal(2))[0].outcome == "booked"
     rig.assert_sound(bare)

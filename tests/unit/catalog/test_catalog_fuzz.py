@@ -10,9 +10,9 @@ import pytest
 import yaml
 from asking import FAST, configuration, skeleton
 from demandops.config.load import load
-from demandops.decision import State, rehearse
+from demandops.decision import State, try_configuration
 from demandops.errors import InvalidInput
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 
 FILES = sorted(
     path
@@ -55,7 +55,7 @@ def mutated(text: str, random: Random) -> str:
 
 def assert_told(path: str, text: str) -> None:
     try:
-        rehearse(State.of(load(configuration({path: text})), Ledger()))
+        try_configuration(State.of(load(configuration({path: text})), Ledger()))
     except InvalidInput as invalid:
         assert invalid.faults
         for found in invalid.faults:

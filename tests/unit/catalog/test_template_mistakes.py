@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from asking import Books, configuration, perception, skeleton
 from demandops.config.load import load
-from demandops.decision import State, rehearse
+from demandops.decision import State, try_configuration
 from demandops.errors import InvalidInput
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"
@@ -258,7 +258,7 @@ class TestBeforeTheFirstDemand:
 
     def rehearsal(self, changed: dict[str, str | None]) -> list[str]:
         with pytest.raises(InvalidInput) as invalid:
-            rehearse(State.of(load(configuration(changed)), Ledger()))
+            try_configuration(State.of(load(configuration(changed)), Ledger()))
         return [str(found) for found in invalid.value.faults]
 
     def test_a_template_that_nobody_has_demanded_is_checked(self) -> None:
@@ -273,7 +273,7 @@ class TestBeforeTheFirstDemand:
         assert [found.split(": ")[0] for found in self.rehearsal(dict(change))] == [TEMPLATE, other]
 
     def test_what_is_laid_down_passes(self) -> None:
-        rehearse(State.of(load(configuration()), Ledger()))
+        try_configuration(State.of(load(configuration()), Ledger()))
 
 
 def test_no_sandbox_escape_left_a_trace() -> None:

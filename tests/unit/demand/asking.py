@@ -15,9 +15,9 @@ import pytest
 import yaml
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
-from demandops.decision import Decision, State, decide, rendered
+from demandops.decision import Decision, State, decide, rendered_files
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.staterepo import new_repo
 
@@ -158,7 +158,7 @@ class Books:
         self.state = _unchanged() if changed is None else _state(changed)
         self._standing = dict(skeleton())
         if changed is not None:
-            self._standing = {**configuration(changed), **rendered(self.state)}
+            self._standing = {**configuration(changed), **rendered_files(self.state)}
         self.files = dict(self._standing)
 
     def copy(self) -> Books:

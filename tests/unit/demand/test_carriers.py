@@ -12,7 +12,7 @@ from demandops.config.load import load
 from demandops.decision import State
 from demandops.demand.demand_request import ConnectionType
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 
 from tests import demanding
 
@@ -46,7 +46,7 @@ def demand(kind: str = "auto", topics: Any = None, **more: Any) -> dict[str, Any
 
 def carried(before: State, asked: dict[str, Any]) -> ConnectionType:
     after, _ = demanding.decide(before, asked, NOW, lambda path: None)
-    (claim,) = after.ledger.connection("c")
+    (claim,) = after.ledger.connection_claims("c")
     return claim.type
 
 
@@ -105,7 +105,9 @@ class TestAutomaticChoice:
         after, _ = demanding.decide(before, demand("mqtt"), NOW, lambda path: None)
         again = demand(requesters=["vehicle01"])
         after, _ = demanding.decide(after, again, NOW, lambda path: None)
-        assert {claim.type for claim in after.ledger.connection("c")} == {ConnectionType.MQTT}
+        assert {claim.type for claim in after.ledger.connection_claims("c")} == {
+            ConnectionType.MQTT
+        }
 
     def test_a_shutdown_without_a_type_means_what_stands(self) -> None:
         before = state(vehicle00=SPEAKS, edge=REACHABLE)
@@ -193,7 +195,8 @@ class TestZenoh:
         before, _ = demanding.decide(before, asked, NOW, lambda path: None)
         other = demand("zenoh", {"/a": {"rate": 2}}, id="d", target="cloud")
         assert faults(before, other) == [
-            "connections: rate 2.0 of '/a' in 'd' contradicts what stands: 'c' carries it from "
+            "connections: rate 2.0 of '/a' in 'd' contradicts an existing claim: 'c' carries it "
+            "from "
             "'vehicle00' with rate 5.0, and the node's bridge has one for each topic; use the same"
         ]
 
@@ -250,7 +253,7 @@ class TestThroughTheWire:
         asked = connection("c", topics=["/a"], broker="", type=number)
         assert books.send(goal([], [asked])).outcome == "booked"
         assert books.send(goal([], [asked])).outcome == "unchanged"
-        (claim,) = books.state.ledger.connection("c")
+        (claim,) = books.state.ledger.connection_claims("c")
         assert claim.type.name == name
         assert books.books()["connections"]["c"]["topics"] == ["/a"]
         assert books.send(goal([], [asked], shutdown=True)).outcome == "released"

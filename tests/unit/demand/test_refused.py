@@ -241,7 +241,7 @@ REFUSED: dict[str, tuple[Goal, list[str]]] = {
     ),
     "a shutdown of which nothing is held": (
         goal([application()], [connection()], shutdown=True),
-        ["apps[0].header.id: nothing that the shutdown lists is held; claims that come near: none"],
+        ["apps[0].header.id: nothing that the shutdown lists is held; similar claims: none"],
     ),
 }
 
@@ -321,7 +321,7 @@ class TestContradictions:
 
     def test_another_node_for_a_claimed_application(self, books: Books) -> None:
         assert books.faults(goal([application(node="cloud", who=["vehicle01"])])) == [
-            f"apps[0].header.node_id: 'cloud' contradicts what stands: '{APP}'"
+            f"apps[0].header.node_id: 'cloud' contradicts an existing claim: '{APP}'"
             " is held by vehicle00 on 'edge'; ask for that node, or wait until it is released"
         ]
 
@@ -342,8 +342,8 @@ class TestContradictions:
         self, books: Books, changed: dict[str, Any], field: str, wanted: str, stands: str
     ) -> None:
         assert books.faults(goal([], [connection(who=["vehicle01"], **changed)])) == [
-            f"connections[0].{field}: '{wanted}' contradicts what stands: 'vehicle00/edge' is held "
-            f"by vehicle00 with {stands}; use the same, or another connection id"
+            f"connections[0].{field}: '{wanted}' contradicts an existing claim: 'vehicle00/edge' "
+            f"is held by vehicle00 with {stands}; use the same, or another connection id"
         ]
 
     def test_another_target_for_a_topic_that_is_carried(self, books: Books) -> None:
@@ -388,7 +388,7 @@ class TestShutdowns:
         books = Books()
         books.send(perception())
         assert books.faults(goal([application(who=["vehicle01"])], shutdown=True)) == [
-            "apps[0].header.id: nothing that the shutdown lists is held; claims that come near: "
+            "apps[0].header.id: nothing that the shutdown lists is held; similar claims: "
             "application 'edge/object_detection_fusion' for vehicle00 (request 'request')"
         ]
 
@@ -396,7 +396,7 @@ class TestShutdowns:
         books = Books()
         books.send(perception())
         assert books.faults(goal([application("edge/fusion")], shutdown=True)) == [
-            "apps[0].header.id: nothing that the shutdown lists is held; claims that come near: "
+            "apps[0].header.id: nothing that the shutdown lists is held; similar claims: "
             "application 'edge/object_detection_fusion' for vehicle00; "
             "connection 'vehicle00/edge' for vehicle00"
         ]

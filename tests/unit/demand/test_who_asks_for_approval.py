@@ -119,24 +119,26 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     from asking import NOW
     from demandops.decision import decide
     from demandops.demand.approval_rule import proposed
-    from demandops.ledger import claim_file as ledger_format
+    from demandops.ledger import claim_file
 
     books = Books(policy(approval="required"))
     decision = decide(books.state, put(lease=60), NOW, books.files.get)
     waiting = decide(books.state, proposed(decision.request), NOW, books.files.get)
-    [claim] = [one for one in waiting.state.ledger.of_demand("d") if "edge" in one.subject.id][:1]
+    [claim] = [
+        one for one in waiting.state.ledger.claims_of_demand("d") if "edge" in one.subject.id
+    ][:1]
     assert claim.lease is not None
     assert claim.lease.until == UNSTARTED
     assert not claim.lease.has_started
-    path = ledger_format.path_of(claim.key)
-    text = ledger_format.write(claim)
+    path = claim_file.path_of(claim.key)
+    text = claim_file.text_of(claim)
     assert "until" not in text
-    assert ledger_format.read(text, path) == claim
-    found = {one.key for one in waiting.state.ledger.unstarted()}
-    assert found == {one.key for one in waiting.state.ledger.of_demand("d")}
+    assert claim_file.read(text, path) == claim
+    found = {one.key for one in waiting.state.ledger.unstarted_claims()}
+    assert found == {one.key for one in waiting.state.ledger.claims_of_demand("d")}
     later = claim.lease.begun(NOW)
     assert (later.seconds, (later.until - NOW).total_seconds()) == (60, 60)
-    assert waiting.state.ledger.ended(NOW.replace(year=2100)) == ()
+    assert waiting.state.ledger.ended_claims(NOW.replace(year=2100)) == ()
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.decision import Decision, State, decide
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.staterepo import new_repo
 from model.books import Goal, in_model_words, object_lists

@@ -16,8 +16,8 @@ from demandops.demand.claim import (
 )
 from demandops.demand.demand_request import ConnectionType, InputTopic, id_problem
 from demandops.demand.route import Route, united
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger import claim_file
+from demandops.ledger.ledger import Ledger
 from hypothesis import given
 from hypothesis import strategies as st
 from trying import examples
@@ -120,13 +120,13 @@ claims = application_claims() | connection_claims()
 @examples(80)
 @given(claims)
 def test_every_claim_survives_its_file(claim: Claim) -> None:
-    path, text = ledger_format.path_of(claim.key), ledger_format.write(claim)
+    path, text = claim_file.path_of(claim.key), claim_file.text_of(claim)
 
-    read = ledger_format.read(text, path)
+    read = claim_file.read(text, path)
 
     assert read == claim
-    assert ledger_format.write(read) == text
-    assert ledger_format.kind_of(path) is claim.subject.kind
+    assert claim_file.text_of(read) == text
+    assert claim_file.kind_of(path) is claim.subject.kind
     assert path.isascii()
     assert all(0 < len(part) <= 100 for part in path.split("/"))
 
@@ -144,7 +144,7 @@ def test_a_claim_that_is_booked_and_dropped_leaves_an_empty_ledger(claim: Claim)
 @given(st.dictionaries(st.tuples(st.sampled_from(SubjectKind), ids, ids), st.none(), min_size=2))
 def test_two_claims_never_share_a_file(keys: dict[tuple[SubjectKind, str, str], None]) -> None:
     paths = {
-        ledger_format.path_of(ClaimKey(Subject(kind, subject), demand)).lower()
+        claim_file.path_of(ClaimKey(Subject(kind, subject), demand)).lower()
         for kind, subject, demand in keys
     }
     assert len(paths) == len(keys)
@@ -167,6 +167,6 @@ def test_a_time_is_the_same_moment_in_any_zone(moment: datetime, hours: int) -> 
         topics=MappingProxyType({"/a": Route("/a", "/b")}),
     )
 
-    read = ledger_format.read(ledger_format.write(claim), ledger_format.path_of(claim.key))
+    read = claim_file.read(claim_file.text_of(claim), claim_file.path_of(claim.key))
 
     assert read.booked == moment

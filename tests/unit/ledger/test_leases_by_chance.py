@@ -18,8 +18,8 @@ from demandops.demand.demand_request import ConnectionType, InputTopic
 from demandops.demand.lease import LONGEST_S, Lease
 from demandops.demand.route import Route, united
 from demandops.identifiers import id_problem
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger import claim_file
+from demandops.ledger.ledger import Ledger
 from hypothesis import given, note
 from hypothesis import strategies as st
 from model.leases import BY_MESSAGE, Goal, Promises, Subject
@@ -159,9 +159,9 @@ def _names(claim: ConnectionClaim) -> dict[str, str]:
 def restart(world: running.World, random: Random) -> None:
     """Go on from the files alone, read in any order."""
     claims = [
-        ledger_format.read(text, path)
+        claim_file.read(text, path)
         for path, text in world.files.items()
-        if ledger_format.kind_of(path)
+        if claim_file.kind_of(path)
     ]
     random.shuffle(claims)
     ledger = running.rebuilt(claims)
@@ -246,7 +246,7 @@ def leave_all(world: running.World, promises: Promises, now: int) -> None:
         world.take(release | {"requesters": list(claim.requesters)})
     assert world.state.ledger == Ledger()
     assert world.rendered() == {}
-    assert not [path for path in world.files if ledger_format.kind_of(path)]
+    assert not [path for path in world.files if claim_file.kind_of(path)]
 
 
 # What is written is what is read
@@ -308,11 +308,11 @@ connections = st.builds(
 @examples(150)
 @given(applications | connections)
 def test_a_claim_is_read_as_it_was_written(claim: Claim) -> None:
-    path = ledger_format.path_of(claim.key)
-    text = ledger_format.write(claim)
-    found = ledger_format.read(text.encode().decode(), path)
+    path = claim_file.path_of(claim.key)
+    text = claim_file.text_of(claim)
+    found = claim_file.read(text.encode().decode(), path)
     assert found == claim
-    assert ledger_format.write(found) == text
+    assert claim_file.text_of(found) == text
     if isinstance(found, ApplicationClaim) and isinstance(claim, ApplicationClaim):
         assert repr(sorted(found.parameters.items())) == repr(sorted(claim.parameters.items()))
 
@@ -334,9 +334,9 @@ def test_the_index_is_that_of_a_ledger_built_in_any_order(
         again.minutes,
     )
     ends = [claim.lease.ends for claim in rest if claim.lease]
-    assert ledger.next_end() == min(ends, default=None)
+    assert ledger.next_lease_end() == min(ends, default=None)
     for now in ends:
-        gone = ledger.ended(now)
+        gone = ledger.ended_claims(now)
         assert {claim.key for claim in gone} == {
             claim.key for claim in rest if claim.lease and claim.lease.ends < now
         }

@@ -10,11 +10,11 @@ from datetime import timedelta
 from random import Random
 
 import pytest
-from demandops.decision import Decision, State, rendered
+from demandops.decision import Decision, State, rendered_files
 from demandops.demand.claim import ApplicationClaim, Claim
 from demandops.errors import Refused
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger import claim_file
+from demandops.ledger.ledger import Ledger
 from hypothesis import assume, given, note
 from hypothesis import strategies as st
 from inmemory import NOW, Repo, outcome
@@ -44,7 +44,7 @@ def ledger_in(repo: Repo) -> Ledger:
     """Return the ledger as one who only has the files reads it."""
     ledger = Ledger()
     for path, text in repo.below("ledger").items():
-        claim = ledger_format.read(text, path)
+        claim = claim_file.read(text, path)
         ledger = ledger.replace(claim.key, claim)
     return ledger
 
@@ -257,7 +257,7 @@ def test_a_request_writes_the_claims_it_changes_and_no_others(random: Random, le
             continue
         changed = [change.after or change.before for change in taken.changes.claims]
         assert {demand_in(claim) for claim in changed if claim} == expected.touched
-        paths = {ledger_format.path_of(change.key) for change in taken.changes.claims}
+        paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
         assert {path for path in taken.files if path.startswith("ledger/")} == paths
         assert bool(taken.files) == expected.effective
 
@@ -313,11 +313,11 @@ def test_rendering_step_by_step_gives_what_rendering_at_once_gives(
     repo = Repo()
     for request in told(Maker(random).sequence(length)):
         repo.take(request)
-        at_once = rendered(repo.state)
+        at_once = rendered_files(repo.state)
         assert repo.below(*{path.split("/")[0] for path in at_once}) == at_once
         fresh = State.of(repo.state.config, ledger_in(repo))
         assert fresh.ledger == repo.state.ledger
-    assert rendered(fresh) == at_once
+    assert rendered_files(fresh) == at_once
 
 
 @examples(40)

@@ -15,8 +15,8 @@ from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Operation
 from demandops.demand.lease import Lease
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
-from demandops.ledger.restoration import Restoration
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.operations.restoration import Restoration
 from inmemory import NOW, Repo
 from model.goals import Maker
 
@@ -77,7 +77,7 @@ def test_what_was_booked_since_is_refused_and_listed() -> None:
         f"{newer.booked:%Y-%m-%d %H:%M:%S} UTC (request '{newer.request}')"
     )
     assert told.value.faults[1].message == (
-        "what was booked since stays unless it is to go as well (--drop-newer)"
+        "newer claims stay; use --drop-newer to undo them as well"
     )
 
 

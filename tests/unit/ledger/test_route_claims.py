@@ -18,8 +18,9 @@ from demandops.demand.demand_request import (
 )
 from demandops.demand.route import Route, united
 from demandops.errors import InvalidInput, Refused
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger, apply
+from demandops.ledger import claim_file
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Ledger
 
 NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
 STRING = "std_msgs/msg/String"
@@ -58,17 +59,17 @@ class TestFiles:
 
     def test_topics_stay_readable(self) -> None:
         held = claim(Route("/b", "/c", qos=1, rate=0.5), Route("/a", "/b"))
-        text = ledger_format.write(held)
+        text = claim_file.text_of(held)
         assert text.endswith(
             "topics:\n  /a: /b\n  /b:\n    target: /c\n    qos: 1\n    rate: 0.5\n"
         )
-        assert ledger_format.read(text, ledger_format.path_of(held.key)) == held
+        assert claim_file.read(text, claim_file.path_of(held.key)) == held
 
     def test_a_file_of_before_there_were_options_is_read(self) -> None:
         held = claim(Route("/a", "/b"))
-        text = ledger_format.write(held)
+        text = claim_file.text_of(held)
         assert yaml.safe_load(text)["topics"] == {"/a": "/b"}
-        assert ledger_format.read(text, ledger_format.path_of(held.key)) == held
+        assert claim_file.read(text, claim_file.path_of(held.key)) == held
 
     @pytest.mark.parametrize(
         ("written", "expected"),
@@ -83,18 +84,18 @@ class TestFiles:
     )
     def test_they_are_read_strictly(self, written: str, expected: str) -> None:
         held = claim(Route("/a", "/b"))
-        text = ledger_format.write(held).replace("/a: /b", f"/a: {written}")
-        path = ledger_format.path_of(held.key)
+        text = claim_file.text_of(held).replace("/a: /b", f"/a: {written}")
+        path = claim_file.path_of(held.key)
         with pytest.raises(InvalidInput) as invalid:
-            ledger_format.read(text, path)
+            claim_file.read(text, path)
         (found,) = invalid.value.faults
         assert str(found).startswith(f"{path}: {expected}")
 
     def test_a_claim_of_a_type_that_is_open_is_not_read(self) -> None:
         held = claim(Route("/a", "/b"))
-        text = ledger_format.write(held).replace("type: mqtt", "type: auto")
+        text = claim_file.text_of(held).replace("type: mqtt", "type: auto")
         with pytest.raises(InvalidInput, match="type: is 'auto', but must be"):
-            ledger_format.read(text, ledger_format.path_of(held.key))
+            claim_file.read(text, claim_file.path_of(held.key))
 
 
 class TestContradictions:
@@ -117,8 +118,8 @@ class TestContradictions:
         value: Any = yaml.safe_load(stands)
         ledger = joined(Ledger(), Route("/a", "/b", **{option: value}))
         assert refusal(ledger, Route("/a", "/b")) == [
-            f"connections[0].topics[0].{option}: {option} {asked} of '/a' contradicts what stands: "
-            f"'c' is held by v with {option} {stands}; use the same, or a second connection"
+            f"connections[0].topics[0].{option}: {option} {asked} of '/a' contradicts an existing "
+            f"claim: 'c' is held by v with {option} {stands}; use the same, or a second connection"
         ]
         assert joined(ledger, Route("/a", "/b", **{option: value}), who="w") != ledger
 
@@ -144,15 +145,15 @@ def test_a_type_that_is_said_later_is_filled_in_and_kept() -> None:
     ledger = joined(Ledger(), Route("/a", "/b"))
     ledger = joined(ledger, Route("/a", "/b", type=STRING))
     assert joined(ledger, Route("/a", "/b")) == ledger
-    (held,) = ledger.connection("c")
+    (held,) = ledger.connection_claims("c")
     assert held.topics == {"/a": Route("/a", "/b", type=STRING)}
 
 
 def test_what_is_carried_back_arrives_at_the_source() -> None:
     ledger = joined(Ledger(), Route("/a", "/b"), Route("/c", "/d", reverse=True))
-    assert ledger.carries("t", "/b")
-    assert ledger.carries("s", "/c")
-    assert not ledger.carries("t", "/d")
+    assert ledger.is_carried_to("t", "/b")
+    assert ledger.is_carried_to("s", "/c")
+    assert not ledger.is_carried_to("t", "/d")
 
 
 @pytest.mark.parametrize("kind", [ConnectionType.ZENOH, ConnectionType.ROS])
@@ -160,9 +161,12 @@ def test_links_are_known_at_both_nodes_as_long_as_somebody_holds_them(kind: Conn
     ledger = joined(Ledger(), Route("/a", "/a"), type=kind.value)
     ledger = joined(ledger, Route("/a", "/a"), type=kind.value, who="w")
     ledger = joined(ledger, Route("/a", "/a"), type=kind.value, id="d", target="u")
-    first, second = ledger.connection("c")
-    assert (ledger.at(kind, "s"), ledger.at(kind, "t")) == (("c", "d"), ("c",))
+    first, second = ledger.connection_claims("c")
+    assert (ledger.connections_at(kind, "s"), ledger.connections_at(kind, "t")) == (
+        ("c", "d"),
+        ("c",),
+    )
     ledger = ledger.replace(first.key, None)
-    assert ledger.at(kind, "t") == ("c",)
+    assert ledger.connections_at(kind, "t") == ("c",)
     ledger = ledger.replace(second.key, None)
-    assert (ledger.at(kind, "s"), ledger.at(kind, "t")) == (("d",), ())
+    assert (ledger.connections_at(kind, "s"), ledger.connections_at(kind, "t")) == (("d",), ())

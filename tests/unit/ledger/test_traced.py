@@ -7,7 +7,7 @@ from random import Random
 import pytest
 from demandops.config.config import Config
 from demandops.decision import Decision
-from demandops.ledger.apply import ClaimChange, Ledger
+from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.planner import plan
 from demandops.plan.release import Release

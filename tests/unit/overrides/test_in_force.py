@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 from asking import CLOUD, EGO, NOW, STATION_CLOUD, Books, application, connection, goal
-from demandops.decision import decide, rendered
+from demandops.decision import decide, rendered_files
 from demandops.demand.claim import KEPT, Subject, SubjectKind
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import InvalidInput, Refused
@@ -84,7 +84,7 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
         ledger, config = books.state.ledger, books.config
         generated = {p: t for p, t in books.files.items() if not p.startswith("ledger/")}
         standing = {p: t for p, t in before.items() if p.startswith(("clusters/", "bootstrap/"))}
-        again = rendered(books.state, standing)
+        again = rendered_files(books.state, standing)
         assert {p: t for p, t in generated.items() if p in again} == again
         assert [p for p in generated if p.startswith("clusters/") and p not in again] == []
         entries = bookkeeping(ledger, config)
@@ -94,7 +94,7 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
             assert ((claim.subject.id, claim.demand) in told) is suspended
             if claim.demand.startswith(KEPT):
                 assert claim.requesters == ("petra",)
-                assert ledger.of(claim.subject) == (claim,), "it gives way to any other"
+                assert ledger.claims_on(claim.subject) == (claim,), "it gives way to any other"
         for entry in entries.services.values():
             assert (entry.service, entry.node) != ("object-detection", "cloud")
         assert "v2/edge" not in entries.connections
@@ -139,7 +139,7 @@ def test_what_is_higher_than_a_hold_changes_what_it_holds() -> None:
         more = {"select": [{"nodes": ["edge"]}], "replicas": 4, "priority": priority}
         held = Books(files(held=hold, more=more))
         held.state = held.state.__class__(held.config, held.state.engine, books.state.ledger)
-        after = rendered(held.state, before)
+        after = rendered_files(held.state, before)
         path = "clusters/c-its/perception/edge/od-edge-vehicle00.yaml"
         assert (body(after[path]) != body(before[path])) is changed
 
@@ -208,7 +208,7 @@ def test_a_kept_claim_is_the_owners_and_holds_what_the_last_one_did() -> None:
     books.send(one | {"shutdown": True})
     books.send(two | {"shutdown": True})
     subject = Subject(SubjectKind.APPLICATION, "edge/object_detection_fusion")
-    (claim,) = books.state.ledger.of(subject)
+    (claim,) = books.state.ledger.claims_on(subject)
     assert (claim.demand, claim.request) == ("override:tested", "override:tested")
     assert (claim.requesters, claim.lease) == (("petra",), None)
     assert "ego_data" not in claim.inputs  # type: ignore[union-attr]
@@ -233,7 +233,7 @@ def test_a_held_release_keeps_its_chart_when_the_registry_moves_on() -> None:
     for overrides, kept in ((hold, True), ({}, False)):
         moved = Books({"registry/charts.yaml": new, **overrides})
         state = type(moved.state)(moved.config, moved.state.engine, books.state.ledger)
-        after = rendered(state, before)
+        after = rendered_files(state, before)
         assert (f"{CHARTS}/object-detection-1.0.0.yaml" in after) is kept
         assert f"{CHARTS}/object-detection-1.1.0.yaml" in after
         release = after["clusters/c-its/perception/edge/od-edge-vehicle00.yaml"]

@@ -16,7 +16,7 @@ from demandops.config.override import Override, OverrideFile, Selector, merged
 from demandops.config.override_conflict import can_meet, commute, contested, overlap
 from demandops.config.policy import matches
 from demandops.plan.checks import trial_demands
-from demandops.plan.overrides.effects import effects_on, with_overrides
+from demandops.plan.overrides.effects import apply_effects, effects_on
 from demandops.plan.overrides.selectors import Traits, fits
 from demandops.plan.release import ServiceRelease
 from hypothesis import example, given, settings
@@ -169,7 +169,7 @@ effects = st.fixed_dictionaries(
 
 @lru_cache
 def _release() -> ServiceRelease:
-    (made,) = trial_demands.releases(config()).values()
+    (made,) = trial_demands.trial_releases(config()).values()
     return made[0]
 
 
@@ -195,7 +195,7 @@ def _override(name: str, fields: dict[str, Any]) -> Override:
 def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
     release = _release()
     by = [(one, effects_on(release, one, config())) for one in overrides]
-    shaped = with_overrides(release, [pair for pair in by if pair[1]], config())
+    shaped = apply_effects(release, [pair for pair in by if pair[1]], config())
     assert isinstance(shaped, ServiceRelease)
     values: Any = {}
     for _, patch in shaped.shaping.patches:

@@ -17,12 +17,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "demand"))
 
 from asking import NOW, skeleton
 from demandops.config.load import load
-from demandops.decision import State, rendered
+from demandops.decision import State, rendered_files
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.route import Route
 from demandops.errors import InvalidInput, Refused
 from demandops.plan.connection_clients import BridgeKey, EndKey
-from demandops.plan.release_keys import affected
+from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connections import client_schema
 from demandops.render.connections.ros import dds_type
@@ -36,7 +36,7 @@ class World:
 
     def __init__(self, before: State) -> None:
         self.state = before
-        self.files: dict[str, str] = dict(rendered(before))
+        self.files: dict[str, str] = dict(rendered_files(before))
         self.releases: tuple[ReleaseChange, ...] = ()
 
     def send(self, asked: dict[str, Any]) -> None:
@@ -85,7 +85,7 @@ class TestZenoh:
         world.send(demand("zenoh", {"/b": "/b"}, id="other", source="vehicle01"))
         world.send(demand("zenoh"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected(before, world.state.ledger, world.state.config, [subject])
+        keys = affected_keys(before, world.state.ledger, world.state.config, [subject])
         assert keys == (BridgeKey("vehicle00"), BridgeKey("edge"))
         assert [(found.name, found.change) for found in world.releases] == [
             ("zenoh-vehicle00", "start"),
@@ -98,7 +98,7 @@ class TestZenoh:
         before = world.state.ledger
         world.send(demand("mqtt"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected(before, world.state.ledger, world.state.config, [subject])
+        keys = affected_keys(before, world.state.ledger, world.state.config, [subject])
         assert keys == (EndKey("c", "source"), EndKey("c", "target"))
 
     def test_its_cost_does_not_grow_with_connections_elsewhere(self) -> None:
@@ -106,9 +106,9 @@ class TestZenoh:
         for number in range(30):
             world.send(demand("zenoh", id=f"c{number}", source="vehicle01"))
         world.send(demand("zenoh", target="vehicle00", source="edge"))
-        assert world.state.ledger.at(world.state.ledger.connection("c")[0].type, "vehicle00") == (
-            "c",
-        )
+        assert world.state.ledger.connections_at(
+            world.state.ledger.connection_claims("c")[0].type, "vehicle00"
+        ) == ("c",)
 
     def test_topics_match_whole_names_and_nothing_else(self) -> None:
         world = zenoh_world()
@@ -159,14 +159,14 @@ class TestZenoh:
             who = chance.choice(["vehicle00", "vehicle01"])
             asked = demand("zenoh", topics, id=id, source=source, target=target, requesters=[who])
             asked["shutdown"] = chance.random() < 0.5
-            if asked["shutdown"] and not world.state.ledger.connection(id):
+            if asked["shutdown"] and not world.state.ledger.connection_claims(id):
                 continue
             try:
                 world.send(asked)
             except InvalidInput:
                 continue  # a shutdown of what this requester does not hold
             kept = {path: text for path, text in world.files.items() if "ledger/" not in path}
-            assert kept == rendered(world.state)
+            assert kept == rendered_files(world.state)
 
 
 class TestRos:
@@ -341,11 +341,11 @@ class TestWhatPeopleDidInGit:
         """Return why the books cannot be rendered once a claim or the inventory was edited."""
         world = World(state(**self.NODES))
         world.send(demand(kind))
-        (claim,) = world.state.ledger.connection("c")
+        (claim,) = world.state.ledger.connection_claims("c")
         edited = replace(claim, topics={route.source: route})
         books = world.state.ledger.replace(claim.key, edited)
         with pytest.raises(Refused) as refused:
-            rendered(replace(state(**(self.NODES | nodes)), ledger=books))
+            rendered_files(replace(state(**(self.NODES | nodes)), ledger=books))
         return [str(found) for found in refused.value.faults]
 
     def test_an_option_that_the_type_cannot_honour(self) -> None:
@@ -362,7 +362,7 @@ class TestWhatPeopleDidInGit:
         ("kind", "node", "left", "expected"),
         [
             ("zenoh", "vehicle00", {}, "node: 'vehicle00' carries Zenoh connections, but has no"),
-            ("ros", "edge", {}, "connections: connection 'c' finds no end with a wan address any"),
+            ("ros", "edge", {}, "connections: connection 'c' has no end with a wan address any"),
             ("ros", "vehicle00", {}, "connections: 'c': the message type of '/a' is not known"),
         ],
     )
@@ -375,7 +375,7 @@ class TestWhatPeopleDidInGit:
         world = World(state(**self.NODES))
         world.send(demand("zenoh"))
         with pytest.raises(Refused, match="'zenoh-bridge' is in use, but not in registry/images"):
-            rendered(replace(state("", **self.NODES), ledger=world.state.ledger))
+            rendered_files(replace(state("", **self.NODES), ledger=world.state.ledger))
 
 
 class TestSchemas:

@@ -21,7 +21,7 @@ from asking import (
     goal,
     perception,
 )
-from demandops.decision import rendered
+from demandops.decision import rendered_files
 from demandops.errors import InvalidInput
 from demandops.render.output_check import check_files
 
@@ -64,10 +64,10 @@ def test_what_is_rendered_fits_the_schemas_of_kubernetes(
 @pytest.mark.parametrize("step", range(8))
 def test_what_is_kept_is_what_would_be_rendered_anew(experiment: list[Books], step: int) -> None:
     books = experiment[step]
-    anew = {path for path in rendered(books.state) if path.startswith("clusters/")}
+    anew = {path for path in rendered_files(books.state) if path.startswith("clusters/")}
     kept = {path for path, _ in documents(books)}
     assert kept == anew
-    assert all(books.files[path] == text for path, text in rendered(books.state).items())
+    assert all(books.files[path] == text for path, text in rendered_files(books.state).items())
 
 
 def test_requesters_appear_nowhere_below_clusters() -> None:

@@ -11,7 +11,7 @@ from demandops.demand.claim import ConnectionClaim
 from demandops.demand.demand_request import ConnectionType
 from demandops.demand.lease import Lease
 from demandops.demand.route import Route
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.service.timing.lease_expiry import LeaseClock
 
 from tests.scenarios.running import START, Clocks, rebuilt

@@ -15,7 +15,7 @@ import pytest
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.decision import Decision, State, decide
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.staterepo import new_repo
 
 NOW = datetime(2026, 3, 1, 12, 0, 7, tzinfo=timezone.utc)

@@ -21,7 +21,7 @@ from demandops.cli.output import (
 from demandops.decision import decide
 from demandops.demand import decommission_goal
 from demandops.errors import Refused
-from demandops.ledger.apply import ClaimChange
+from demandops.ledger.ledger import ClaimChange
 from demandops.service import Generator
 from demandops.staterepo import reader
 from demandops.staterepo.history import authorship

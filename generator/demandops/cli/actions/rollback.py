@@ -21,7 +21,7 @@ from demandops.cli.output import (
 )
 from demandops.decision import Decision, decide
 from demandops.errors import InvalidInput
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.service import Generator
 from demandops.service import rollback_goal as rollbacks
 from demandops.staterepo import reader
@@ -112,7 +112,7 @@ def _consequence(decision: Decision | None) -> dict[str, Any]:
                 "demand": claim.demand,
                 "request": claim.request,
                 "requesters": list(claim.requesters),
-                "file": ledger_format.path_of(claim.key),
+                "file": claim_file.path_of(claim.key),
             }
         )
     releases = [

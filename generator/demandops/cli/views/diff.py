@@ -18,7 +18,7 @@ from demandops.cli.output import (
     warn_of,
 )
 from demandops.plan.views.bookkeeping import bookkeeping
-from demandops.plan.views.bookkeeping_diff import EntryChange, difference
+from demandops.plan.views.bookkeeping_diff import EntryChange, bookkeeping_changes
 from demandops.render.changes.commit_diff import ReleaseDifference, compare
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo import reader
@@ -43,7 +43,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
         old, new = (_loaded(repo, revision) for revision in (before, after))
         releases, others = _releases(repo, old, new)
     books = [bookkeeping(one.state.ledger, one.state.config) for one in (old, new)]
-    entries = difference(*books)
+    entries = bookkeeping_changes(*books)
     if output == "json":
         was, now = map(asdict, books)
         print_json(

@@ -17,7 +17,7 @@ from demandops.cli.output import (
     state_repo_option,
 )
 from demandops.config.override import ImagePin, written
-from demandops.plan.views.override_report import Entry, survey
+from demandops.plan.views.override_report import Entry, override_report
 from demandops.staterepo import reader
 
 
@@ -34,7 +34,7 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
         snapshot = repo.snapshot(at, tell)
     state = snapshot.state
-    found = survey(state.ledger, state.config, datetime.now(timezone.utc))
+    found = override_report(state.ledger, state.config, datetime.now(timezone.utc))
     if output == "json":
         print_json([_row(entry) for entry in found])
         return

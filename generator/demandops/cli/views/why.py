@@ -19,7 +19,7 @@ from demandops.cli.output import (
 from demandops.cli.views import why_answer
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import StateRepoError, near, shown
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
 from demandops.render.gitops.paths import path_of
@@ -97,7 +97,7 @@ def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -
     Raises:
         StateRepoError: where it means nothing, or several things.
     """
-    if name.startswith(("clusters/", "bootstrap/", f"{ledger_format.LEDGER_ROOT}/")):
+    if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     found = [one for one in _by_name(repo, snapshot, name) if kind in (None, one.kind)]
     running = [one for one in found if one.release or _is_held(snapshot, one)]
@@ -109,7 +109,7 @@ def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    known = {*explanation.names(ledger, config), *repo.ever_stopped(str(snapshot.commit))}
+    known = {*explanation.release_names(ledger, config), *repo.ever_stopped(str(snapshot.commit))}
     known |= {id for one in SubjectKind for id in ledger.subjects(one)}
     raise StateRepoError(f"nothing called {shown(name)} runs, or ever did{near(name, known)}")
 
@@ -117,17 +117,17 @@ def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -
 def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
     ledger, config = snapshot.state.ledger, snapshot.state.config
     found = []
-    release = explanation.find(ledger, config, name)
+    release = explanation.release_named(ledger, config, name)
     path = path_of(release) if release else repo.path_called(name, str(snapshot.commit))
     if path is None:  # one that an override denies may never have run
-        stopped = explanation.denied_called(ledger, config, name)
+        stopped = explanation.denied_release_named(ledger, config, name)
         path = path_of(stopped[0]) if stopped else None
     if path is not None:
         found.append(_Asked("release", name, path, release))
     for kind in SubjectKind:
         subject = Subject(kind, name)
-        folder = ledger_format.folder_of(subject)
-        if ledger.of(subject) or _has_history(repo, snapshot, folder):
+        folder = claim_file.folder_of(subject)
+        if ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
             found.append(_Asked(kind.value[:-1], name, folder, subject=subject))
     return found
 
@@ -139,14 +139,14 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Asked:
     if key is not None:
         return _Asked("claim", key.demand, path, subject=key.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    release = explanation.find(snapshot.state.ledger, snapshot.state.config, name)
+    release = explanation.release_named(snapshot.state.ledger, snapshot.state.config, name)
     if release is not None and path_of(release) == path:
         return _Asked("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
         raise StateRepoError(f"{shown(path)} is no file of the state repo, and never was")
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return _Asked("file", path, path)
-    return _Asked("claim" if ledger_format.kind_of(path) else "release", name, path)
+    return _Asked("claim" if claim_file.kind_of(path) else "release", name, path)
 
 
 def _denied(snapshot: Snapshot, asked: _Asked) -> dict[str, Any]:
@@ -154,12 +154,12 @@ def _denied(snapshot: Snapshot, asked: _Asked) -> dict[str, Any]:
     if asked.kind != "release":
         return {}
     name = asked.path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    stopped = explanation.denied_called(snapshot.state.ledger, snapshot.state.config, name)
+    stopped = explanation.denied_release_named(snapshot.state.ledger, snapshot.state.config, name)
     return why_answer.denied(*stopped) if stopped else {}
 
 
 def _is_held(snapshot: Snapshot, asked: _Asked) -> bool:
-    return asked.subject is not None and bool(snapshot.state.ledger.of(asked.subject))
+    return asked.subject is not None and bool(snapshot.state.ledger.claims_on(asked.subject))
 
 
 def _has_history(repo: Reader, snapshot: Snapshot, path: str) -> bool:

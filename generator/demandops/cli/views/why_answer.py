@@ -8,8 +8,8 @@ from typing import Any
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import Claim, Subject
-from demandops.ledger import claim_file as ledger_format
-from demandops.plan.overrides.claims_in_force import in_force, suspended_by
+from demandops.ledger import claim_file
+from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
 from demandops.render.changes.changeset import describe_change
@@ -24,7 +24,7 @@ _PEOPLES_COMMITS = 5
 def release(snapshot: Snapshot, found: Release) -> dict[str, Any]:
     """Return why a release runs."""
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    claims = explanation.claims_behind(in_force(ledger, config), found)
+    claims = explanation.claims_behind(without_suspended(ledger, config), found)
     return {
         "runs": True,
         "what": describe_change(None, found, existed=False).description,
@@ -33,7 +33,7 @@ def release(snapshot: Snapshot, found: Release) -> dict[str, Any]:
         "claims": [_claim(claim, config) for claim in claims],
         "shaped_by": [
             {"file": one.file, "entry": one.entry or None, "what": one.what}
-            for one in explanation.shaped_by(found, config)
+            for one in explanation.shaping_files(found, config)
         ],
         "overrides": [_override(one, effects) for one, effects in found.shaping.by],
     }
@@ -52,7 +52,7 @@ def denied(found: Release, by: Override) -> dict[str, Any]:
 def subject(snapshot: Snapshot, found: Subject) -> dict[str, Any]:
     """Return who holds an application or a connection, and what runs because of that."""
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    claims = sorted(ledger.of(found), key=lambda claim: claim.booked)
+    claims = sorted(ledger.claims_on(found), key=lambda claim: claim.booked)
     releases = explanation.releases_of(ledger, config, found)
     return {
         "runs": any(suspended_by(claim, config) is None for claim in claims),
@@ -96,7 +96,7 @@ def _override(override: Override, effects: Iterable[str]) -> dict[str, Any]:
 
 def _claim(claim: Claim, config: Config) -> dict[str, Any]:
     lease = claim.lease
-    suspended, kept = suspended_by(claim, config), explanation.kept_by(claim, config)
+    suspended, kept = suspended_by(claim, config), explanation.keeping_override(claim, config)
     return {
         "subject": str(claim.subject),
         "demand": claim.demand,
@@ -104,7 +104,7 @@ def _claim(claim: Claim, config: Config) -> dict[str, Any]:
         "requesters": list(claim.requesters),
         "since": claim.booked.isoformat(),
         "lease": {"seconds": lease.seconds, "until": lease.until.isoformat()} if lease else None,
-        "file": ledger_format.path_of(claim.key),
+        "file": claim_file.path_of(claim.key),
         "release_by": explanation.how_to_release(claim),
         "kept_by": _override(kept, ("keep",)) if kept else None,
         "suspended_by": _override(suspended, ("deny",)) if suspended else None,

@@ -1,1 +1,1 @@
-"""What refuses a booking by its plan: quotas and denials; and trials of what people merge."""
+"""Checks of a booking by its plan (quotas, denials), and trial demands for a configuration."""

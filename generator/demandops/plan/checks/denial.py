@@ -1,7 +1,7 @@
-"""``deny``: a demand that an override rules out is refused, and told why and by whom.
+"""``deny``: a demand that an override denies is refused, with the reason and the owner.
 
-Who asks again for what stands already only renews it, which is always allowed; it is then told
-that it is suspended.
+A demand that only repeats existing claims renews them. That is always allowed; it gets a warning
+that they are suspended.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from demandops.config.policy import matches
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, DemandRequest
 from demandops.errors import Fault, fault
-from demandops.ledger.apply import Changes, Ledger
-from demandops.plan.overrides.claims_in_force import suspended_by
-from demandops.plan.overrides.selectors import Traits, fits, labelled, traits_of
+from demandops.ledger.ledger import Changes, Ledger
+from demandops.plan.overrides.selectors import Traits, fits, has_labels, traits_of
+from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.plan.release import ServiceKey
-from demandops.plan.release_keys import keys_booked
+from demandops.plan.release_keys import keys_including_suspended
 
 
 def faults(
     request: DemandRequest, after: Ledger, changes: Changes, config: Config
 ) -> Iterator[Fault]:
-    """Yield each thing that a request asks anew and an override denies."""
+    """Yield every new application and connection of a request that an override denies."""
     denying = [one for one in reversed(config.in_force) if one.deny]
     if not denying or not request.operation.asks:
         return
@@ -34,15 +34,19 @@ def faults(
         and change.before.booked == change.after.booked
         for change in changes.claims
     }
-    for subject, where, asked in _listed(request):
+    for subject, where, demanded in _listed(request):
         if renewed.get(subject, True):
             continue
         for override in denying:
-            field = _denied(
-                override, where, asked, list(_runs(asked, subject, after, config)), config
+            field = _denied_field(
+                override,
+                where,
+                demanded,
+                list(_service_traits(demanded, subject, after, config)),
+                config,
             )
             if field:
-                yield fault(field, _told(override), code="denied")
+                yield fault(field, _message(override), code="denied")
                 break
 
 
@@ -51,56 +55,62 @@ def _listed(
 ) -> Iterator[tuple[Subject, str, ApplicationDemand | ConnectionDemand]]:
     for index, app in enumerate(request.applications):
         yield Subject(SubjectKind.APPLICATION, app.id), f"applications[{index}]", app
-    for index, one in enumerate(request.connections):
-        yield Subject(SubjectKind.CONNECTION, one.id), f"connections[{index}]", one
+    for index, connection in enumerate(request.connections):
+        subject = Subject(SubjectKind.CONNECTION, connection.id)
+        yield subject, f"connections[{index}]", connection
 
 
-def _runs(
-    asked: ApplicationDemand | ConnectionDemand, subject: Subject, after: Ledger, config: Config
+def _service_traits(
+    demanded: ApplicationDemand | ConnectionDemand, subject: Subject, after: Ledger, config: Config
 ) -> Iterator[Traits]:
-    """Yield the services that an application would run, as selectors see them."""
-    if not isinstance(asked, ApplicationDemand):
+    """Yield the traits of the services that an application needs."""
+    if not isinstance(demanded, ApplicationDemand):
         return
-    for key in keys_booked(after, config, subject):
+    for key in keys_including_suspended(after, config, subject):
         if isinstance(key, ServiceKey):
             yield Traits(
-                (key.node,), asked.requesters, (asked.id,), (asked.appdef,), service=key.service
+                (key.node,),
+                demanded.requesters,
+                (demanded.id,),
+                (demanded.appdef,),
+                service=key.service,
             )
 
 
-def _denied(
+def _denied_field(
     override: Override,
     where: str,
-    asked: ApplicationDemand | ConnectionDemand,
+    demanded: ApplicationDemand | ConnectionDemand,
     services: list[Traits],
     config: Config,
 ) -> str:
-    """Return the field for which an override denies what is asked, or nothing."""
+    """Return the field that makes an override deny a demanded subject, or an empty text."""
     for selector in override.select:
-        looked_at = services if selector.services else [traits_of(asked)]
-        for traits in looked_at:
+        for traits in services if selector.services else [traits_of(demanded)]:
             if fits(selector, traits, config):
-                return f"{where}.{_field(selector, asked, config)}"
+                return f"{where}.{_matched_field(selector, demanded, config)}"
     return ""
 
 
-def _field(selector: Selector, asked: ApplicationDemand | ConnectionDemand, config: Config) -> str:
-    """Return the field of what is asked that a selector goes by, the most telling one."""
+def _matched_field(
+    selector: Selector, demanded: ApplicationDemand | ConnectionDemand, config: Config
+) -> str:
+    """Return the field that a selector matches; of several, the most specific one."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:
         who = selector.requesters
-        index = next(i for i, name in enumerate(asked.requesters) if matches(name, who))
+        index = next(i for i, name in enumerate(demanded.requesters) if matches(name, who))
         return f"requesters[{index}]"
     if selector.services or selector.appdefs:
         return "appdef"
-    if isinstance(asked, ApplicationDemand):
+    if isinstance(demanded, ApplicationDemand):
         return "node"
-    at_source = not selector.nodes or matches(asked.source, selector.nodes)
-    return "source" if at_source and labelled(selector, asked.source, config) else "target"
+    at_source = not selector.nodes or matches(demanded.source, selector.nodes)
+    return "source" if at_source and has_labels(selector, demanded.source, config) else "target"
 
 
-def _told(override: Override) -> str:
+def _message(override: Override) -> str:
     until = f" until {written(override.end)}" if override.end else ""
     return (
         f"is denied by {override.path}{until}: {override.reason}; ask its owner, {override.owner}, "
@@ -109,17 +119,17 @@ def _told(override: Override) -> str:
 
 
 def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
-    """Yield what of a demand is booked and does not run, for an override suspends it."""
+    """Yield a warning for each claim of a demand that an override suspends."""
     subjects = dict.fromkeys(subject for subject, _, _ in _listed(request))
     claims = [
-        *ledger.of_demand(request.demand),
-        *(claim for subject in subjects for claim in ledger.of(subject)),
+        *ledger.claims_of_demand(request.demand),
+        *(claim for subject in subjects for claim in ledger.claims_on(subject)),
     ]
     seen = set()
-    asking = set(request.requesters())
+    requesters = set(request.requesters())
     for claim in claims if config.in_force else ():
         override = suspended_by(claim, config)
-        if override is None or claim.key in seen or not asking & set(claim.requesters):
+        if override is None or claim.key in seen or not requesters & set(claim.requesters):
             continue
         seen.add(claim.key)
         by = f"{override.path} of {override.owner}: {override.reason}"

@@ -1,4 +1,4 @@
-"""Quotas: does a booking leave more than an access domain allows?"""
+"""Quotas: what a booking must not exceed in an access domain."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
 from demandops.demand.claim import ApplicationClaim, Claim, Subject, SubjectKind
 from demandops.errors import Fault, fault
-from demandops.ledger.apply import Changes, Ledger
+from demandops.ledger.ledger import Changes, Ledger
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import keys_of
 
 
 def faults(before: Ledger, after: Ledger, changes: Changes, config: Config) -> Iterator[Fault]:
-    """Yield every quota that ``changes`` go beyond; what was over it before may stay and shrink."""
+    """Yield every quota that ``changes`` exceed, unless the count does not grow."""
     booked = [change.after for change in changes.claims if change.after]
     holders = {(_node(claim), who) for claim in booked for who in claim.requesters}
     domains = {
@@ -35,11 +35,13 @@ def _claims(
         return
     count = _held(requester, after, domain, config)
     if count > most and count > _held(requester, before, domain, config):
-        yield _over(domain, "claimsPerRequester", most, f"'{requester}' would hold {count} claims")
+        yield _exceeded(
+            domain, "claimsPerRequester", most, f"'{requester}' would hold {count} claims"
+        )
 
 
 def _held(requester: str, ledger: Ledger, domain: AccessDomain, config: Config) -> int:
-    claims = ledger.of_requester(requester)
+    claims = ledger.claims_of_requester(requester)
     return sum(config.domain_of.get(_node(claim)) is domain for claim in claims)
 
 
@@ -50,26 +52,26 @@ def _services(node: str, before: Ledger, after: Ledger, config: Config) -> Itera
         return
     count = _running(node, after, config)
     if count > most and count > _running(node, before, config):
-        yield _over(domain, "servicesPerNode", most, f"'{node}' would run {count} services")
+        yield _exceeded(domain, "servicesPerNode", most, f"'{node}' would run {count} services")
 
 
 def _running(node: str, ledger: Ledger, config: Config) -> int:
-    applications = (Subject(SubjectKind.APPLICATION, name) for name in ledger.at_node(node))
+    applications = (Subject(SubjectKind.APPLICATION, name) for name in ledger.applications_at(node))
     keys = {key for subject in applications for key in keys_of(ledger, config, subject)}
     return sum(isinstance(key, ServiceKey) and key.node == node for key in keys)
 
 
-def _over(domain: AccessDomain, quota: str, most: int, what: str) -> Fault:
+def _exceeded(domain: AccessDomain, quota: str, most: int, usage: str) -> Fault:
     return fault(
         "",
-        f"{what}, and quotas.{quota} of access domain '{domain.name}' allows {most}; release "
+        f"{usage}, and quotas.{quota} of access domain '{domain.name}' allows {most}; release "
         "something first, or have policy/ changed",
         code="quota",
     )
 
 
 def _node(claim: Claim) -> str:
-    """Return where a claim counts: where the application runs or the connection leads."""
+    """Return the node at which a claim counts: the application's, or the connection's target."""
     return claim.node if isinstance(claim, ApplicationClaim) else claim.target
 
 

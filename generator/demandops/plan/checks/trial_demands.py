@@ -1,6 +1,6 @@
-"""Invented demands: what every appdef would run, and every override would make of it.
+"""Trial demands: the releases of every appdef, and of every override that applies to it.
 
-What people merge is tried before somebody demands it. Gives releases to render; renders nothing.
+They show mistakes in a configuration before a real demand arrives. Returns releases; renders none.
 """
 
 from __future__ import annotations
@@ -13,34 +13,30 @@ from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.config.policy import matches
 from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
-from demandops.ledger import apply as booking
-from demandops.ledger.apply import Ledger
-from demandops.plan.overrides.effects import effects_on, with_overrides
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Ledger
+from demandops.plan.overrides.effects import apply_effects, effects_on
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
-from demandops.plan.release_keys import affected
+from demandops.plan.release_keys import affected_keys
 
 _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
-def releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return appdef → its services for an invented demand on some node, without overrides.
+def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
+    """Return appdef → its services for a trial demand on the first node, without overrides.
 
     Raises:
-        Refused: where one cannot be planned.
+        Refused: if one cannot be planned.
     """
-    place = next(iter(sorted(config.domain_of)), None)
-    if place is None:
+    node = next(iter(sorted(config.domain_of)), None)
+    if node is None:
         return {}
     plain = config.without_overrides()
-    return {
-        appdef.name: list(_services(appdef, place, plain)) for appdef in config.appdefs.values()
-    }
+    return {appdef.name: list(_services(appdef, node, plain)) for appdef in config.appdefs.values()}
 
 
-def _services(
-    appdef: ApplicationDefinition, place: str, config: Config
-) -> Iterator[ServiceRelease]:
+def _services(appdef: ApplicationDefinition, node: str, config: Config) -> Iterator[ServiceRelease]:
     request = DemandRequest(
         id="rehearsal",
         operation=Operation.JOIN,
@@ -48,27 +44,27 @@ def _services(
             ApplicationDemand(
                 id=f"rehearsal/{appdef.name}",
                 appdef=appdef.name,
-                node=place,
+                node=node,
                 requesters=("rehearsal",),
                 inputs={
-                    role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", place),)
+                    role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", node),)
                     for role in appdef.inputs
                 },
             ),
         ),
     )
-    ledger, changes = booking.apply(Ledger(), request, _NEVER)
-    for key in affected(Ledger(), ledger, config, changes.subjects()):
+    ledger, changes = apply(Ledger(), request, _NEVER)
+    for key in affected_keys(Ledger(), ledger, config, changes.subjects()):
         release = plan(ledger, config, key)
         if isinstance(release, ServiceRelease):
             yield release
 
 
-def overridden(
-    override: Override, invented: Iterable[ServiceRelease], appdef: str, config: Config
+def overridden_releases(
+    override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
-    """Yield the invented releases of an appdef as an override would have those it may be for."""
-    for release in invented:
+    """Yield those trial releases of an appdef that an override may select, with its effects."""
+    for release in trials:
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
         if effects and any(
             not selector.connections
@@ -76,6 +72,6 @@ def overridden(
             and (not selector.appdefs or matches(appdef, selector.appdefs))
             for selector in override.select
         ):
-            shaped = with_overrides(release, [(override, effects)], config)
+            shaped = apply_effects(release, [(override, effects)], config)
             if isinstance(shaped, ServiceRelease):
                 yield shaped

@@ -1,1 +1,1 @@
-"""What overrides make of claims and releases, before anything is planned."""
+"""Overrides: which claims and releases they select, and what they do to them."""

@@ -1,7 +1,6 @@
-"""What overrides make of a planned release: another version, place, number or image, or none.
+"""The effects of overrides on a planned release: version, node, replicas, images, or denial.
 
-Applied to the releases that a demand touches and to no others. Values are patched when they are
-rendered, for a template gives them.
+The rendering patches values, because a template makes them.
 """
 
 from __future__ import annotations
@@ -12,10 +11,18 @@ from dataclasses import replace
 from demandops.config.config import DDS_ROUTER_IMAGE, MQTT_CLIENT_IMAGE, ZENOH_BRIDGE_IMAGE, Config
 from demandops.config.override import Override
 from demandops.demand.claim import KEPT, Claim
-from demandops.ledger.apply import Ledger
-from demandops.plan.overrides.claims_in_force import denied_by
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.selectors import Traits, selects
-from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease, Shaping, place
+from demandops.plan.overrides.suspended_claims import denied_by
+from demandops.plan.release import (
+    Bridge,
+    MqttEnd,
+    Release,
+    RosEnd,
+    ServiceRelease,
+    Shaping,
+    node_and_domain,
+)
 
 _CLIENT_IMAGES: dict[type[MqttEnd | RosEnd | Bridge], str] = {
     MqttEnd: MQTT_CLIENT_IMAGE,
@@ -24,40 +31,40 @@ _CLIENT_IMAGES: dict[type[MqttEnd | RosEnd | Bridge], str] = {
 }
 
 
-def shaped(release: Release, ledger: Ledger, config: Config) -> Release | None:
-    """Return a release as the overrides in force have it, or nothing where one denies it.
+def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release | None:
+    """Return a release with the effects of all overrides, or ``None`` if one denies it.
 
     Raises:
-        Refused: where the node that it is moved to is gone.
+        Refused: if an override moves it to a node that is gone.
     """
     if not config.in_force:
         return release
     claims = _claims(release, ledger)
     traits = _traits(release, claims)
-    if denying(release, ledger, config) is not None:
+    if service_denied_by(release, ledger, config) is not None:
         return None
     kept = {claim.demand.removeprefix(KEPT) for claim in claims if claim.demand.startswith(KEPT)}
     by = []
     for override in config.in_force:
-        effects = _effects(release, override, config) if selects(override, traits, config) else ()
+        effects = effects_on(release, override, config) if selects(override, traits, config) else ()
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
         if effects:
             by.append((override, effects))
-    return with_overrides(release, by, config)
+    return apply_effects(release, by, config)
 
 
-def denying(release: Release, ledger: Ledger, config: Config) -> Override | None:
-    """Return the override that keeps a service from running, or nothing."""
+def service_denied_by(release: Release, ledger: Ledger, config: Config) -> Override | None:
+    """Return the override that denies a service, or ``None``."""
     if not isinstance(release, ServiceRelease) or not any(one.deny for one in config.in_force):
         return None
     return denied_by(_traits(release, _claims(release, ledger)), config)
 
 
-def with_overrides(
+def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
-    """Return a release with the effects of these overrides, who comes last wins."""
+    """Return a release with the effects of these overrides; the last one wins."""
     by = tuple(by)
     if not by:
         return release
@@ -71,17 +78,13 @@ def with_overrides(
         if "replicas" in effects and override.replicas is not None:
             release = replace(release, replicas=override.replicas)
         if "node" in effects:
-            node, domain = place(config, str(override.node))
+            node, domain = node_and_domain(config, str(override.node))
             release = replace(release, node=node, domain=domain)
     return release
 
 
 def effects_on(release: Release, override: Override, config: Config) -> tuple[str, ...]:
-    """Return what an override would do to a release, were it selected."""
-    return _effects(release, override, config)
-
-
-def _effects(release: Release, override: Override, config: Config) -> tuple[str, ...]:
+    """Return the effects that an override has on a release that it selects."""
     if isinstance(release, ServiceRelease):
         images = set(release.service.images)
         known = config.charts[release.service.chart].versions()
@@ -96,9 +99,11 @@ def _effects(release: Release, override: Override, config: Config) -> tuple[str,
 
 def _claims(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
     if isinstance(release, ServiceRelease):
-        return tuple(claim for app in release.applications for claim in ledger.application(app))
+        return tuple(
+            claim for app in release.applications for claim in ledger.application_claims(app)
+        )
     names = release.connections if isinstance(release, Bridge) else (release.connection,)
-    return tuple(claim for name in names for claim in ledger.connection(name))
+    return tuple(claim for name in names for claim in ledger.connection_claims(name))
 
 
 def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:

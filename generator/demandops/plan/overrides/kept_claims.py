@@ -1,8 +1,8 @@
-"""``keep``: what runs goes on without a demand, by a claim of the override's own.
+"""``keep``: a claim of the override's own keeps a subject running without a demand.
 
-When the last claim on a subject goes, one with the same content is booked in the owner's name; it
-gives way as soon as somebody asks again. Bookkeeping, history and files then explain it by
-themselves.
+When the last claim on a subject is released, a claim with the same content is booked for the
+override's owner. It is removed when a demand asks for the subject again. Because it is a claim,
+bookkeeping and history show it like any other.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import KEPT, Claim, ClaimKey, Subject, SubjectKind, is_kept
 from demandops.demand.demand_request import DemandRequest
-from demandops.ledger.apply import Changes, Ledger
-from demandops.ledger.ledger import differences
-from demandops.plan.overrides.claims_in_force import suspended_by
+from demandops.ledger.ledger import Changes, Ledger, claim_changes
 from demandops.plan.overrides.selectors import selects, traits_of
+from demandops.plan.overrides.suspended_claims import suspended_by
 
 
-def requested(request: DemandRequest) -> tuple[Subject, ...]:
+def requested_subjects(request: DemandRequest) -> tuple[Subject, ...]:
     """Return the subjects that a request lists."""
     return (
         *(Subject(SubjectKind.APPLICATION, app.id) for app in request.applications),
@@ -29,73 +28,74 @@ def requested(request: DemandRequest) -> tuple[Subject, ...]:
     )
 
 
-def giving_way(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
-    """Return the ledger without the overrides' own claims on these subjects."""
+def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
+    """Return the ledger without the kept claims on these subjects."""
     for subject in subjects:
-        for claim in ledger.of(subject):
-            if is_kept(claim):
-                ledger = ledger.replace(claim.key, None)
+        ledger = ledger.without(claim for claim in ledger.claims_on(subject) if is_kept(claim))
     return ledger
 
 
-def settled(
+def with_kept_claims(
     before: Ledger,
     after: Ledger,
     changes: Changes,
     subjects: Iterable[Subject],
-    world: tuple[Config, datetime],
+    config: Config,
+    now: datetime,
 ) -> tuple[Ledger, Changes]:
-    """Return a booking with what overrides keep, or no longer keep, of what it touched."""
+    """Return a booking with the kept claims updated on everything that it touched."""
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
-    after, more = kept(before, after, touched, world)
-    return after, replace(changes, claims=differences(before, after, [*keys, *more]))
+    after, more = update_kept_claims(before, after, touched, config, now)
+    return after, replace(changes, claims=claim_changes(before, after, [*keys, *more]))
 
 
-def kept(
-    before: Ledger, after: Ledger, subjects: Iterable[Subject], world: tuple[Config, datetime]
+def update_kept_claims(
+    before: Ledger, after: Ledger, subjects: Iterable[Subject], config: Config, now: datetime
 ) -> tuple[Ledger, list[ClaimKey]]:
-    """Return ``after`` with just the claims of overrides' own that belong there, and their keys.
+    """Return ``after`` with exactly the kept claims that its overrides ask for, and their keys.
 
     Args:
-        before, after: the books before and after a change.
-        subjects: what changed.
-        world: the configuration and the time for claims that are made.
+        before, after: the ledger before and after a change.
+        subjects: the subjects that changed.
+        config: the configuration after the change.
+        now: the booking time of new kept claims.
     """
     keys: list[ClaimKey] = []
     for subject in subjects:
-        own = [c for c in (*after.of(subject), *before.of(subject)) if is_kept(c)]
-        wanted = None
-        if all(is_kept(claim) for claim in after.of(subject)):
-            wanted = _wanted(own, before.of(subject), world)
-        for claim in own:
-            keys.append(claim.key)
-            after = after.replace(claim.key, None)
-        if wanted is not None:
-            keys.append(wanted.key)
-            after = after.replace(wanted.key, wanted)
+        existing = [
+            c for c in (*after.claims_on(subject), *before.claims_on(subject)) if is_kept(c)
+        ]
+        needed = None
+        if all(is_kept(claim) for claim in after.claims_on(subject)):
+            needed = _needed(existing, before.claims_on(subject), config, now)
+        keys += [claim.key for claim in existing]
+        after = after.without(existing)
+        if needed is not None:
+            keys.append(needed.key)
+            after = after.replace(needed.key, needed)
     return after, keys
 
 
-def subjects_kept(ledger: Ledger) -> tuple[Subject, ...]:
-    """Return every subject that an override's own claim holds."""
+def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
+    """Return every subject with a kept claim, sorted."""
     found = {claim.subject for claim in ledger if is_kept(claim)}
     return tuple(sorted(found, key=str))
 
 
-def _wanted(
-    own: list[Claim], stood: tuple[Claim, ...], world: tuple[Config, datetime]
+def _needed(
+    existing: list[Claim], before: tuple[Claim, ...], config: Config, now: datetime
 ) -> Claim | None:
-    config, now = world
-    for claim in own:
-        if any(KEPT + one.name == claim.demand for one in keepers(claim, config)):
+    """Return the kept claim that a subject without demands needs, or ``None``."""
+    for claim in existing:
+        if any(KEPT + one.name == claim.demand for one in keeping_overrides(claim, config)):
             return claim
-    if not stood:
+    if not before:
         return None
-    last = max(stood, key=lambda claim: (claim.booked, claim.demand))
+    last = max(before, key=lambda claim: (claim.booked, claim.demand))
     if suspended_by(last, config) is not None:
         return None
-    for override in keepers(last, config):
+    for override in keeping_overrides(last, config):
         name = KEPT + override.name
         return replace(
             last, demand=name, request=name, requesters=(override.owner,), booked=now, lease=None
@@ -103,14 +103,15 @@ def _wanted(
     return None
 
 
-def keepers(claim: Claim, config: Config) -> list[Override]:
-    """Return the overrides that keep what a claim holds, the highest first.
+def keeping_overrides(claim: Claim, config: Config) -> list[Override]:
+    """Return the overrides that keep the subject of a claim, the highest first.
 
-    One of an override's own stands in its owner's name, so there ``requesters`` has been judged.
+    A kept claim names the owner as its requester, so ``requesters`` of the selector is ignored: it
+    was matched against the original claim.
     """
-    traits, whoever = traits_of(claim), is_kept(claim)
+    traits, any_requester = traits_of(claim), is_kept(claim)
     return [
         one
         for one in reversed(config.in_force)
-        if one.keep and selects(one, traits, config, whoever_asks=whoever)
+        if one.keep and selects(one, traits, config, any_requester=any_requester)
     ]

@@ -1,7 +1,7 @@
-"""What people's changes of overrides ask of the books: claims that overrides keep, and markers.
+"""What the ledger needs when overrides change or end: kept claims, and markers of ended overrides.
 
-An override that had expired when it was merged never applies; one that was in force is ended by a
-commit of its own (:func:`due`).
+An override whose end had passed when it was merged never applies. The generator ends an override
+that was in effect with a commit of its own.
 """
 
 from __future__ import annotations
@@ -13,15 +13,17 @@ from datetime import datetime
 from demandops.config.config import Config
 from demandops.config.override import Override, written
 from demandops.demand.claim import ClaimKey, Subject
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger import ended_override_file
-from demandops.ledger.apply import Ledger
+from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 
 
 @dataclass(frozen=True, slots=True)
-class TakenIn:
-    """Books and configuration with what overrides ask of them, and the ledger's files for it."""
+class LedgerUpdate:
+    """Ledger and configuration after overrides changed, with the ledger files to write.
+
+    ``keys`` are the claims that may have changed.
+    """
 
     ledger: Ledger
     config: Config
@@ -29,76 +31,83 @@ class TakenIn:
     files: Mapping[str, str | None]
 
 
-def taken_in(
+def update_ledger(
     before: tuple[Ledger, Config],
     after: tuple[Ledger, Config],
     subjects: Iterable[Subject],
-    marked: Mapping[str, str],
+    markers: Mapping[str, str],
     now: datetime,
-) -> TakenIn:
-    """Return what a change of the configuration asks of the books.
+) -> LedgerUpdate:
+    """Return the update that a change of the configuration requires.
 
     Args:
-        before, after: books and configuration on either side of the change.
-        subjects: those whose claims people changed.
-        marked: the markers as they are, path → text.
-        now: overrides that are new and ended by then do not apply.
+        before, after: ledger and configuration before and after the change.
+        subjects: those whose claims a person changed.
+        markers: the current markers, path → text.
+        now: new overrides that end by then do not apply.
     """
     ledger, config = after
     known = {one.name: one for one in before[1].in_force}
-    late = [
-        one for one in due(config, now) if one.name not in known or known[one.name].end != one.end
+    expired = [
+        one
+        for one in expired_overrides(config, now)
+        if one.name not in known or known[one.name].end != one.end
     ]
-    gone = ended_override_file.stale(marked, config.overrides)
+    stale = ended_override_file.stale_markers(markers, config.overrides)
     ended = {
         name: end
         for name, end in config.ended.items()
-        if ended_override_file.path_of(name) not in gone
+        if ended_override_file.path_of(name) not in stale
     }
-    ended |= {one.name: written(one.end) for one in late if one.end}
+    ended |= {one.name: written(one.end) for one in expired if one.end}
     config = config.with_ended(ended)
-    files: dict[str, str | None] = dict.fromkeys(gone)
-    files |= {ended_override_file.path_of(one.name): ended_override_file.write(one) for one in late}
-    touched = (*subjects, *kept_claims.subjects_kept(before[0]), *kept_claims.subjects_kept(ledger))
-    settled, keys = kept_claims.kept(before[0], ledger, dict.fromkeys(touched), (config, now))
-    files |= files_of(ledger, settled, keys)
-    return TakenIn(settled, config, tuple(keys), files)
+    files: dict[str, str | None] = dict.fromkeys(stale)
+    for override in expired:
+        files |= _marker(override)
+    touched = (*subjects, *kept_claims.kept_subjects(before[0]), *kept_claims.kept_subjects(ledger))
+    updated, keys = kept_claims.update_kept_claims(
+        before[0], ledger, dict.fromkeys(touched), config, now
+    )
+    files |= changed_claim_files(ledger, updated, keys)
+    return LedgerUpdate(updated, config, tuple(keys), files)
 
 
-def ended(state: tuple[Ledger, Config], override: Override, now: datetime) -> TakenIn:
-    """Return books and configuration without an override whose time is over."""
+def end_override(state: tuple[Ledger, Config], override: Override, now: datetime) -> LedgerUpdate:
+    """Return the update that ends an override."""
     ledger, config = state
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     after = config.with_ended({**config.ended, override.name: written(override.end)})
-    found = taken_in(state, (ledger, after), (), {}, now)
-    marker = {ended_override_file.path_of(override.name): ended_override_file.write(override)}
-    return TakenIn(found.ledger, found.config, found.keys, {**found.files, **marker})
+    update = update_ledger(state, (ledger, after), (), {}, now)
+    return LedgerUpdate(
+        update.ledger, update.config, update.keys, {**update.files, **_marker(override)}
+    )
 
 
-def files_of(before: Ledger, after: Ledger, keys: Iterable[ClaimKey]) -> dict[str, str | None]:
-    """Return the claim files at ``keys`` that differ (``None``: to remove)."""
+def _marker(override: Override) -> dict[str, str]:
+    return {ended_override_file.path_of(override.name): ended_override_file.text_of(override)}
+
+
+def changed_claim_files(
+    before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
+) -> dict[str, str | None]:
+    """Return the claim files at ``keys`` that differ, path → text; ``None`` removes a file."""
     files: dict[str, str | None] = {}
     for key in keys:
         claim = after.get(key)
         if claim != before.get(key):
-            files[ledger_format.path_of(key)] = ledger_format.write(claim) if claim else None
+            files[claim_file.path_of(key)] = claim_file.text_of(claim) if claim else None
     return files
 
 
-def due(config: Config, now: datetime) -> list[Override]:
-    """Return the overrides in force whose time is over, the first to end first."""
-    over = [(one.end, one.name, one) for one in config.in_force if one.end and one.end <= now]
-    return [one for _, _, one in sorted(over, key=lambda item: item[:2])]
+def expired_overrides(config: Config, now: datetime) -> list[Override]:
+    """Return the overrides in effect whose end has passed, sorted by their end."""
+    expired = [(one.end, one.name, one) for one in config.in_force if one.end and one.end <= now]
+    return [one for _, _, one in sorted(expired, key=lambda item: item[:2])]
 
 
-def next_end(config: Config) -> datetime | None:
-    """Return when the next override in force ends."""
-    return min((one.end for one in config.in_force if one.end), default=None)
-
-
-def differing(before: Config, after: Config) -> list[str]:
-    """Return the files of the overrides that came into force, changed or ceased to apply."""
+def changed_override_files(before: Config, after: Config) -> list[str]:
+    """Return the files of the overrides that took effect, changed or stopped applying."""
     old = {one.name: one for one in before.in_force}
     new = {one.name: one for one in after.in_force}
     names = [name for name in {*old, *new} if old.get(name) != new.get(name)]

@@ -1,6 +1,6 @@
-"""Whom an override is for: its selectors held against a release, a claim or a demand.
+"""Selectors: which releases, claims and demands an override is for.
 
-Knows what a selector says and what there is to match; nothing of what an override then does.
+Does not know what an override does to them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """What a selector looks at. Only releases of services have a ``service``."""
+    """What a selector matches. Only the release of a service has a ``service``."""
 
     nodes: tuple[str, ...]
     requesters: tuple[str, ...]
@@ -27,7 +27,7 @@ class Traits:
 
 
 def traits_of(subject: Claim | ApplicationDemand | ConnectionDemand) -> Traits:
-    """Return what a selector sees of an application or a connection that somebody asks for."""
+    """Return the traits of a claimed or demanded application or connection."""
     if isinstance(subject, ApplicationClaim):
         ids = (subject.application,)
         return Traits((subject.node,), subject.requesters, ids, (subject.appdef,))
@@ -38,35 +38,37 @@ def traits_of(subject: Claim | ApplicationDemand | ConnectionDemand) -> Traits:
     return Traits(ends, subject.requesters, connections=(name,))
 
 
-def fits(selector: Selector, traits: Traits, config: Config, *, whoever_asks: bool = False) -> bool:
-    """Tell whether every field of a selector fits; ``whoever_asks`` passes requesters over."""
-    asked = (
+def fits(
+    selector: Selector, traits: Traits, config: Config, *, any_requester: bool = False
+) -> bool:
+    """Return whether every field of a selector matches; ``any_requester`` ignores requesters."""
+    fields = (
         (selector.applications, traits.applications),
         (selector.appdefs, traits.appdefs),
         (selector.services, (traits.service,) if traits.service else ()),
         (selector.connections, traits.connections),
         (selector.nodes, traits.nodes),
-        (None if whoever_asks else selector.requesters, traits.requesters),
+        (None if any_requester else selector.requesters, traits.requesters),
     )
     if any(
         patterns is not None and not any(matches(value, patterns) for value in values)
-        for patterns, values in asked
+        for patterns, values in fields
     ):
         return False
-    return not selector.labels or any(labelled(selector, node, config) for node in traits.nodes)
+    return not selector.labels or any(has_labels(selector, node, config) for node in traits.nodes)
 
 
-def labelled(selector: Selector, node: str, config: Config) -> bool:
-    """Tell whether a node has all labels of a selector."""
+def has_labels(selector: Selector, node: str, config: Config) -> bool:
+    """Return whether a node has all labels of a selector."""
     known = config.nodes.get(node)
     labels = known.labels() if known else {}
     return all(labels.get(key) == value for key, value in (selector.labels or {}).items())
 
 
 def selects(
-    override: Override, traits: Traits, config: Config, *, whoever_asks: bool = False
+    override: Override, traits: Traits, config: Config, *, any_requester: bool = False
 ) -> bool:
-    """Tell whether an override is for this: one of its selectors fits."""
+    """Return whether one of an override's selectors matches."""
     return any(
-        fits(selector, traits, config, whoever_asks=whoever_asks) for selector in override.select
+        fits(selector, traits, config, any_requester=any_requester) for selector in override.select
     )

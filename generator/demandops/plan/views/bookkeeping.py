@@ -1,6 +1,6 @@
 """Bookkeeping: for each service and connection, who requests it.
 
-The view of the paper's Table III, column 4, derived from claims; nothing stores it.
+This is Table III, column 4, of the paper. It is derived from claims and stored nowhere.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 
 from demandops.config.config import Config
 from demandops.demand.claim import SubjectKind
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.connection_clients import connection_topics
-from demandops.plan.overrides.claims_in_force import in_force, suspended
+from demandops.plan.overrides.suspended_claims import suspended_claims, without_suspended
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import all_keys
@@ -21,7 +21,7 @@ from demandops.plan.release_keys import all_keys
 
 @dataclass(frozen=True, slots=True)
 class ServiceEntry:
-    """Who requests one service, and what it takes in (role → sorted topics)."""
+    """Who requests one service, and its inputs (role → sorted topics)."""
 
     applications: tuple[str, ...]
     service: str
@@ -44,7 +44,7 @@ class ConnectionEntry:
 
 @dataclass(frozen=True, slots=True)
 class SuspendedEntry:
-    """A claim that is booked and not planned, and the override that suspends it."""
+    """A booked claim that is not planned, and the override that suspends it."""
 
     kind: str
     id: str
@@ -58,7 +58,7 @@ class SuspendedEntry:
 class Bookkeeping:
     """The whole view: services by release name, connections by id, both sorted.
 
-    ``suspended`` are the claims that an override keeps from running; they are in neither.
+    ``suspended`` are the claims that an override suspends; they are in neither.
     """
 
     services: dict[str, ServiceEntry]
@@ -85,9 +85,9 @@ def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
                 requesters=release.requesters,
             )
     connections = {}
-    standing = in_force(ledger, config)
+    active = without_suspended(ledger, config)
     for id in ledger.subjects(SubjectKind.CONNECTION):
-        claims = standing.connection(id)
+        claims = active.connection_claims(id)
         if not claims:
             continue
         connections[id] = ConnectionEntry(
@@ -104,7 +104,7 @@ def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
 
 
 def _suspended(ledger: Ledger, config: Config) -> Iterator[SuspendedEntry]:
-    for claim, override in suspended(ledger, config):
+    for claim, override in suspended_claims(ledger, config):
         kind = claim.subject.kind.value[:-1]
         yield SuspendedEntry(
             kind,
@@ -116,19 +116,19 @@ def _suspended(ledger: Ledger, config: Config) -> Iterator[SuspendedEntry]:
         )
 
 
-def as_data(books: Bookkeeping, commit: str) -> dict[str, Any]:
+def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
     """Return the bookkeeping as plain data, the contract of ``bookkeeping --output json``.
 
-    ``suspended`` is there only where something is.
+    ``suspended`` is left out if it is empty.
     """
-    data = asdict(books)
+    data = asdict(view)
     for entry in data["services"].values():
         entry["applications"] = list(entry["applications"])
         entry["requesters"] = list(entry["requesters"])
     for entry in data["connections"].values():
         entry["topics"] = sorted(entry["topics"])
         entry["requesters"] = list(entry["requesters"])
-    held_back = data.pop("suspended")
-    if held_back:
-        data["suspended"] = [one | {"requesters": list(one["requesters"])} for one in held_back]
+    suspended = data.pop("suspended")
+    if suspended:
+        data["suspended"] = [one | {"requesters": list(one["requesters"])} for one in suspended]
     return data | {"commit": commit}

@@ -1,4 +1,4 @@
-"""What differs between two bookkeepings, entry by entry and in words. Pure."""
+"""The differences between two bookkeepings, entry by entry."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from demandops.plan.views.bookkeeping import Bookkeeping, ConnectionEntry, Servi
 
 @dataclass(frozen=True, slots=True)
 class EntryChange:
-    """One service or connection that is requested anew, otherwise or no longer.
+    """One service or connection that was added, changed or removed.
 
-    ``requesters`` are those who request it; of one that is gone, those who did. ``lost`` and
-    ``gained`` say what changed.
+    ``requesters`` are the current ones, or the last ones if it was removed. ``lost`` and ``gained``
+    list what changed.
     """
 
     kind: Literal["service", "connection"]
@@ -25,8 +25,8 @@ class EntryChange:
     gained: tuple[str, ...] = ()
 
 
-def difference(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
-    """Return every entry that differs, services first, each kind sorted by name."""
+def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
+    """Return every entry that differs: services, then connections, each sorted by name."""
     return (
         *_changes("service", dict(old.services), dict(new.services)),
         *_changes("connection", dict(old.connections), dict(new.connections)),

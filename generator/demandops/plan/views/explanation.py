@@ -1,7 +1,4 @@
-"""Why a release runs: the claims that ask for it, and the files of people that shaped it.
-
-The auditor's view of a plan; pure, and no part of what is written.
-"""
+"""The explanation of a release: the claims that need it, and people's files that shape it."""
 
 from __future__ import annotations
 
@@ -22,35 +19,35 @@ from demandops.config.config import (
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.demand.claim import KEPT, ApplicationClaim, Claim, Subject, demand_id, is_kept
-from demandops.ledger.apply import Ledger
-from demandops.plan.planner import denied, plan
+from demandops.ledger.ledger import Ledger
+from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Bridge, MqttEnd, Release, ServiceRelease
 from demandops.plan.release_keys import all_keys, keys_of
 
 
 @dataclass(frozen=True, slots=True)
-class Shaping:
-    """A file that people own, which of its entries shaped a release, and what that says."""
+class ShapingFile:
+    """A file that people write, its entry that shapes a release, and what the entry decides."""
 
     file: str
     entry: str
     what: str
 
 
-def find(ledger: Ledger, config: Config, name: str) -> Release | None:
-    """Return the release of a name, or nothing where none of that name runs."""
+def release_named(ledger: Ledger, config: Config, name: str) -> Release | None:
+    """Return the release with a name, or ``None`` if none runs."""
     releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
     return next((release for release in releases if release and release.name == name), None)
 
 
-def names(ledger: Ledger, config: Config) -> list[str]:
+def release_names(ledger: Ledger, config: Config) -> list[str]:
     """Return the names of all releases that run."""
     releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
     return [release.name for release in releases if release]
 
 
 def releases_of(ledger: Ledger, config: Config, subject: Subject) -> list[Release]:
-    """Return the releases that run because something holds an application or a connection."""
+    """Return the releases that run because of claims on an application or a connection."""
     releases = (
         plan(ledger, config, key) for key in dict.fromkeys(keys_of(ledger, config, subject))
     )
@@ -58,24 +55,24 @@ def releases_of(ledger: Ledger, config: Config, subject: Subject) -> list[Releas
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
-    """Return the claims that ask for a release, the first that was booked first.
+    """Return the claims that need a release, sorted by their booking time.
 
     Args:
-        ledger: the books without suspended claims.
-        release: what runs.
+        ledger: the ledger without suspended claims.
+        release: the release that runs.
     """
     claims: Iterable[Claim]
     if isinstance(release, ServiceRelease):
-        users = (claim for id in release.applications for claim in ledger.application(id))
+        users = (claim for id in release.applications for claim in ledger.application_claims(id))
         claims = [claim for claim in users if _takes(claim, release)]
     else:
         ids = release.connections if isinstance(release, Bridge) else (release.connection,)
-        claims = [claim for id in ids for claim in ledger.connection(id)]
+        claims = [claim for id in ids for claim in ledger.connection_claims(id)]
     return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
 
 
 def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
-    """Tell whether a claim on an application needs this service of it."""
+    """Return whether a claim on an application needs this service of it."""
     if release.service.each is None:
         return True
     topics = claim.inputs.get(release.service.each, ())
@@ -83,7 +80,7 @@ def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
 
 
 def how_to_release(claim: Claim) -> str:
-    """Return how its requesters give a claim up."""
+    """Return how the requesters release a claim."""
     if is_kept(claim):
         return f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(KEPT)}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):
@@ -91,49 +88,53 @@ def how_to_release(claim: Claim) -> str:
     return f"send operation: release for demand '{claim.demand}'"
 
 
-def shaped_by(release: Release, config: Config) -> list[Shaping]:
-    """Return the files of people that say what a release is, and where."""
-    found = [Shaping(ROOT_FILE, "gitops", f"written for {config.repository.gitops}")]
+def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
+    """Return people's files that decide what a release is and where it runs."""
+    found = [ShapingFile(ROOT_FILE, "gitops", f"written for {config.repository.gitops}")]
     of_kind = _service if isinstance(release, ServiceRelease) else _client
     found += of_kind(release, config)
-    found.append(Shaping(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))
+    found.append(ShapingFile(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))
     domain = release.domain
-    return [*found, Shaping(DOMAINS_FILE, domain.name, f"namespace {domain.namespace}")]
+    return [*found, ShapingFile(DOMAINS_FILE, domain.name, f"namespace {domain.namespace}")]
 
 
-def denied_called(ledger: Ledger, config: Config, name: str) -> tuple[Release, Override] | None:
-    """Return the release of a name that claims need, and the override that denies it."""
+def denied_release_named(
+    ledger: Ledger, config: Config, name: str
+) -> tuple[Release, Override] | None:
+    """Return the denied release with a name and the override that denies it, or ``None``."""
     for key in all_keys(ledger, config):
-        found = denied(ledger, config, key)
+        found = denied_release(ledger, config, key)
         if found is not None and found[0].name == name:
             return found
     return None
 
 
-def kept_by(claim: Claim, config: Config) -> Override | None:
-    """Return the override whose own claim this is, or nothing where somebody asks for it."""
+def keeping_override(claim: Claim, config: Config) -> Override | None:
+    """Return the override that keeps this claim, or ``None`` if a demand holds it."""
     return config.overrides.get(claim.demand.removeprefix(KEPT)) if is_kept(claim) else None
 
 
-def _service(release: Release, config: Config) -> Iterator[Shaping]:
-    assert isinstance(release, ServiceRelease)  # noqa: S101 - the caller chose by that
+def _service(release: Release, config: Config) -> Iterator[ShapingFile]:
+    assert isinstance(release, ServiceRelease)  # noqa: S101 - the caller checks the type
     folder = f"appdefs/{release.appdef}"
-    yield Shaping(f"{folder}/appdef.yaml", f"services.{release.key.service}", "what it is")
-    yield Shaping(config.values_template(release.appdef, release.service), "", "its Helm values")
+    yield ShapingFile(f"{folder}/appdef.yaml", f"services.{release.key.service}", "what it is")
+    yield ShapingFile(
+        config.values_template(release.appdef, release.service), "", "its Helm values"
+    )
     chart, name = release.chart, release.service.chart
     where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
-    yield Shaping(CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}")
+    yield ShapingFile(CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}")
     for image in release.service.images:
-        yield Shaping(IMAGES_FILE, f"images.{image}", config.images[image].reference())
+        yield ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
 
 
-def _client(release: Release, config: Config) -> Iterator[Shaping]:
+def _client(release: Release, config: Config) -> Iterator[ShapingFile]:
     image = DDS_ROUTER_IMAGE
     if isinstance(release, Bridge):
         image = ZENOH_BRIDGE_IMAGE
     elif isinstance(release, MqttEnd):
         image = MQTT_CLIENT_IMAGE
         broker = release.broker
-        yield Shaping(BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}")
+        yield ShapingFile(BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}")
     if image in config.images:
-        yield Shaping(IMAGES_FILE, f"images.{image}", config.images[image].reference())
+        yield ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())

@@ -1,4 +1,4 @@
-"""What each override does at present: for ``demandops overrides`` and ``check``."""
+"""The override report: what each override does now, for ``demandops overrides`` and ``check``."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from typing import Literal
 
 from demandops.config.config import Config
 from demandops.config.override import Override, written
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
-from demandops.plan.overrides.claims_in_force import suspended_by
-from demandops.plan.planner import denied, plan
+from demandops.plan.overrides.suspended_claims import suspended_by
+from demandops.plan.planner import denied_release, plan
 from demandops.plan.release_keys import all_keys
 
-Standing = Literal["in force", "expired", "matches nothing"]
+State = Literal["in force", "expired", "matches nothing"]
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """An override, and the releases and claims that it is for now."""
+    """An override, and the releases and claims that it applies to now."""
 
     override: Override
-    state: Standing
+    state: State
     releases: tuple[str, ...]
     claims: tuple[str, ...]
 
 
-def survey(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
-    """Return every override that lies there, by name, and what it does."""
+def override_report(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
+    """Return every override, sorted by name, with what it does."""
     releases = _releases(ledger, config)
     claims = _claims(ledger, config)
     found = []
@@ -38,11 +38,11 @@ def survey(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
             tuple(sorted(releases.get(name, ()))),
             tuple(sorted(claims.get(name, ()))),
         )
-        standing: Standing = "in force" if any(entry) else "matches nothing"
-        over = override.end is not None and override.end <= now
-        if over or override not in config.in_force:
-            standing, entry = "expired", ((), ())
-        found.append(Entry(override, standing, *entry))
+        state: State = "in force" if any(entry) else "matches nothing"
+        expired = override.end is not None and override.end <= now
+        if expired or override not in config.in_force:
+            state, entry = "expired", ((), ())
+        found.append(Entry(override, state, *entry))
     return found
 
 
@@ -53,15 +53,15 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
         if entry.state == "expired" and override.end:
             yield (
                 override.path,
-                f"expired at {written(override.end)} and applies no more; remove the file, or "
+                f"expired at {written(override.end)} and no longer applies; remove the file, or "
                 "write a later time",
             )
         elif entry.state == "matches nothing":
-            yield override.path, "matches nothing at present; mend select if it should"
+            yield override.path, "matches nothing now; if it should, correct select"
 
 
 def _releases(ledger: Ledger, config: Config) -> dict[str, set[str]]:
-    """Return override → the releases that it shapes, or keeps from running."""
+    """Return override → the releases that it changes or denies."""
     found: dict[str, set[str]] = {}
     for key in all_keys(ledger, config):
         release = plan(ledger, config, key)
@@ -69,17 +69,17 @@ def _releases(ledger: Ledger, config: Config) -> dict[str, set[str]]:
             for override, _ in release.shaping.by:
                 found.setdefault(override.name, set()).add(release.name)
             continue
-        stopped = denied(ledger, config, key)
+        stopped = denied_release(ledger, config, key)
         if stopped is not None:
             found.setdefault(stopped[1].name, set()).add(stopped[0].name)
     return found
 
 
 def _claims(ledger: Ledger, config: Config) -> dict[str, set[str]]:
-    """Return override → the subjects that it suspends, or would keep."""
+    """Return override → the claims that it suspends or would keep."""
     found: dict[str, set[str]] = {}
     for claim in ledger:
-        by = [suspended_by(claim, config), *kept_claims.keepers(claim, config)]
+        by = [suspended_by(claim, config), *kept_claims.keeping_overrides(claim, config)]
         for override in by:
             if override is not None:
                 found.setdefault(override.name, set()).add(f"{claim.subject} of {claim.demand}")

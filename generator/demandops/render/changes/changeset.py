@@ -12,8 +12,8 @@ from typing import Literal
 from demandops.config.config import Config
 from demandops.demand.route import Route
 from demandops.errors import Refused
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import ClaimChange, Ledger
+from demandops.ledger import claim_file
+from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey
@@ -74,9 +74,7 @@ def build_changeset(
     """
     config, engine, read = context
     files: dict[str, str | None] = {
-        ledger_format.path_of(change.key): ledger_format.write(change.after)
-        if change.after
-        else None
+        claim_file.path_of(change.key): claim_file.text_of(change.after) if change.after else None
         for change in claims
     }
     releases = []

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from demandops.config.config import Config
 from demandops.errors import Refused
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import all_keys

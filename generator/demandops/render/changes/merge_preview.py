@@ -14,8 +14,8 @@ from demandops import strict_yaml
 from demandops.config.config import Config
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import Fault, InvalidInput
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger import claim_file
+from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of
@@ -99,7 +99,7 @@ def _claim_files(ledger: Ledger, config: Config) -> dict[ReleaseKey, list[str]]:
     """Return the files of the claims that need a release, by release."""
     by_release: dict[ReleaseKey, list[str]] = {}
     for subject in (Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)):
-        files = [ledger_format.path_of(claim.key) for claim in ledger.of(subject)]
+        files = [claim_file.path_of(claim.key) for claim in ledger.claims_on(subject)]
         for key in keys_of(ledger, config, subject):
             by_release.setdefault(key, []).extend(files)
     return by_release

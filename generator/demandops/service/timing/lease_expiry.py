@@ -15,7 +15,7 @@ from datetime import datetime, timedelta, timezone
 
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import DemandRequest, Operation
-from demandops.ledger.apply import Ledger
+from demandops.ledger.ledger import Ledger
 from demandops.service.ticket import Ticket
 
 log = logging.getLogger("demandops")
@@ -46,7 +46,7 @@ class LeaseClock:
         What of a demand has ended goes together, so none of it while some is granted more time.
         """
         now = self._look()
-        ended = ledger.ended(now)
+        ended = ledger.ended_claims(now)
         granted = {claim.demand for claim in ended if not self._is_over(claim, now)}
         return now, [claim for claim in ended if claim.demand not in granted]
 
@@ -55,7 +55,7 @@ class LeaseClock:
 
         Not at once, for what is over and still there could not be released or is granted more.
         """
-        end = ledger.next_end()
+        end = ledger.next_lease_end()
         if end is None:
             return longest
         return min(max((end - self._look()).total_seconds() + 0.01, _SHORTEST_S), longest)

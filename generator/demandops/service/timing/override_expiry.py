@@ -7,7 +7,7 @@ from datetime import datetime, timedelta
 
 from demandops.config.config import Config
 from demandops.errors import InvalidInput
-from demandops.plan.overrides.lifecycle import due
+from demandops.plan.overrides.lifecycle import expired_overrides
 from demandops.staterepo.write.commit_line import CommitLine
 
 log = logging.getLogger("demandops")
@@ -25,7 +25,7 @@ class OverrideClock:
 
     def end(self, line: CommitLine, now: datetime) -> None:
         """Commit on a line that what is over has ended; what cannot be carried out stays."""
-        for override in due(line.head.state.config, now):
+        for override in expired_overrides(line.head.state.config, now):
             tried = self._failed.get((override.name, override.end or now))
             if tried is not None and now < tried + _AGAIN:
                 continue

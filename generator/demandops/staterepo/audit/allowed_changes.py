@@ -14,8 +14,7 @@ from pygit2 import Commit, Repository
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.demand.claim import KEPT, Claim
 from demandops.errors import InvalidInput
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger import ended_override_file
+from demandops.ledger import claim_file, ended_override_file
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import LogEntry
@@ -43,7 +42,7 @@ def _foreign(repo: Repository, commit: Commit, entry: LogEntry) -> Iterator[str]
         root = path.split("/", 1)[0]
         if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
             continue
-        if root != ledger_format.LEDGER_ROOT:
+        if root != claim_file.LEDGER_ROOT:
             yield path
         elif path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
             if operation not in _ENDING or (blob and not _is_marker(commit, path)):
@@ -60,7 +59,7 @@ def _named(entry: LogEntry) -> set[str]:
     demands = {*entry.trailers.get("Demand-Id", ())}
     for path in entry.trailers.get("Override", ()):  # the claims by which overrides keep something
         demands.add(KEPT + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
-    return {f"{ledger_format.segment(demand)}.yaml" for demand in demands}
+    return {f"{claim_file.segment(demand)}.yaml" for demand in demands}
 
 
 def _only_begins(commit: Commit, path: str) -> bool:
@@ -79,12 +78,12 @@ def _is_marker(commit: Commit, path: str) -> bool:
 
 def _is_canonical(commit: Commit, path: str) -> bool:
     claim = _claim(commit, path)
-    return claim is not None and ledger_format.write(claim) == trees.read_text(commit.tree, path)
+    return claim is not None and claim_file.text_of(claim) == trees.read_text(commit.tree, path)
 
 
 def _claim(commit: Commit, path: str) -> Claim | None:
     text = trees.read_text(commit.tree, path)
     try:
-        return ledger_format.read(text, path) if text is not None else None
+        return claim_file.read(text, path) if text is not None else None
     except InvalidInput:
         return None

@@ -16,12 +16,11 @@ import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.config.config import CONFIG_ROOTS, Config
-from demandops.decision import State, rendered
+from demandops.decision import State, rendered_files
 from demandops.demand.claim import Claim
 from demandops.errors import InvalidInput
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger import ended_override_file
-from demandops.ledger.apply import ClaimChange
+from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger.ledger import ClaimChange
 from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
@@ -164,7 +163,7 @@ class _Row:
         proof, self._proof = self._proof, None
         if alone:
             state = self._loaded(commit, entry)
-            files = rendered(state, _held_from(commit, state.config))
+            files = rendered_files(state, _held_from(commit, state.config))
             wanted = {path: _blob(text) for path, text in files.items()}
             return _differing(wanted, dict(_standing(commit.tree)))
         if proof is None or _reconfigured(proof, commit):
@@ -219,7 +218,7 @@ def _reconfigured(proof: _Proof, commit: Commit) -> bool:
 
     def ids(tree: Tree) -> list[Oid | None]:
         found = [trees.child(tree, root) for root in (*CONFIG_ROOTS, NOTES_ROOT)]
-        ledger = trees.child(tree, ledger_format.LEDGER_ROOT)
+        ledger = trees.child(tree, claim_file.LEDGER_ROOT)
         if isinstance(ledger, Tree):
             found.append(trees.child(ledger, ended_override_file.MARKERS_ROOT.rsplit("/", 1)[-1]))
         return [entry.id if entry else None for entry in found]
@@ -234,11 +233,11 @@ def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[Cla
         InvalidInput: where a claim file is not valid.
     """
     changes = []
-    for path, blob in trees.below_root(repo, proof.tree, commit.tree, ledger_format.LEDGER_ROOT):
-        if ledger_format.kind_of(path) is None:
+    for path, blob in trees.below_root(repo, proof.tree, commit.tree, claim_file.LEDGER_ROOT):
+        if claim_file.kind_of(path) is None:
             continue
         known = proof.claims.get(path)
-        claim = ledger_format.read(_text(commit, path), path) if blob else None
+        claim = claim_file.read(_text(commit, path), path) if blob else None
         if known or claim:
             changes.append(ClaimChange(known, claim))
     return changes
@@ -250,7 +249,7 @@ def _from_nothing(state: State, commit: Commit) -> _Proof:
     proof = _Proof(
         tree=commit.tree,
         state=state,
-        claims={ledger_format.path_of(claim.key): claim for claim in state.ledger},
+        claims={claim_file.path_of(claim.key): claim for claim in state.ledger},
         plan=IncrementalPlan(state.config),
         planned={},
         held={},
@@ -268,7 +267,7 @@ def _bring_forward(
     ledger = proof.state.ledger
     for change in changes:
         ledger = ledger.replace(change.key, change.after)
-        path = ledger_format.path_of(change.key)
+        path = claim_file.path_of(change.key)
         proof.claims.pop(path, None)
         if change.after is not None:
             proof.claims[path] = change.after

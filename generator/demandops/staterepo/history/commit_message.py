@@ -17,9 +17,9 @@ from demandops.decision import Decision
 from demandops.demand.claim import KEPT, ClaimKey, SubjectKind
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.decommission import needs
-from demandops.ledger.restoration import Restoration
+from demandops.ledger import claim_file
+from demandops.ledger.operations.decommission import needs_node
+from demandops.ledger.operations.restoration import Restoration
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.settings import RENDER_VERSION
 
@@ -61,7 +61,7 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
         return _operator(leaving.by, received)
     names = ", ".join(_requesters(decision))
     demand = decision.changes.claims[0].key.demand
-    local = demand if _LOCAL_PART.fullmatch(demand) else ledger_format.segment(demand)
+    local = demand if _LOCAL_PART.fullmatch(demand) else claim_file.segment(demand)
     email = f"{local}@demandops.invalid"
     return pygit2.Signature(_name(names), email, int(received.timestamp()), 0)
 
@@ -135,7 +135,7 @@ def _leaving(decision: Decision) -> list[tuple[str, str]]:
     leaving, befores = decision.request.leaving, [c.before for c in decision.changes.claims]
     if leaving is None or "node" not in leaving.kinds:
         return []
-    held = any(needs(before, leaving.name) for before in befores if before)
+    held = any(needs_node(before, leaving.name) for before in befores if before)
     return [("Node", leaving.name)] if held else []
 
 

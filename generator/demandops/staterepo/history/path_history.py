@@ -17,7 +17,7 @@ from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.demand.claim import ApplicationClaim
 from demandops.errors import InvalidInput
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.plan import naming
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo.git.tree import below_root, child, commit_of, entries, read_text
@@ -134,7 +134,7 @@ def concerns(repo: Repository, revision: str | Oid, node: str) -> bool:
         parts = path.split("/")
         if len(parts) == 5 and parts[3] == folder:
             return True
-    changed = below_root(repo, before, after, ledger_format.LEDGER_ROOT)
+    changed = below_root(repo, before, after, claim_file.LEDGER_ROOT)
     return any(
         _names(read_text(tree, path), path, node) for path, _ in changed for tree in (before, after)
     )
@@ -142,10 +142,10 @@ def concerns(repo: Repository, revision: str | Oid, node: str) -> bool:
 
 def _names(text: str | None, path: str, node: str) -> bool:
     """Tell whether a claim's file names a node."""
-    if text is None or ledger_format.kind_of(path) is None:
+    if text is None or claim_file.kind_of(path) is None:
         return False
     try:
-        claim = ledger_format.read(text, path)
+        claim = claim_file.read(text, path)
     except InvalidInput:
         return False
     if isinstance(claim, ApplicationClaim):

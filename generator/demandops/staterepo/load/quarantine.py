@@ -13,10 +13,10 @@ from dataclasses import replace
 from pygit2 import Repository
 from pygit2.enums import SortMode
 
-from demandops.decision import State, consequence
+from demandops.decision import State, changeset_of_edit
 from demandops.demand.claim import Claim, Subject
 from demandops.errors import Fault, InvalidInput
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.render.changes.changeset import FileReader
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
@@ -53,7 +53,7 @@ def _faults(
     state: State, before: Snapshot, subject: Subject, read: FileReader
 ) -> tuple[Fault, ...]:
     try:
-        consequence(state, before.state.ledger, [subject], read)
+        changeset_of_edit(state, before.state.ledger, [subject], read)
     except InvalidInput as error:
         return error.faults
     return ()
@@ -63,16 +63,16 @@ def _told_of(
     faults: Iterable[Fault], snapshot: Snapshot, before: Snapshot, subject: Subject
 ) -> list[Fault]:
     """Return faults of a subject, each told to be in the file of a claim that is another now."""
-    claims = snapshot.state.ledger.of(subject)
+    claims = snapshot.state.ledger.claims_on(subject)
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
-    paths = [ledger_format.path_of(claim.key) for claim in (changed or claims)]
+    paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]
     return [found.within(paths[0]) if paths else found for found in faults]
 
 
 def _holding(repo: Repository, snapshot: Snapshot, before: Snapshot, subject: Subject) -> Snapshot:
     ledger, keys = snapshot.state.ledger, snapshot.keys
-    claims = (*before.state.ledger.of(subject), *ledger.of(subject))
-    known = {ledger_format.path_of(claim.key): claim.key for claim in claims}
+    claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
+    known = {claim_file.path_of(claim.key): claim.key for claim in claims}
     ours = _generators(repo, snapshot, before, known)
     for path, key in known.items():
         claim = ours[path] if path in ours else before.state.ledger.get(key)
@@ -103,4 +103,4 @@ def _generators(
 
 
 def _claim(text: str | None, path: str) -> Claim | None:
-    return ledger_format.read(text, path) if text is not None else None
+    return claim_file.read(text, path) if text is not None else None

@@ -12,8 +12,8 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Operation
 from demandops.errors import Fault, InvalidInput
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.restoration import Restoration
+from demandops.ledger import claim_file
+from demandops.ledger.operations.restoration import Restoration
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.tree import commit_of
 
@@ -32,11 +32,11 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     commit = commit_of(repo, to)
     claims: list[Claim] = []
     faults: list[Fault] = []
-    for path, text in trees.texts(commit.tree, (ledger_format.LEDGER_ROOT,)).items():
-        if ledger_format.kind_of(path) is None:
+    for path, text in trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items():
+        if claim_file.kind_of(path) is None:
             continue
         try:
-            claims.append(ledger_format.read(text, path))
+            claims.append(claim_file.read(text, path))
         except InvalidInput as error:
             faults += error.faults
     if faults:

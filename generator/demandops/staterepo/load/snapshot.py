@@ -16,12 +16,11 @@ from rpds import HashTrieMap
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load as load_config
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.decision import State, rehearse
+from demandops.decision import State, try_configuration
 from demandops.demand.claim import Claim, ClaimKey, Subject
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger import ended_override_file
-from demandops.ledger.apply import Ledger
+from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger.ledger import Ledger
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
@@ -58,7 +57,7 @@ class Snapshot:
         """Return the snapshot of a commit of our own, whose state is known already."""
         keys = self.keys
         for key in changes:
-            path = ledger_format.path_of(key)
+            path = claim_file.path_of(key)
             if state.ledger.get(key) is not None:
                 keys = keys.insert(path, key)
             elif path in keys:
@@ -140,7 +139,7 @@ def _last_valid_claim(commit: Commit, path: str) -> Claim | None:
         if text is None:
             return None
         try:
-            return ledger_format.read(text, path)
+            return claim_file.read(text, path)
         except InvalidInput:
             continue
     return None
@@ -161,14 +160,14 @@ def _edited_by_hand(repo: Repository, before: Oid, to: Oid) -> bool:
 def _ledger_at(
     repo: Repository, tree: Tree, progress: Progress
 ) -> tuple[Ledger, HashTrieMap[str, ClaimKey], list[Fault]]:
-    paths = [(path, blob) for path, blob in _ledger_files(tree) if ledger_format.kind_of(path)]
+    paths = [(path, blob) for path, blob in _ledger_files(tree) if claim_file.kind_of(path)]
     ledger, faults = Ledger(), list[Fault]()
     keys: HashTrieMap[str, ClaimKey] = HashTrieMap()
     for done, (path, blob) in enumerate(paths):
         if done % 200 == 0:
             progress(done, len(paths))
         try:
-            claim = ledger_format.read(_text(repo, blob), path)
+            claim = claim_file.read(_text(repo, blob), path)
         except InvalidInput as error:
             faults += error.faults
             continue
@@ -179,7 +178,7 @@ def _ledger_at(
 
 
 def _ledger_files(tree: Tree) -> Iterable[tuple[str, Oid]]:
-    root = ledger_format.LEDGER_ROOT
+    root = claim_file.LEDGER_ROOT
     if root in tree and isinstance(tree[root], Tree):
         yield from trees.entries(tree[root], f"{root}/")  # type: ignore[arg-type]
 
@@ -218,7 +217,7 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     )
     changed |= {path: trees.blob(after, path) for path in snapshot.held}
     for path, blob in sorted(changed.items()):
-        if ledger_format.kind_of(path) is None:
+        if claim_file.kind_of(path) is None:
             continue
         known = keys.get(path)
         if blob is None:
@@ -228,7 +227,7 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
                 keys = keys.remove(path)
             continue
         try:
-            claim = ledger_format.read(_text(repo, blob), path)
+            claim = claim_file.read(_text(repo, blob), path)
         except InvalidInput as error:
             problems += error.faults
             held.append(path)
@@ -255,7 +254,7 @@ def _tried(files: Mapping[str, str], state: State) -> Config:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config = load_config(files)
     if config.with_ended(state.config.ended) != state.config:
-        rehearse(State.of(config, Ledger()))
+        try_configuration(State.of(config, Ledger()))
     return config
 
 

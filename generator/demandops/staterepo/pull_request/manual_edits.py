@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from demandops.config.override import OVERRIDES_ROOT
 from demandops.errors import Fault, fault
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.plan.release import Release
 from demandops.render.changes import merge_preview
 from demandops.render.changes.override_suggestion import (
@@ -40,8 +40,8 @@ def _is_generators(path: str) -> bool:
     root = path.split("/", maxsplit=1)[0]
     if trees.is_note(path):
         return False
-    if root == ledger_format.LEDGER_ROOT:  # claims are judged as such
-        return ledger_format.kind_of(path) is None
+    if root == claim_file.LEDGER_ROOT:  # claims are judged as such
+        return claim_file.kind_of(path) is None
     return root in (*GENERATED_ROOTS, NOTES_ROOT)
 
 
@@ -110,7 +110,7 @@ def _message(path: str, added: bool, deleted: bool, found: Suggestion | None) ->
         return f"{_LOST}, and merge {found.name} as shown{rest}"
     if path.startswith(f"{NOTES_ROOT}/"):
         return "is the generator's own, and written anew by it; take the edit back"
-    if path.startswith(f"{ledger_format.LEDGER_ROOT}/") and added:
+    if path.startswith(f"{claim_file.LEDGER_ROOT}/") and added:
         return "is no claim's place, and the generator removes it; take it away"
     if added:
         return (

@@ -18,17 +18,16 @@ from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.override import written
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.decision import State, rehearse, rendered
+from demandops.decision import State, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger import ended_override_file
-from demandops.ledger.apply import Ledger
-from demandops.plan.overrides.lifecycle import due, taken_in
+from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger.ledger import Ledger
+from demandops.plan.overrides.lifecycle import expired_overrides, update_ledger
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
 from demandops.plan.views.bookkeeping import bookkeeping
-from demandops.plan.views.bookkeeping_diff import EntryChange, difference
-from demandops.plan.views.override_report import survey, warnings
+from demandops.plan.views.bookkeeping_diff import EntryChange, bookkeeping_changes
+from demandops.plan.views.override_report import override_report, warnings
 from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview
 from demandops.render.changes.override_suggestion import Suggestion
@@ -120,10 +119,10 @@ def _generated(path: str) -> bool:
 def _ledger(files: Mapping[str, str], faults: list[Fault]) -> Ledger:
     ledger = Ledger()
     for path, text in sorted(files.items()):
-        if ledger_format.kind_of(path) is None:
+        if claim_file.kind_of(path) is None:
             continue
         try:
-            claim = ledger_format.read(text, path)
+            claim = claim_file.read(text, path)
         except InvalidInput as error:
             faults += error.faults
         else:
@@ -150,7 +149,7 @@ def _state(
     faults += _unversioned_charts(config, files, before)
     config = _with_ended(config, files, now)
     state = State.of(config, ledger)
-    rehearse(state)
+    try_configuration(state)
     return state
 
 
@@ -169,10 +168,10 @@ def _taken_in(
         claim.subject
         for books in (old, new)
         for claim in books
-        if ledger_format.path_of(claim.key) in changed
+        if claim_file.path_of(claim.key) in changed
     ]
     before, after = (old, start.state.config), (new, state.config)
-    taken = taken_in(before, after, dict.fromkeys(subjects), _marked(files), now)
+    taken = update_ledger(before, after, dict.fromkeys(subjects), _marked(files), now)
     return replace(state, ledger=taken.ledger, config=taken.config)
 
 
@@ -185,19 +184,19 @@ def _marked(files: Mapping[str, str]) -> dict[str, str]:
 def _with_ended(config: Config, files: Mapping[str, str], now: datetime) -> Config:
     """Return the configuration without the overrides that a generator ended, or would at once."""
     config = config.with_ended(ended_override_file.read(_marked(files)))
-    over = {one.name: written(one.end) for one in due(config, now) if one.end}
+    over = {one.name: written(one.end) for one in expired_overrides(config, now) if one.end}
     return config.with_ended({**config.ended, **over})
 
 
 def _warnings(state: State, now: datetime) -> tuple[Fault, ...]:
-    idle = warnings(survey(state.ledger, state.config, now))
+    idle = warnings(override_report(state.ledger, state.config, now))
     return tuple(fault("", text).within(path) for path, text in idle)
 
 
 def _wanted(state: State, standing: Mapping[str, str], edited: Collection[str]) -> dict[str, str]:
     """Return every generated file; of what cannot be rendered, the faults of every release."""
     try:
-        return rendered(state, standing)
+        return rendered_files(state, standing)
     except InvalidInput as error:
         found = merge_preview.render_faults(state.ledger, state.config, state.engine, edited)
         raise InvalidInput(found or error.faults) from None
@@ -218,7 +217,7 @@ def _books(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
         old = bookkeeping(start.state.ledger, start.state.config)
     except InvalidInput:
         return None
-    return difference(old, bookkeeping(state.ledger, state.config))
+    return bookkeeping_changes(old, bookkeeping(state.ledger, state.config))
 
 
 def _hand_edits(

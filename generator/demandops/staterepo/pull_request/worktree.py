@@ -12,12 +12,12 @@ from pygit2 import Commit, Repository
 from demandops.config.config import CONFIG_ROOTS
 from demandops.decision import State
 from demandops.errors import Fault, InvalidInput, StateRepoError, fault
-from demandops.ledger import claim_file as ledger_format
+from demandops.ledger import claim_file
 from demandops.settings import GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.load import snapshot as snapshots
 
-_ROOTS = (*CONFIG_ROOTS, ledger_format.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
+_ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
 _SHALLOW = (
     "this clone is shallow and does not hold the commit that the edit started from; fetch all of "

@@ -19,13 +19,19 @@ from pygit2 import Oid, Signature
 
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.decision import Decision, State, consequence, rendered
+from demandops.decision import Decision, State, changeset_of_edit, rendered_files
 from demandops.demand.claim import ClaimKey, Subject
 from demandops.errors import Fault, InvalidInput, StateRepoError
-from demandops.ledger import claim_file as ledger_format
-from demandops.ledger.apply import Ledger
+from demandops.ledger import claim_file
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
-from demandops.plan.overrides.lifecycle import TakenIn, differing, ended, files_of, taken_in
+from demandops.plan.overrides.lifecycle import (
+    LedgerUpdate,
+    changed_claim_files,
+    changed_override_files,
+    end_override,
+    update_ledger,
+)
 from demandops.render.changes.changeset import Change, Changeset, ReleaseChange
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import signing
@@ -135,7 +141,10 @@ class CommitLine:
         self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
         files = {**change.files, **self._report(problems, before)}
         if files:
-            overrides = [*differing(before.state.config, state.config), *change.overrides]
+            overrides = [
+                *changed_override_files(before.state.config, state.config),
+                *change.overrides,
+            ]
             overrides += commit_message.keeping(keys)
             causes = authorship.since(self._objects, before.sound or before.commit, snapshot.commit)
             text = commit_message.of_follow(
@@ -171,7 +180,7 @@ class CommitLine:
     ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
         """Render everything for a configuration that changed."""
         marked = last_valid_config.markers_at(self._tree)
-        taken = taken_in(_books(before.state), _books(state), subjects, marked, now)
+        taken = update_ledger(_books(before.state), _books(state), subjects, marked, now)
         state = _with(state, taken)
         return state, self.everything(state, taken.files), taken.keys
 
@@ -182,7 +191,7 @@ class CommitLine:
             Refused, InvalidInput: where what is left cannot be planned or rendered.
         """
         state = self.head.state
-        taken = ended(_books(state), override, now)
+        taken = end_override(_books(state), override, now)
         state = _with(state, taken)
         change = self.everything(state, taken.files)
         more = effective_config.trailers(self.head)
@@ -203,19 +212,21 @@ class CommitLine:
         books = before.state.ledger
         files: dict[str, str | None] = {}
         for subject in subjects:
-            ledger, own = kept_claims.kept(books, state.ledger, [subject], (state.config, now))
+            ledger, own = kept_claims.update_kept_claims(
+                books, state.ledger, [subject], state.config, now
+            )
             tried = replace(state, ledger=ledger)
             try:
-                consequence(tried, books, [subject], self.read)
+                changeset_of_edit(tried, books, [subject], self.read)
             except InvalidInput as error:
                 problems += error.faults
-                state = replace(state, ledger=state.ledger.restored(subject, books))
+                state = replace(state, ledger=state.ledger.with_claims_from(subject, books))
                 continue
-            files |= files_of(state.ledger, ledger, own)
+            files |= changed_claim_files(state.ledger, ledger, own)
             state = tried
             good.append(subject)
             keys += own
-        change = consequence(state, books, good, self.read)
+        change = changeset_of_edit(state, books, good, self.read)
         return state, replace(change, files={**files, **change.files}), tuple(keys)
 
     def everything(
@@ -227,7 +238,7 @@ class CommitLine:
             Refused, InvalidInput: where a release cannot be planned or rendered.
         """
         generated = trees.texts(self._tree, GENERATED_ROOTS)
-        files: dict[str, str | None] = dict(rendered(state, generated))
+        files: dict[str, str | None] = dict(rendered_files(state, generated))
         changes = []
         standing = {path for path in generated if path.endswith(".yaml")}
         for path in standing - set(files):
@@ -286,11 +297,11 @@ def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, st
     A lease that counted from the demand could be over before anybody has approved it.
     """
     ledger, files = state.ledger, {}
-    for claim in ledger.unstarted():
+    for claim in ledger.unstarted_claims():
         assert claim.lease is not None  # noqa: S101 - that is what was looked for
         begun = replace(claim, lease=claim.lease.begun(now))
         ledger = ledger.replace(claim.key, begun)
-        files[ledger_format.path_of(claim.key)] = ledger_format.write(begun)
+        files[claim_file.path_of(claim.key)] = claim_file.text_of(begun)
     return replace(state, ledger=ledger), files
 
 
@@ -298,7 +309,7 @@ def _books(state: State) -> tuple[Ledger, Config]:
     return state.ledger, state.config
 
 
-def _with(state: State, taken: TakenIn) -> State:
+def _with(state: State, taken: LedgerUpdate) -> State:
     return replace(state, ledger=taken.ledger, config=taken.config)
 
 

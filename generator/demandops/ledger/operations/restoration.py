@@ -1,9 +1,8 @@
-"""Going back: the claims of an earlier commit, booked again as they stood there.
+"""A restoration: the claims of an earlier commit are booked again.
 
-What was booked since goes only where that is wanted. A claim that comes back has the lease that it
-had, for its full term from now on: with its old end it would be released at once. Claims of
-overrides' own are nobody's demand: whether they come or go is settled as after every change
-(:mod:`demandops.plan.overrides.kept_claims`).
+Claims that were booked since are released only if the request says so. A lease that comes back runs
+for its full term from now on, because its old end may have passed. Claims that an override keeps
+are no demand: they are updated as after every change (:mod:`demandops.plan.overrides.kept_claims`).
 """
 
 from __future__ import annotations
@@ -24,17 +23,17 @@ from demandops.demand.demand_request import (
 from demandops.demand.lease import Lease, Term
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.claim_file import path_of
-from demandops.ledger.ledger import Changes, ClaimChange, Ledger, differences
+from demandops.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
 
 _SHOWN = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Restoration(DemandRequest):
-    """A request to go back to the books of a commit.
+    """A request to restore the ledger of an earlier commit.
 
-    ``to`` is the commit, ``made`` when it was made, ``claims`` what it held; ``by`` and ``email``
-    are who asks for it.
+    ``to`` is the commit, ``made`` its time and ``claims`` its ledger. ``by`` and ``email`` name who
+    asks for it.
     """
 
     to: str = ""
@@ -47,41 +46,41 @@ class Restoration(DemandRequest):
 
 
 def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Make the books what they were.
+    """Make the ledger what it was.
 
     Raises:
-        Refused: where that would drop or undo what was booked since, and it may not.
+        Refused: if that drops or undoes newer claims, and ``drop_newer`` is not set.
     """
-    assert isinstance(request, Restoration)  # noqa: S101 - the operation says so
+    assert isinstance(request, Restoration)  # noqa: S101 - apply() checks the operation
     changes = _changes(ledger, request)
     if not request.drop_newer:
         newer = [c for c in changes if c.before is not None and not is_kept(c.before)]
         if newer:
-            raise Refused(_newer(newer))
+            raise Refused(_newer_faults(newer))
     start = ledger
     for change in changes:
-        ledger = ledger.replace(change.key, _fresh(change, now))
-    return ledger, Changes(claims=differences(start, ledger, [change.key for change in changes]))
+        ledger = ledger.replace(change.key, _with_full_lease(change, now))
+    return ledger, Changes(claims=claim_changes(start, ledger, [change.key for change in changes]))
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
-    """Return what going back changes; a claim whose lease alone was renewed stays as it is."""
-    wanted = {claim.key: claim for claim in request.claims}
-    gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in wanted]
-    back = [ClaimChange(ledger.get(key), claim) for key, claim in wanted.items()]
-    back = [change for change in back if not _alike(change.before, change.after)]
+    """Return what the restoration changes; a claim whose lease alone differs stays as it is."""
+    restored = {claim.key: claim for claim in request.claims}
+    gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in restored]
+    back = [ClaimChange(ledger.get(key), claim) for key, claim in restored.items()]
+    back = [change for change in back if not _same(change.before, change.after)]
     return sorted([*gone, *back], key=lambda change: path_of(change.key))
 
 
-def _alike(one: Claim | None, other: Claim | None) -> bool:
+def _same(one: Claim | None, other: Claim | None) -> bool:
     if one is None or other is None:
         return one is other
-    if is_kept(one):  # when it was kept is no part of what is asked
+    if is_kept(one):  # when the override kept it does not matter
         one = replace(one, booked=other.booked)
     return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
 
 
-def _fresh(change: ClaimChange, now: datetime) -> Claim | None:
+def _with_full_lease(change: ClaimChange, now: datetime) -> Claim | None:
     claim = change.after
     if claim is None or claim.lease is None:
         return claim
@@ -90,34 +89,34 @@ def _fresh(change: ClaimChange, now: datetime) -> Claim | None:
     return replace(claim, lease=lease)
 
 
-def _newer(changes: list[ClaimChange]) -> Iterator[Fault]:
+def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
     for change in changes[:_SHOWN]:
         claim = change.before
-        assert claim is not None  # noqa: S101 - the caller chose those
-        what = "drop" if change.after is None else "undo a change of"
+        assert claim is not None  # noqa: S101 - the caller passes existing claims
+        effect = "drop" if change.after is None else "undo a change of"
         message = (
-            f"would {what} the claim of {', '.join(claim.requesters)} on {claim.subject}, booked "
+            f"would {effect} the claim of {', '.join(claim.requesters)} on {claim.subject}, booked "
             f"{claim.booked:%Y-%m-%d %H:%M:%S} UTC (request '{claim.request}')"
         )
         yield fault("", message, code="newer").within(path_of(claim.key))
     more = len(changes) - _SHOWN
-    rest = f"and {more} more; " if more > 0 else ""
-    message = f"{rest}what was booked since stays unless it is to go as well (--drop-newer)"
+    others = f"and {more} more; " if more > 0 else ""
+    message = f"{others}newer claims stay; use --drop-newer to undo them as well"
     yield fault("", message, code="newer")
 
 
 def faults(request: Restoration, ledger: Ledger, config: Config) -> Iterator[Fault]:
-    """Yield why claims that come back are not possible any more, by what is configured now."""
+    """Yield why restored claims are not valid in the current configuration."""
     for change in _changes(ledger, request):
-        if change.after is None or is_kept(change.after):  # overrides keep or drop their own
+        if change.after is None or is_kept(change.after):  # overrides decide about these
             continue
-        asked = _asked(change.after)
-        for found in (*admission.faults(asked, config), *permission.faults(asked, config)):
+        booking = _request_for(change.after)
+        for found in (*admission.faults(booking, config), *permission.faults(booking, config)):
             field = found.field.partition("].")[2] or found.field
             yield replace(found, field=field).within(path_of(change.key))
 
 
-def _asked(claim: Claim) -> DemandRequest:
+def _request_for(claim: Claim) -> DemandRequest:
     """Return the request that would book a claim today."""
     applications: Iterable[ApplicationDemand] = ()
     connections: Iterable[ConnectionDemand] = ()

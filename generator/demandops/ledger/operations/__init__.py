@@ -1,0 +1,1 @@
+"""What each operation does to the ledger, one module each, and what they share."""

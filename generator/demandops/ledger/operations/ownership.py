@@ -1,0 +1,46 @@
+"""Who owns a demand that names itself: the requesters of its claims.
+
+A request that names none of them is refused. So a demand id that two choose by chance does no harm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import DemandRequest
+from demandops.errors import Refused, fault
+from demandops.ledger.ledger import Ledger
+
+
+def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
+    """Return the claims of the request's demand.
+
+    Raises:
+        Refused: if the demand holds nothing or belongs to other requesters.
+    """
+    held = ledger.claims_of_demand(request.demand)
+    if not held:
+        demands = sorted(
+            {
+                claim.demand
+                for requester in request.named_by
+                for claim in ledger.claims_of_requester(requester)
+            }
+        )
+        known = f"; demands in this name: {', '.join(demands[:5])}" if demands else ""
+        message = f"'{request.demand}' holds nothing{known}"
+        raise Refused([fault("demand", message, code="not-held")])
+    refuse_other_owners(held, request)
+    return held
+
+
+def refuse_other_owners(held: Iterable[Claim], request: DemandRequest) -> None:
+    """Raise :class:`Refused` if the claims belong to none of the request's requesters."""
+    owners = sorted({requester for claim in held for requester in claim.requesters})
+    if owners and not set(owners) & set(request.requesters()):
+        message = (
+            f"'{request.demand}' is a demand of {', '.join(owners)}; name one of them, or choose "
+            "another demand id"
+        )
+        raise Refused([fault("demand", message, code="not-yours")])
