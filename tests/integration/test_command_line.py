@@ -267,7 +267,7 @@ class TestRequest:
             assert row["errors"] == [
                 {
                     "field": "",
-                    "message": "not booked, for another request of this call does not parse",
+                    "message": "not booked because another request of this call does not parse",
                 }
             ]
 

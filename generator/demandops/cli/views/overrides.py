@@ -1,4 +1,4 @@
-"""``demandops overrides``: what people have overridden, and what each override does now."""
+"""``demandops overrides``: the overrides, and what each one does now."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from demandops.staterepo import reader
 
 @click.command()
 @state_repo_option
-@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; the newest by default.")
+@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; default: the newest commit.")
 @output_option
 def overrides(state_repo: str, at: str | None, output: str) -> None:
-    """List the overrides: what each does, for which releases and claims, whose it is, how long.
+    """List the overrides and what each one does.
 
-    One is in force, expired, or matches nothing at present. The releases are those that it shapes,
-    or keeps from running; the claims those that it suspends, or would keep.
+    The state of an override is `in force`, `expired` or `matches nothing`. The list has the
+    releases that it changes or denies, and the claims that it suspends or keeps.
     """
-    with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
-        snapshot = repo.snapshot(at, tell)
+    with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
+        snapshot = repo.snapshot(at, report)
     state = snapshot.state
-    found = survey(state.ledger, state.config, datetime.now(timezone.utc))
+    entries = survey(state.ledger, state.config, datetime.now(timezone.utc))
     if output == "json":
-        print_json([_row(entry) for entry in found])
+        print_json([_row(entry) for entry in entries])
         return
     out = console()
-    if not found:
+    if not entries:
         out.print("no overrides; docs/overrides.md says how to write one")
         return
     table = Table("Override", "State", "Does", "To", "Priority", "Owner", "Until", "Reason")
-    for entry in found:
+    for entry in entries:
         one = entry.override
         table.add_row(
             one.name,
@@ -61,14 +61,14 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
 
 def _effects(entry: Entry) -> list[str]:
     one = entry.override
-    told = {
+    values = {
         "version": one.version,
         "replicas": one.replicas,
         "node": one.node,
         "images": ", ".join(one.images or ()),
         "values": ", ".join(one.values or ()),
     }
-    return [f"{name} {told[name]}" if name in told else name for name in one.effects()]
+    return [f"{name} {values[name]}" if name in values else name for name in one.effects()]
 
 
 def _row(entry: Entry) -> dict[str, Any]:
@@ -88,7 +88,7 @@ def _row(entry: Entry) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Return an effect as it stands in the file; a null of a patch is a part of it."""
+    """Return an effect as written in the file. A patch keeps its null values."""
     if isinstance(value, dict):
         return {name: _plain(item) for name, item in value.items()}
     return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value
