@@ -66,7 +66,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
     out = console()
     for line in list(_entry_lines(entries)) or ["no difference in bookkeeping"]:
         out.print(line)
-    for line in list(_release_lines(releases, others)) or ["no difference in what runs"]:
+    for line in list(_release_lines(releases, others)) or ["no difference in releases"]:
         out.print(line)
 
 

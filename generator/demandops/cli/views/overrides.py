@@ -40,50 +40,50 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
         return
     out = console()
     if not entries:
-        out.print("no overrides; docs/overrides.md says how to write one")
+        out.print("no overrides; see docs/overrides.md")
         return
     table = Table("Override", "State", "Does", "To", "Priority", "Owner", "Until", "Reason")
     for entry in entries:
-        one = entry.override
+        override = entry.override
         table.add_row(
-            one.name,
+            override.name,
             entry.state,
             "\n".join(_effects(entry)),
             "\n".join([*entry.releases, *entry.claims]),
-            str(one.priority),
-            one.owner,
-            written(one.end) if one.end else "",
-            one.reason,
+            str(override.priority),
+            override.owner,
+            written(override.end) if override.end else "",
+            override.reason,
         )
     out.print(table)
     out.print(f"at {snapshot.commit}")
 
 
 def _effects(entry: Entry) -> list[str]:
-    one = entry.override
+    override = entry.override
     values = {
-        "version": one.version,
-        "replicas": one.replicas,
-        "node": one.node,
-        "images": ", ".join(one.images or ()),
-        "values": ", ".join(one.values or ()),
+        "version": override.version,
+        "replicas": override.replicas,
+        "node": override.node,
+        "images": ", ".join(override.images or ()),
+        "values": ", ".join(override.values or ()),
     }
-    return [f"{name} {values[name]}" if name in values else name for name in one.effects()]
+    return [f"{name} {values[name]}" if name in values else name for name in override.effects()]
 
 
 def _row(entry: Entry) -> dict[str, Any]:
-    one = entry.override
+    override = entry.override
     return {
-        "name": one.name,
-        "file": one.path,
+        "name": override.name,
+        "file": override.path,
         "state": entry.state,
-        "effects": {name: _plain(getattr(one, name)) for name in one.effects()},
+        "effects": {name: _plain(getattr(override, name)) for name in override.effects()},
         "releases": list(entry.releases),
         "claims": list(entry.claims),
-        "priority": one.priority,
-        "owner": one.owner,
-        "until": written(one.end) if one.end else None,
-        "reason": one.reason,
+        "priority": override.priority,
+        "owner": override.owner,
+        "until": written(override.end) if override.end else None,
+        "reason": override.reason,
     }
 
 
