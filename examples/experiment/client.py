@@ -1,7 +1,7 @@
-"""A ROS 2 action client: sends each request file that it is told of on standard input.
+"""A ROS 2 action client for DeploymentRequest goals from YAML files.
 
-One line in, the path of a YAML file with a DeploymentRequest goal; JSON lines out: one for each
-feedback and one for the result. Nothing in it knows the server.
+It reads one path of a file from each line of standard input. It prints one line of JSON for each
+feedback and one for the result. It works with any server of the action.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _WAIT_S = 20.0
 _STATUS = {GoalStatus.STATUS_SUCCEEDED: "succeeded", GoalStatus.STATUS_CANCELED: "cancelled"}
 
 
-def _say(**facts: object) -> None:
+def _print_json(**facts: object) -> None:
     print(json.dumps(facts), flush=True)
 
 
@@ -31,22 +31,23 @@ def main() -> int:
     node = rclpy.create_node("experiment_client")
     client = ActionClient(node, DeploymentRequest, sys.argv[1])
     if not client.wait_for_server(timeout_sec=_WAIT_S):
-        _say(status="no server", message=f"nobody serves {sys.argv[1]}")
+        _print_json(status="no server", message=f"no server of {sys.argv[1]}")
         return 1
-    _say(status="ready")
+    _print_json(status="ready")
     for line in sys.stdin:
         goal = from_data(DeploymentRequest.Goal(), yaml.safe_load(Path(line.strip()).read_text()))
-        sent = client.send_goal_async(
-            goal, feedback_callback=lambda told: _say(feedback=told.feedback.message)
+        acceptance = client.send_goal_async(
+            goal,
+            feedback_callback=lambda message: _print_json(feedback=message.feedback.message),
         )
-        rclpy.spin_until_future_complete(node, sent)
-        if not sent.result().accepted:
-            _say(status="rejected", message="the server takes no goal now")
+        rclpy.spin_until_future_complete(node, acceptance)
+        if not acceptance.result().accepted:
+            _print_json(status="rejected", message="the server accepts no goals now")
             continue
-        done = sent.result().get_result_async()
-        rclpy.spin_until_future_complete(node, done)
-        answer = done.result()
-        _say(status=_STATUS.get(answer.status, "aborted"), message=answer.result.message)
+        result = acceptance.result().get_result_async()
+        rclpy.spin_until_future_complete(node, result)
+        answer = result.result()
+        _print_json(status=_STATUS.get(answer.status, "aborted"), message=answer.result.message)
     rclpy.try_shutdown()
     return 0
 

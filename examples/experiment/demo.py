@@ -1,8 +1,8 @@
-"""The paper's experiment, played: eight demands over ROS 2 become eight commits.
+"""The paper's experiment: eight demands over ROS 2 become eight commits.
 
-Starts the node and a client as processes of their own, sends the eight requests of this folder,
-and after each shows the demand, the bookkeeping beside the paper's, and the files that changed.
-Exits with 0 only if all eight steps match.
+The script starts the node and a client as processes and sends the eight requests of this folder.
+After each request it shows the request, the paper's bookkeeping and ours, and the changed files.
+It exits with 0 only if all eight steps match.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ def demandops(*args: str) -> str:
 
 
 def git(*args: str) -> str:
-    """Run git in the state repo: all that the demo shows can be had without this program."""
+    """Run git in the state repo and return what it prints."""
     command = ["git", "-C", str(STATE_REPO), *args]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
 class Client:
-    """The client process: a request file in, feedback and result out."""
+    """The client process."""
 
     def __init__(self) -> None:
         command = [sys.executable, str(HERE / "client.py"), ACTION]
@@ -57,7 +57,7 @@ class Client:
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
-            raise SystemExit("the client ended; the node's log says more")
+            raise SystemExit("the client ended; see the node's log")
         answer: dict[str, Any] = json.loads(line)
         if answer.get("status") == "no server":
             raise SystemExit(answer["message"])
@@ -82,8 +82,8 @@ class Client:
         self._process.wait(10)
 
 
-def play(client: Client, step: int, file: Path) -> bool:
-    """Send one request and show what came of it; tell whether it is what the paper says."""
+def run_step(client: Client, step: int, file: Path) -> bool:
+    """Send a request and show its effect; return whether it is the paper's."""
     out.rule(f"[bold]step {step}: {paper.STEPS[step - 1]}")
     stages, result = client.send(file)
     out.print(f"[dim]request[/]  {file.relative_to(HERE.parent.parent)}")
@@ -95,26 +95,26 @@ def play(client: Client, step: int, file: Path) -> bool:
     books = json.loads(
         demandops("bookkeeping", "--state-repo", str(STATE_REPO), "--output", "json")
     )
-    wanted, found = paper.expected(step), paper.observed(books)
+    expected, observed = paper.expected(step), paper.observed(books)
     table = Table("Service or connection", "Requesters (paper)", "Requesters (ours)", "")
-    for subject in sorted({*wanted, *found}):
-        left, right = wanted.get(subject, []), found.get(subject, [])
+    for subject in sorted({*expected, *observed}):
+        left, right = expected.get(subject, []), observed.get(subject, [])
         mark = "[green]same[/]" if left == right else "[red bold]DIFFERS[/]"
         table.add_row(subject, ", ".join(left), ", ".join(right), mark)
-    if not wanted and not found:
+    if not expected and not observed:
         table.add_row("(nothing runs)", "", "", "[green]same[/]")
     out.print(table)
     for line in git("show", "--name-status", "--format=", commit).splitlines():
         sign, path = line.split("\t")
         out.print(f"  {SIGNS[sign]} {path}")
-    return wanted == found and books["commit"] == commit
+    return expected == observed and books["commit"] == commit
 
 
 def main() -> int:
-    """Play all steps."""
+    """Play all steps and return the exit code."""
     shutil.rmtree(BUILD, ignore_errors=True)
     BUILD.mkdir(parents=True)
-    # a ROS graph of its own, and no trace in the user's home
+    # a separate ROS graph, and no files in the user's home
     os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["DEMANDOPS_DATA_HOME"] = str(BUILD / "data")
@@ -127,7 +127,7 @@ def main() -> int:
         try:
             client = Client()
             files = sorted(HERE.glob("[1-8]-*.yaml"))
-            matches = [play(client, step, file) for step, file in enumerate(files, 1)]
+            matches = [run_step(client, step, file) for step, file in enumerate(files, 1)]
             client.close()
         finally:
             node.terminate()
@@ -139,7 +139,7 @@ def main() -> int:
         f"{good} of {len(files)} steps match the paper",
         style="bold green" if good == 8 else "bold red",
     )
-    out.print(f"look further: git -C {os.path.relpath(STATE_REPO)} show HEAD~3")
+    out.print(f"to see more: git -C {os.path.relpath(STATE_REPO)} show HEAD~3")
     if stopped != 0:
         out.print(f"the node ended with {stopped}; see {os.path.relpath(log)}")
     return 0 if good == len(files) == 8 and stopped == 0 else 1

@@ -1,7 +1,7 @@
-"""What the paper reports: who requests which service and connection after each of eight steps.
+"""The paper's table: who requests which service and connection after each of eight steps.
 
-The columns are those of its table: the detection on the station's point cloud and the connection
-that feeds it share one set of requesters, as do those of vehicle00.
+The detection on the station's point cloud and the connection of that cloud have the same
+requesters. So do those of vehicle00.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ STEPS = (
 
 S, V0, V1, V2, V3 = "station00", "vehicle00", "vehicle01", "vehicle02", "vehicle03"
 
-# (on the station's cloud, on vehicle00's cloud, the fusion, vehicles 1 to 3 with a connection)
+# the requesters of the detection on the station's cloud, of the detection on vehicle00's cloud and
+# of the fusion; the vehicles 1 to 3 that have a connection
 _TABLE: tuple[tuple[set[str], set[str], set[str], tuple[str, ...]], ...] = (
     ({S, V0}, {S, V0}, {S, V0}, ()),
     ({S, V0, V1}, {S, V0}, {S, V0, V1}, (V1,)),
@@ -35,7 +36,7 @@ _TABLE: tuple[tuple[set[str], set[str], set[str], tuple[str, ...]], ...] = (
 
 
 def expected(step: int) -> dict[str, list[str]]:
-    """Return subject → sorted requesters after ``step`` (1 to 8); what is gone is not listed."""
+    """Return the sorted requesters of each subject after ``step`` (1 to 8)."""
     station, vehicle, fusion, connected = _TABLE[step - 1]
     rows = {
         f"object-detection {S}": station,
@@ -49,11 +50,11 @@ def expected(step: int) -> dict[str, list[str]]:
 
 
 def observed(books: dict[str, Any]) -> dict[str, list[str]]:
-    """Return the same rows from ``demandops bookkeeping --output json``."""
+    """Return the same for the output of ``demandops bookkeeping --output json``."""
     rows = {}
     for entry in books["services"].values():
-        whom = entry["source"] or ", ".join(entry["applications"])
-        rows[f"{entry['service']} {whom}"] = entry["requesters"]
+        target = entry["source"] or ", ".join(entry["applications"])
+        rows[f"{entry['service']} {target}"] = entry["requesters"]
     for entry in books["connections"].values():
         rows[f"connection {entry['source']} to {entry['target']}"] = entry["requesters"]
     return dict(sorted(rows.items()))

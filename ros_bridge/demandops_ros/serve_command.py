@@ -103,12 +103,13 @@ def serve(
     webhook_secret_file: Path | None,
     signing_key: Path | None,
 ) -> None:
-    """Run the ROS 2 node that takes demands over the actions DeploymentRequest and Demand.
+    """Run the ROS 2 node that accepts demands.
 
-    Everything after --ros-args goes to ROS. Parameters: action_name (of DeploymentRequest),
-    demand_action_name, answer (of DeploymentRequest: pushed, reconciled or healthy), answer_timeout
-    (seconds), state_repo, fetch_interval, log_level (debug, info, warn, error or fatal). Stop it
-    with Ctrl-C or SIGTERM: it finishes what it has in hand.
+    Its actions are DeploymentRequest and Demand. Everything after --ros-args goes to ROS.
+    Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
+    DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds), state_repo,
+    fetch_interval, log_level (debug, info, warn, error or fatal). Stop it with Ctrl-C or SIGTERM:
+    it finishes the goals in hand.
     """
     ros_args = list(ctx.args)
     if ros_args and ros_args[0] != "--ros-args":

@@ -219,7 +219,7 @@ class TestWhy:
         ran = demandops("why", "twin", "--state-repo", state.path)
         assert (ran.code, ran.out) == (1, "")
         assert ran.err == (
-            "error: 'twin' names more than one: application, connection; say which by --kind\n"
+            "error: 'twin' can mean several: application, connection; choose one with --kind\n"
         )
         assert ask("why", "twin", "--kind", "connection")["kind"] == "connection"
 
@@ -235,7 +235,7 @@ class TestWhy:
         ran = demandops("why", name, "--state-repo", played.path)
         assert (ran.code, ran.out) == (1, "")
         assert ran.err == (
-            f"error: nothing called '{name}' runs, or ever did; did you mean {hint}?\n"
+            f"error: nothing called '{name}' runs or ever ran; did you mean {hint}?\n"
         )
 
     @pytest.mark.parametrize(
@@ -309,11 +309,11 @@ class TestLogFilters:
     def test_no_time(self, demandops: Run, played: Any) -> None:
         ran = demandops("log", "--since", "soon", "--state-repo", played.path)
         assert ran.code == 2
-        assert "'soon' is no time; write it like 2026-01-31T14:03" in ran.err
+        assert "'soon' is not a time; write it like 2026-01-31T14:03" in ran.err
 
     def test_nothing_fits(self, demandops: Run, played: Any) -> None:
         ran = demandops("log", "--requester", "nobody", "--state-repo", played.path)
-        assert (ran.code, ran.out) == (0, "no commit fits\n")
+        assert (ran.code, ran.out) == (0, "no commit matches\n")
 
 
 class TestTimes:
@@ -453,7 +453,7 @@ class TestRollback:
     def test_it_wants_a_reason(self, demandops: Run, played: Any) -> None:
         ran = demandops("rollback", "main~1", "-m", "  ", "--state-repo", played.path)
         assert ran.code == 2
-        assert "say why: -m REASON" in ran.err
+        assert "give the reason: -m TEXT" in ran.err
 
     def test_a_commit_that_is_not_of_this_history(self, demandops: Run, played: Any) -> None:
         git(played, "config", "user.name", "x")

@@ -552,9 +552,9 @@ ATTACKS: dict[str, tuple[str | bytes, str]] = {
         ),
         "error: {file}: line 1: anchors and aliases (& and *) are not taken; write it out\n",
     ),
-    "binary": (bytes(range(256)), "error: {file}: is no UTF-8 text\n"),
-    "UTF-16": ("id: a\n".encode("utf-16"), "error: {file}: is no UTF-8 text\n"),
-    "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "error: {file}: is no UTF-8 text\n"),
+    "binary": (bytes(range(256)), "error: {file}: is not UTF-8 text\n"),
+    "UTF-16": ("id: a\n".encode("utf-16"), "error: {file}: is not UTF-8 text\n"),
+    "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "error: {file}: is not UTF-8 text\n"),
     "a tab": (
         "id: a\n\tapps: []\n",
         "error: {file}: line 2, column 1: not valid YAML: found a tab character that violates "
@@ -763,7 +763,7 @@ class TestYamlAttacks:
             input=bytes(range(256)), capture_output=True, check=False,
         )  # fmt: skip
         assert ran.returncode == 1
-        assert ran.stderr.decode() == "error: standard input: is no UTF-8 text\n"
+        assert ran.stderr.decode() == "error: standard input: is not UTF-8 text\n"
 
     def test_no_control_character_of_a_file_reaches_the_terminal(
         self, demandops: Send, state: Any, tmp_path: Path

@@ -267,7 +267,7 @@ class TestRequest:
             assert row["errors"] == [
                 {
                     "field": "",
-                    "message": "not booked, for another request of this call does not parse",
+                    "message": "not booked because another request of this call does not parse",
                 }
             ]
 
@@ -539,7 +539,7 @@ class TestDiff:
         ran = demandops("diff", "main", "main", "--state-repo", joined.path)
         assert (ran.code, ran.out) == (
             0,
-            "no difference in bookkeeping\nno difference in what runs\n",
+            "no difference in bookkeeping\nno difference in releases\n",
         )
 
     def test_a_revision_that_does_not_exist(self, demandops: Run, state: Any) -> None:

@@ -86,7 +86,7 @@ def test_overrides_are_listed_with_what_each_does(demandops: Run, overridden: St
     for word in ("od-edge-vehicle00", "matches nothing", "2020-01-01T00:00:00Z", "petra"):
         assert word in table.out
     before = demandops("overrides", "--state-repo", overridden.path, "--at", "main~2")
-    assert before.out == "no overrides; docs/overrides.md says how to write one\n"
+    assert before.out == "no overrides; see docs/overrides.md\n"
 
 
 def test_bookkeeping_shows_what_is_suspended(demandops: Run, overridden: StateRepo) -> None:

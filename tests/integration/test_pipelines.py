@@ -170,7 +170,7 @@ def test_github_checks_and_reports(
     )
     assert done.returncode == (0 if sound else 1)
     report = (tmp_path / "report.md").read_text()
-    assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else 'one thing to mend'}")
+    assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else '1 error'}")
     assert summary.read_text() == report
 
 
@@ -197,7 +197,7 @@ def test_gitlab_checks_and_reports(
     )
     assert done.returncode == (0 if sound else 1), done.stderr
     report = (repo / "report.md").read_text()
-    assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else 'one thing to mend'}")
+    assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else '1 error'}")
     assert report in done.stdout
 
 

@@ -136,7 +136,7 @@ def test_a_dry_run_says_that_approval_is_needed(
     ran = send(strict, "--dry-run")
     assert ran.out.splitlines()[:2] == [
         "Request 0: 'request' would be proposed",
-        "  needs approval: access domain 'perception' asks for it",
+        "  needs approval: access domain 'perception' requires it",
     ]
     [row] = send(strict, "--dry-run", "--output", "json").json()
     assert (row["outcome"], row["approval"]) == ("proposed", ["access domain 'perception'"])

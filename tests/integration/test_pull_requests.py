@@ -483,7 +483,7 @@ def test_a_report_of_nothing_says_so(branch: Path, check: Check) -> None:
         "<!-- demandops check -->\n"
         "## DemandOps: valid, and everything renders\n"
         f"\nCompared with `{base}`.\n"
-        "\nMerging changes nothing that runs, and nobody's demand.\n",
+        "\nMerging changes no release and no demand.\n",
         "",
     )
 
@@ -532,6 +532,6 @@ def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Che
     assert out.startswith(f"{pull_request_comment.MARK}\n## DemandOps: valid")
     assert "Releases: 3 to change." in out
     assert out.endswith(
-        "\n3 parts of this report left out, for a comment has a longest length; `demandops check` "
-        "shows all.\n"
+        "\n3 parts of this report left out because a comment has a limited length; "
+        "`demandops check` shows all.\n"
     )

@@ -240,7 +240,7 @@ def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(
     assert done.stdout.startswith("\nbefore this, on the clusters:\n- c-its: suspend Flux")
     assert (state.tip == before) is (code == 1)
     if code:
-        assert done.stderr == "error: nothing was changed; do it first, or say --yes\n"
+        assert done.stderr == "error: nothing was changed; do this first, or give --yes\n"
 
 
 def test_back_to_flux_argo_cds_finalizers_go_first(
@@ -267,7 +267,7 @@ def test_where_nothing_would_change_nothing_is_committed(
     before = state.tip
     ran = upgraded(*more)
     assert (ran.code, ran.err, state.tip) == (0, "", before)
-    assert ran.out == f"nothing to do: all is rendered for flux by version 1, at {before}\n"
+    assert ran.out == f"nothing to do: everything is rendered for flux by version 1, at {before}\n"
     assert upgraded(*more, "--output", "json").json()["outcome"] == "unchanged"
 
 

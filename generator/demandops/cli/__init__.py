@@ -1,1 +1,1 @@
-"""The command line: ``demandops``. Formats what the stages return; decides nothing."""
+"""The command line. It formats what the stages return and decides nothing."""

@@ -1,90 +1,148 @@
-"""``demandops``: the commands, and the one place where errors become exit codes.
+"""The `demandops` command: its table of commands, and the exit codes.
 
-0 done, 1 the user's to mend, 2 wrong usage, 3 a fault of the program. Commands that stand above
-the generator (``serve``) are found by the entry points of the group ``demandops.commands``.
+A command's module is imported when the command runs, so that `--version` and `--help` start fast.
 """
 
 from __future__ import annotations
 
 import logging
 import sys
-from importlib.metadata import EntryPoint, entry_points
+from enum import IntEnum
+from importlib import import_module
 
 import click
 
 from demandops import __version__
-from demandops.cli.actions import decommission, request, rollback
 from demandops.cli.output import errors
-from demandops.cli.repo import check, init, schema, upgrade, verify
-from demandops.cli.views import bookkeeping, diff, log, overrides, proposals, status, why
 from demandops.errors import DemandOpsError, InvalidInput
 
-_EXIT_USER, _EXIT_USAGE, _EXIT_FAULT, _EXIT_INTERRUPTED = 1, 2, 3, 130
+COMMANDS = {
+    "bookkeeping": (
+        "demandops.cli.views.bookkeeping:bookkeeping",
+        "Show who requests which service and connection.",
+    ),
+    "check": (
+        "demandops.cli.repo.check:check",
+        "Check edits of a state repo and show their consequences.",
+    ),
+    "decommission": (
+        "demandops.cli.actions.decommission:decommission",
+        "Release all claims of a node or a requester.",
+    ),
+    "demand": (
+        "demandops_ros.demand_command:demand",
+        "Send a demand to a running node.",
+    ),
+    "diff": (
+        "demandops.cli.views.diff:diff",
+        "Show the differences between two commits.",
+    ),
+    "init": (
+        "demandops.cli.repo.init:init",
+        "Create a state repo.",
+    ),
+    "log": (
+        "demandops.cli.views.log:log",
+        "List the commits of the state repo, newest first.",
+    ),
+    "overrides": (
+        "demandops.cli.views.overrides:overrides",
+        "List the overrides and what each one does.",
+    ),
+    "proposals": (
+        "demandops.cli.views.proposals:proposals",
+        "List the demands that await approval.",
+    ),
+    "request": (
+        "demandops.cli.actions.request:request",
+        "Book demand requests from files.",
+    ),
+    "rollback": (
+        "demandops.cli.actions.rollback:rollback",
+        "Restore the ledger of an earlier commit, by a new commit.",
+    ),
+    "schema": (
+        "demandops.cli.repo.schema:schema",
+        "Print the JSON Schema of a kind of file.",
+    ),
+    "serve": (
+        "demandops_ros.serve_command:serve",
+        "Run the ROS 2 node that accepts demands.",
+    ),
+    "status": (
+        "demandops.cli.views.status:status",
+        "Show the state of each release on its cluster.",
+    ),
+    "upgrade": (
+        "demandops.cli.repo.upgrade:upgrade",
+        "Render everything again, in one commit.",
+    ),
+    "verify": (
+        "demandops.cli.repo.verify:verify",
+        "Render the ledger of commits again and compare the bytes.",
+    ),
+    "why": (
+        "demandops.cli.views.why:why",
+        "Explain why something runs or ran.",
+    ),
+}
+"""Each command, by name: ``module:function`` and its short help."""
 
 
-class _Commands(click.Group):
-    """The group of commands, with those of other packages loaded when they are called."""
+class ExitCode(IntEnum):
+    """The exit codes of all commands."""
 
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names of all commands."""
-        return [*super().list_commands(ctx), *sorted(_elsewhere())]
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command; one of another package is imported now."""
-        own = super().get_command(ctx, cmd_name)
-        if own is not None or cmd_name not in _elsewhere():
-            return own
-        try:
-            command = _elsewhere()[cmd_name].load()
-        except ModuleNotFoundError as error:
-            missing = str(error.name)
-
-            @click.command(cmd_name, context_settings={"ignore_unknown_options": True})
-            @click.argument("args", nargs=-1)
-            def unavailable(args: tuple[str, ...]) -> None:
-                raise click.ClickException(
-                    f"{cmd_name} needs {missing}, which is not installed; see README.md, "
-                    "'With ROS 2'"
-                )
-
-            unavailable.short_help = f"(needs {missing}, which is not installed)"
-            return unavailable
-        assert isinstance(command, click.Command)  # noqa: S101 - the entry point's contract
-        return command
+    DONE = 0
+    USER_ERROR = 1
+    WRONG_USAGE = 2
+    PROGRAM_ERROR = 3
+    INTERRUPTED = 130
 
 
-def _elsewhere() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group="demandops.commands")}
+def load(name: str) -> click.Command:
+    """Import a command.
+
+    Raises:
+        click.ClickException: a package that the command needs is not installed.
+    """
+    module, _, function = COMMANDS[name][0].partition(":")
+    try:
+        command: click.Command = getattr(import_module(module), function)
+    except ModuleNotFoundError as error:
+        if str(error.name).split(".")[0] in ("demandops", "demandops_ros"):
+            raise
+        raise click.ClickException(
+            f"{name} needs {error.name}, which is not installed; see README.md, 'With ROS 2'"
+        ) from None
+    return command
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+class _LazyGroup(click.Group):
+    """A group that lists its commands from the table and imports the one that runs."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that the arguments name, imported, and its arguments."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, load(name) if name else command, rest
+
+
+@click.group(
+    cls=_LazyGroup,
+    commands=[click.Command(name, short_help=text) for name, (_, text) in COMMANDS.items()],
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 @click.version_option(__version__, prog_name="demandops")
-@click.option("-v", "--verbose", is_flag=True, help="Say what is being done.")
+@click.option("-v", "--verbose", is_flag=True, help="Log what the program does.")
 def cli(verbose: bool) -> None:
     """Turn demands for applications into desired state in Git.
 
-    Start with `demandops init DIR --bare`, then `demandops serve --state-repo DIR` for demands over
-    ROS 2, or `demandops request FILE --state-repo DIR` for demands from files.
+    Start with `demandops init DIR --bare`. Then run `demandops serve --state-repo DIR` to accept
+    demands over ROS 2, or `demandops request FILE --state-repo DIR` to book demands from files.
     """
     level = logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
-
-
-cli.add_command(init.init)
-cli.add_command(request.request)
-cli.add_command(decommission.decommission)
-cli.add_command(bookkeeping.bookkeeping)
-cli.add_command(why.why)
-cli.add_command(log.log)
-cli.add_command(diff.diff)
-cli.add_command(overrides.overrides)
-cli.add_command(rollback.rollback)
-cli.add_command(check.check)
-cli.add_command(verify.verify)
-cli.add_command(upgrade.upgrade)
-cli.add_command(schema.schema)
-cli.add_command(status.status)
-cli.add_command(proposals.proposals)
 
 
 def main(args: list[str] | None = None) -> None:
@@ -96,26 +154,26 @@ def run(args: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     try:
         code = cli.main(args=args, prog_name="demandops", standalone_mode=False)
-        return code if isinstance(code, int) else 0
+        return code if isinstance(code, int) else ExitCode.DONE
     except click.UsageError as error:
         error.show()
-        return _EXIT_USAGE
+        return ExitCode.WRONG_USAGE
     except click.Abort:
         errors.print("interrupted")
-        return _EXIT_INTERRUPTED
+        return ExitCode.INTERRUPTED
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")
-        return _EXIT_USER
+        return ExitCode.USER_ERROR
     except InvalidInput as error:
-        for found in error.faults:
-            errors.print(f"error: {found}")
-        return _EXIT_USER
+        for each in error.faults:
+            errors.print(f"error: {each}")
+        return ExitCode.USER_ERROR
     except DemandOpsError as error:
         errors.print(f"error: {error}")
-        return _EXIT_USER
+        return ExitCode.USER_ERROR
     except BrokenPipeError:  # `demandops log | head`
         sys.stderr.close()
-        return 0
+        return ExitCode.DONE
     except Exception as error:
         logging.getLogger("demandops").debug("a fault of the program", exc_info=True)
         errors.print(
@@ -124,7 +182,7 @@ def run(args: list[str] | None = None) -> int:
         )
         if logging.getLogger().isEnabledFor(logging.INFO):
             logging.exception("traceback")
-        return _EXIT_FAULT
+        return ExitCode.PROGRAM_ERROR
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""What commands print: tables for people, JSON for programs, errors and progress on stderr."""
+"""The output of commands: tables for people, JSON for programs, errors and progress on stderr.
+
+`rich` is imported by what needs it, because `demandops --help` imports this module.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console
-from rich.progress import Progress as Bar
 
-F = TypeVar("F", bound=Callable[..., Any])
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as Bar
 
 _WIDE = 200
 _PATIENCE_S = 0.5
@@ -23,27 +26,29 @@ Progress = Callable[[int, int], None]
 
 
 def _console(stderr: bool) -> Console:
-    """Return a console; where no terminal reads, nothing is coloured and little is wrapped."""
+    """Return a console; if the stream is not a terminal, it is wide and has no colors."""
+    from rich.console import Console  # noqa: PLC0415
+
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _WIDE
     return Console(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
 SIGNS = {"start": "+", "change": "~", "stop": "-"}
-"""How a release that starts, changes or stops is marked."""
+"""The mark of a release, by its change."""
 
 REV_HELP = "A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h"
 
 
 class _Errors:
-    """Plain lines on stderr, whole whatever the width of the terminal."""
+    """Prints plain lines on stderr, never wrapped."""
 
     def print(self, text: str) -> None:
         click.echo("".join(char if char in "\n\t" else _visible(char) for char in text), err=True)
 
 
 def _visible(char: str) -> str:
-    """Return a character as it is, or escaped where it would act on the terminal."""
+    """Return a character, escaped if it would control the terminal."""
     return char if char.isprintable() else char.encode("unicode_escape").decode()
 
 
@@ -51,14 +56,14 @@ errors = _Errors()
 
 
 def console() -> Console:
-    """Return the console of the moment's standard output."""
+    """Return a console for the current standard output."""
     return _console(stderr=False)
 
 
 def warn_of(problems: Iterable[object]) -> None:
-    """Tell files that are not valid, for which their last valid version was taken."""
-    for found in problems:
-        errors.print(f"warning: {found} (its last valid version is taken)")
+    """Warn about invalid files whose last valid version is in effect."""
+    for problem in problems:
+        errors.print(f"warning: {problem} (its last valid version is in effect)")
 
 
 def print_json(data: object) -> None:
@@ -72,7 +77,7 @@ state_repo_option = click.option(
     required=True,
     envvar="DEMANDOPS_STATE_REPO",
     metavar="URL_OR_DIR",
-    help="The state repo: a folder with a bare repository, or a URL that git clones "
+    help="The state repo: a bare repository's folder, or a URL that git can clone "
     "[env: DEMANDOPS_STATE_REPO].",
 )
 
@@ -83,7 +88,7 @@ signing_option = click.option(
     type=click.Path(path_type=Path),
     metavar="FILE",
     help="Sign the commits with this SSH key: a private key without a passphrase, or the public "
-    "one of a key that an agent holds; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
+    "key of a key in an SSH agent; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
 )
 
 output_option = click.option(
@@ -92,29 +97,31 @@ output_option = click.option(
     type=click.Choice(["text", "json"]),
     default="text",
     show_default=True,
-    help="How to print.",
+    help="The output format.",
 )
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Progress]:
-    """Give a function that shows progress on a terminal once the work takes a while."""
+def progress(title: str) -> Iterator[Progress]:
+    """Yield a function that shows progress on a terminal, unless the work is short."""
     start = time.monotonic()
     bar: Bar | None = None
     task: Any = None
 
-    def tell(done: int, total: int) -> None:
+    def show(done: int, total: int) -> None:
         nonlocal bar, task
         if bar is None:
             if not sys.stderr.isatty() or time.monotonic() - start < _PATIENCE_S or done >= total:
                 return
+            from rich.progress import Progress as Bar  # noqa: PLC0415
+
             bar = Bar(console=_console(stderr=True), transient=True)
-            task = bar.add_task(what, total=total)
+            task = bar.add_task(title, total=total)
             bar.start()
         bar.update(task, completed=done, total=total)
 
     try:
-        yield tell
+        yield show
     finally:
         if bar is not None:
             bar.stop()

@@ -473,7 +473,7 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
     assert run(["status", "--state-repo", str(bare)]) == 0
     out = capsys.readouterr().out
     assert out.splitlines()[:2] == [
-        "1 problem; of each file the last valid version is in force:",
+        "1 problem; of each file the last valid version is in effect:",
         f"  {problem}",
     ]
     assert "of-edge-fusion-1" in out
@@ -483,4 +483,4 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
     assert run(["bookkeeping", "--state-repo", str(bare)]) == 0
     shown = capsys.readouterr()
     assert "edge/fusion-1" in shown.out
-    assert shown.err == f"warning: {problem}; its last valid version is in force\n"
+    assert shown.err == f"warning: {problem}; its last valid version is in effect\n"

@@ -1,1 +1,1 @@
-"""Commands that change the books: request, decommission, roll back."""
+"""Commands that change the ledger: request, decommission, rollback."""

@@ -1,4 +1,4 @@
-"""``demandops decommission``: release all that a node or a requester holds, in one commit."""
+"""``demandops decommission``: release all claims of a node or a requester, in one commit."""
 
 from __future__ import annotations
 
@@ -31,9 +31,14 @@ from demandops.staterepo.load.snapshot import Snapshot
 @click.command()
 @click.argument("name", metavar="NODE|REQUESTER")
 @state_repo_option
-@click.option("--node", "kinds", flag_value="node", help="As a node only.")
-@click.option("--requester", "kinds", flag_value="requester", help="As a requester only.")
-@click.option("--dry-run", is_flag=True, help="Show the consequence and release nothing.")
+@click.option("--node", "kinds", flag_value="node", help="Decommission only the node of that name.")
+@click.option(
+    "--requester",
+    "kinds",
+    flag_value="requester",
+    help="Decommission only the requester of that name.",
+)
+@click.option("--dry-run", is_flag=True, help="Show the consequences and release nothing.")
 @signing_option
 @output_option
 def decommission(
@@ -44,20 +49,21 @@ def decommission(
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Release all that a node or a requester holds, for it leaves for good.
+    """Release all claims of a node or a requester.
 
-    Of a node: the applications at it, the inputs from it and the connections that end at it, in
-    whosever name; afterwards it can be deleted from the inventory. Of a requester: its claims; one
-    that stands in other names too keeps standing in those. Where a name is both, both.
+    A node loses its applications, the inputs from it and the connections that end at it, for every
+    requester; then you can delete it from the inventory. A requester loses all its claims, also
+    the claims that it shares with other requesters. If a node and a requester have the name, both
+    are decommissioned.
     """
     goal = decommission_goal.as_data(
         name, (kinds,) if kinds else ("node", "requester"), authorship.operator()
     )
     try:
         if dry_run:
-            row = _rehearsed(goal, state_repo, output)
+            row = _dry_run(goal, state_repo, output)
         else:
-            row = _done(goal, state_repo, signing_key)
+            row = _decommission(goal, state_repo, signing_key)
     except _NothingHeld:
         row = _row(name, "unchanged", None, ())
     if output == "json":
@@ -67,35 +73,37 @@ def decommission(
 
 
 class _NothingHeld(Exception):
-    """A node that is known and holds nothing: there is nothing to do, and nothing wrong."""
+    """Raised when a known node holds no claims, which is not an error."""
 
 
-def _held_by_nobody(error: Refused, name: str, snapshot: Snapshot) -> bool:
-    codes = {found.code for found in error.faults}
+def _holds_nothing(error: Refused, name: str, snapshot: Snapshot) -> bool:
+    codes = {each.code for each in error.faults}
     return codes == {"not-held"} and name in snapshot.state.config.nodes
 
 
-def _done(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any]:
-    with progress("reading the ledger") as tell:
-        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=tell)
+def _decommission(
+    goal: dict[str, Any], state_repo: str, signing_key: Path | None
+) -> dict[str, Any]:
+    with progress("reading the ledger") as report:
+        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=report)
     try:
         receipt = generator.submit(goal).future.result()
         return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)
     except Refused as error:
-        if _held_by_nobody(error, goal["name"], generator.snapshot):
+        if _holds_nothing(error, goal["name"], generator.snapshot):
             raise _NothingHeld from None
         raise
     finally:
         generator.close(timeout=0)
 
 
-def _rehearsed(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any]:
-    with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
-        snapshot = repo.snapshot(progress=tell)
+def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any]:
+    with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
+        snapshot = repo.snapshot(progress=report)
         try:
             decision = decide(snapshot.state, goal, datetime.now(timezone.utc), repo.file_reader())
         except Refused as error:
-            if _held_by_nobody(error, goal["name"], snapshot):
+            if _holds_nothing(error, goal["name"], snapshot):
                 raise _NothingHeld from None
             raise
     if output == "text":

@@ -1,4 +1,4 @@
-"""``demandops request``: book requests from files, without ROS."""
+"""``demandops request``: book demand requests from files, without ROS."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class _Document:
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE…")
 @state_repo_option
-@click.option("--dry-run", is_flag=True, help="Show the consequence and book nothing.")
+@click.option("--dry-run", is_flag=True, help="Show the consequences and book nothing.")
 @click.option(
     "--wait",
     is_flag=True,
-    help="Wait until demands that need approval are decided. Without it they are proposed, and the "
-    "next generator to start on this machine looks after them.",
+    help="Wait until demands that need approval are decided. Otherwise they are proposed, and "
+    "the next generator that starts on this machine follows them up.",
 )
 @signing_option
 @output_option
@@ -66,10 +66,10 @@ def request(
 ) -> None:
     """Book demand requests from files.
 
-    FILE is the action goal of DeploymentRequest as YAML, as `ros2 action send_goal` takes it, or a
-    document of the kind Demand (docs/demand.md), or - for standard input. Several files, or
-    documents in one, are taken in order; one that is refused does not stop the next. All are parsed
-    before any is booked.
+    FILE contains goals of the action DeploymentRequest as YAML, as for `ros2 action send_goal`, or
+    documents of the kind Demand (docs/demand.md). Write - for standard input. Nothing is booked
+    unless all documents parse. They are then booked in order; the next one is booked even if one
+    is refused.
     """
     documents = [document for file in files for document in _documents(file)]
     if not documents:
@@ -78,7 +78,7 @@ def request(
     if any(faulty):
         rows = _unbooked(documents, faulty, state_repo)
     elif dry_run:
-        rows = _rehearse(documents, state_repo, output)
+        rows = _dry_run(documents, state_repo, output)
     else:
         rows = _book(documents, state_repo, wait, signing_key)
     if output == "json":
@@ -98,7 +98,7 @@ def _documents(file: str) -> Iterable[_Document]:
         reason = error.strerror or str(error)
         raise InvalidInput([fault("", f"cannot be read: {reason}").within(name)]) from None
     except UnicodeDecodeError:
-        raise InvalidInput([fault("", "is no UTF-8 text").within(name)]) from None
+        raise InvalidInput([fault("", "is not UTF-8 text").within(name)]) from None
     try:
         return [_Document(name, goal) for goal in strict_yaml.load_all(text) if goal is not None]
     except InvalidInput as error:
@@ -120,13 +120,13 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
 def _unbooked(
     documents: list[_Document], faulty: list[list[Fault]], state_repo: str
 ) -> list[dict[str, Any]]:
-    """Tell every fault of the documents that do not parse, those of their contents as well."""
+    """Return a refusal for each document because at least one does not parse."""
     with reader.opened(state_repo) as repo:
         state = repo.snapshot().state
     rows = []
-    for index, (document, found) in enumerate(zip(documents, faulty, strict=True)):
-        faults = [fault("", "not booked, for another request of this call does not parse")]
-        if found:
+    for index, (document, form) in enumerate(zip(documents, faulty, strict=True)):
+        faults = [fault("", "not booked because another request of this call does not parse")]
+        if form:
             try:
                 admit(state, document.goal)
             except InvalidInput as error:
@@ -136,11 +136,11 @@ def _unbooked(
 
 
 def _errors(faults: Iterable[Fault]) -> list[dict[str, str]]:
-    return [{"field": found.field, "message": _message(found)} for found in faults]
+    return [{"field": each.field, "message": _message(each)} for each in faults]
 
 
-def _message(found: Fault) -> str:
-    return f"{found.file}: {found.message}" if found.file else found.message
+def _message(each: Fault) -> str:
+    return f"{each.file}: {each.message}" if each.file else each.message
 
 
 def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str, Any]:
@@ -151,30 +151,30 @@ def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str
 def _book(
     documents: list[_Document], state_repo: str, wait: bool, signing_key: Path | None
 ) -> list[dict[str, Any]]:
-    with progress("reading the ledger") as tell:
-        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=tell)
+    with progress("reading the ledger") as report:
+        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=report)
     try:
-        answers = [_handed_in(generator, document, wait) for document in documents]
+        answers = [_submitted(generator, document, wait) for document in documents]
         rows = []
         for index, (document, answer) in enumerate(zip(documents, answers, strict=True)):
             try:
-                told = answer.result()
+                result = answer.result()
             except DemandOpsError as error:
                 rows.append(_refused(index, document, error))
                 continue
-            if isinstance(told, Receipt):
-                rows.append(_booked(index, told))
+            if isinstance(result, Receipt):
+                rows.append(_booked(index, result))
             else:
-                rows.append(_row(index, document.request_id, "proposed", proposal=told))
+                rows.append(_row(index, document.request_id, "proposed", proposal=result))
         return rows
     finally:
         generator.close(timeout=0)
 
 
-def _handed_in(
+def _submitted(
     generator: Generator, document: _Document, wait: bool
 ) -> Future[Receipt | dict[str, str]]:
-    """Hand a request in; the future gives its receipt, or where it awaits approval."""
+    """Submit a request; return a future of its receipt, or of the proposal that awaits approval."""
     answer: Future[Receipt | dict[str, str]] = Future()
     name = document.request_id
 
@@ -210,16 +210,16 @@ def _booked(index: int, receipt: Receipt) -> dict[str, Any]:
     )
 
 
-def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[dict[str, Any]]:
-    """Decide every request on top of the one before, in memory only."""
+def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[dict[str, Any]]:
+    """Decide each request after the one before it, in memory only."""
     rows = []
-    with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
+    with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         repo.refuse_other_rendering()
-        state = repo.snapshot(progress=tell).state
-        standing, written = repo.file_reader(), dict[str, str | None]()
+        state = repo.snapshot(progress=report).state
+        committed, written = repo.file_reader(), dict[str, str | None]()
 
         def read(path: str) -> str | None:
-            return written[path] if path in written else standing(path)
+            return written[path] if path in written else committed(path)
 
         for index, document in enumerate(documents):
             try:
@@ -230,7 +230,7 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
             state = decision.state
             written.update(decision.files)
             if output == "text":
-                _show_consequence(index, decision)
+                _show_consequences(index, decision)
             rows.append(
                 _row(
                     index,
@@ -244,16 +244,16 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
     return rows
 
 
-def _show_consequence(index: int, decision: Decision) -> None:
+def _show_consequences(index: int, decision: Decision) -> None:
     outcome = "proposed" if decision.approval else decision.outcome
     console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
-    for who in decision.approval:
-        console().print(f"  needs approval: {who} asks for it")
+    for rule in decision.approval:
+        console().print(f"  needs approval: {rule} requires it")
     show_releases(decision)
 
 
 def show_releases(decision: Decision) -> None:
-    """Print what a decision changes: releases, and the files that are written or removed."""
+    """Print the releases that a decision changes and the files that it writes or removes."""
     out = console()
     for release in decision.releases:
         out.print(f"  {SIGNS[release.change]} {release.name} ({release.description})")

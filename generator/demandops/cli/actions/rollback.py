@@ -1,4 +1,4 @@
-"""``demandops rollback``: back to the books of an earlier commit, by a new one."""
+"""``demandops rollback``: restore the ledger of an earlier commit, by a new commit."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 
 
 @dataclass(frozen=True, slots=True)
-class _Wish:
-    """What was asked for: the commit to go back to, and how."""
+class _Target:
+    """The commit to go back to, and how."""
 
     to: str
     drop_newer: bool
     reason: str
-    who: tuple[str, str]
+    person: tuple[str, str]
 
 
 @click.command()
 @click.argument("revision", metavar="REV|TIME")
 @state_repo_option
-@click.option("-m", "--reason", metavar="TEXT", help="Why; it stands in the commit.")
+@click.option("-m", "--reason", metavar="TEXT", help="The reason, for the commit message.")
 @click.option(
     "--drop-newer",
     is_flag=True,
-    help="Drop what was booked since; without it such a rollback is refused.",
+    help="Also drop claims that were booked since then; otherwise they prevent the rollback.",
 )
-@click.option("--dry-run", is_flag=True, help="Show the consequence and change nothing.")
+@click.option("--dry-run", is_flag=True, help="Show the consequences and change nothing.")
 @signing_option
 @output_option
 @click.pass_context
@@ -63,44 +63,43 @@ def rollback(  # noqa: PLR0913, PLR0917 - one for each option
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Go back to the books of an earlier commit, by a new commit.
+    """Restore the ledger of an earlier commit, by a new commit.
 
-    Claims that were released since come back and what they ask for runs again, with today's
-    configuration: that is people's, and stays. A claim with a lease gets its full term again. REV
-    is a commit; a TIME stands for the newest commit at or before it.
+    Claims that were released since then are booked again, with the current configuration. A lease
+    starts again with its full term. REV is a commit; TIME means the newest commit at or before it.
     """
     if not (dry_run or (reason and reason.strip())):
-        raise click.UsageError("say why: -m REASON")
+        raise click.UsageError("give the reason: -m TEXT")
     with reader.opened(state_repo) as repo:
-        wish = _Wish(repo.commit(revision), drop_newer, reason or "", repo.person())
+        target = _Target(repo.commit(revision), drop_newer, reason or "", repo.person())
         base = repo.commit()
-        found: dict[str, Any] = {"to": wish.to, "outcome": "refused", "commit": None}
-        found |= _consequence(None)
-        found |= {"configuration_since": repo.configured_since(wish.to), "errors": []}
+        result: dict[str, Any] = {"to": target.to, "outcome": "refused", "commit": None}
+        result |= _consequences(None)
+        result |= {"configuration_since": repo.configured_since(target.to), "errors": []}
         try:
-            found |= _rehearsed(repo, wish, base)
+            result |= _dry_run(repo, target, base)
         except InvalidInput as error:
-            found["errors"] = _errors(error)
-    if not dry_run and not found["errors"]:
-        found |= _done(state_repo, wish, signing_key, base)
+            result["errors"] = _errors(error)
+    if not dry_run and not result["errors"]:
+        result |= _roll_back(state_repo, target, signing_key, base)
     if output == "json":
-        print_json(found)
+        print_json(result)
     else:
-        _print(found, dry_run)
-    if found["errors"]:
+        _print(result, dry_run)
+    if result["errors"]:
         ctx.exit(1)
 
 
-def _rehearsed(repo: Reader, wish: _Wish, base: str) -> dict[str, Any]:
-    """Decide the rollback on top of a commit, in memory only."""
-    with progress("reading the ledger") as tell:
-        state = repo.last_valid(base, tell).state
-    request = repo.restoration(wish.to, drop_newer=wish.drop_newer)
+def _dry_run(repo: Reader, target: _Target, base: str) -> dict[str, Any]:
+    """Decide the rollback on a commit, in memory only."""
+    with progress("reading the ledger") as report:
+        state = repo.last_valid(base, report).state
+    request = repo.restoration(target.to, drop_newer=target.drop_newer)
     decision = decide(state, request, datetime.now(timezone.utc), repo.file_reader(base))
-    return {"outcome": decision.outcome, **_consequence(decision)}
+    return {"outcome": decision.outcome, **_consequences(decision)}
 
 
-def _consequence(decision: Decision | None) -> dict[str, Any]:
+def _consequences(decision: Decision | None) -> dict[str, Any]:
     claims: dict[str, list[dict[str, Any]]] = {word: [] for word in _SIGN}
     for change in decision.changes.claims if decision else ():
         word = "changed_back" if change.before else "restored"
@@ -117,64 +116,68 @@ def _consequence(decision: Decision | None) -> dict[str, Any]:
         )
     releases = [
         {
-            "name": one.name,
-            "change": one.change,
-            "what": one.description,
-            "details": list(one.details),
+            "name": each.name,
+            "change": each.change,
+            "what": each.description,
+            "details": list(each.details),
         }
-        for one in (decision.releases if decision else ())
+        for each in (decision.releases if decision else ())
     ]
     return {**claims, "releases": releases}
 
 
-def _done(state_repo: str, wish: _Wish, key: Path | None, base: str) -> dict[str, Any]:
-    """Have a generator roll back; tell what it came to, on whatever it was judged."""
-    with progress("reading the ledger") as tell:
-        generator = Generator(state_repo, patient=False, signing_key=key, progress=tell)
+def _roll_back(state_repo: str, target: _Target, key: Path | None, base: str) -> dict[str, Any]:
+    """Roll back with a generator; return the result."""
+    with progress("reading the ledger") as report:
+        generator = Generator(state_repo, patient=False, signing_key=key, progress=report)
     try:
-        goal = rollbacks.goal(wish.to, drop_newer=wish.drop_newer, reason=wish.reason, who=wish.who)
+        goal = rollbacks.goal(
+            target.to, drop_newer=target.drop_newer, reason=target.reason, who=target.person
+        )
         receipt = generator.submit(goal).future.result()
     except InvalidInput as error:
-        return {"outcome": "refused", **_consequence(None), "errors": _errors(error)}
+        return {"outcome": "refused", **_consequences(None), "errors": _errors(error)}
     finally:
         generator.close(timeout=0)
-    found: dict[str, Any] = {"outcome": receipt.outcome, "commit": receipt.commit}
+    result: dict[str, Any] = {"outcome": receipt.outcome, "commit": receipt.commit}
     if receipt.outcome == "unchanged":
-        return found | _consequence(None)
+        return result | _consequences(None)
     with reader.opened(state_repo) as repo:
-        judged_on = repo.commit(f"{receipt.commit}~1")
-        if judged_on != base:  # others wrote meanwhile, or people's changes were taken in before
-            found |= _rehearsed(repo, wish, judged_on)
-    return found
+        decided_on = repo.commit(f"{receipt.commit}~1")
+        if decided_on != base:  # the tip moved in between
+            result |= _dry_run(repo, target, decided_on)
+    return result
 
 
 def _errors(error: InvalidInput) -> list[dict[str, str]]:
-    return [{"file": one.file, "field": one.field, "message": one.message} for one in error.faults]
+    return [
+        {"file": each.file, "field": each.field, "message": each.message} for each in error.faults
+    ]
 
 
-def _print(found: dict[str, Any], dry_run: bool) -> None:
-    to, out = found["to"][:10], console()
-    if found["errors"]:
+def _print(result: dict[str, Any], dry_run: bool) -> None:
+    to, out = result["to"][:10], console()
+    if result["errors"]:
         errors.print(f"the rollback to {to} is refused:")
-        for one in found["errors"]:
-            where = [part for part in (one["file"], one["field"]) if part]
-            errors.print(f"  {': '.join([*where, one['message']])}")
-    elif found["outcome"] == "unchanged":
-        out.print(f"the books are what they were at {to}; nothing to roll back")
+        for error in result["errors"]:
+            where = [part for part in (error["file"], error["field"]) if part]
+            errors.print(f"  {': '.join([*where, error['message']])}")
+    elif result["outcome"] == "unchanged":
+        out.print(f"the ledger is the same as at {to}; there is nothing to roll back")
     elif dry_run:
         out.print(f"the rollback to {to} would change:")
     else:
-        out.print(f"rolled back to {to} in {found['commit']}")
+        out.print(f"rolled back to {to} in {result['commit']}")
     for word, sign in _SIGN.items():
-        for claim in found[word]:
+        for claim in result[word]:
             who = ", ".join(claim["requesters"])
             out.print(f"  {sign} claim of {who} on {claim['subject']} ({word.replace('_', ' ')})")
-    for release in found["releases"]:
+    for release in result["releases"]:
         out.print(f"  {SIGNS[release['change']]} release {release['name']} ({release['what']})")
         for detail in release["details"]:
             out.print(f"      {detail}")
-    since = found["configuration_since"]
+    since = result["configuration_since"]
     if since:
-        out.print(f"configuration is people's and stays as it is; changed since {to}:")
+        out.print(f"a rollback does not change configuration; changed since {to}:")
         for path in since:
             out.print(f"  {path}")

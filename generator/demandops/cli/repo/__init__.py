@@ -1,1 +1,1 @@
-"""Commands for a whole state repo: lay it down, check, upgrade and verify it."""
+"""Commands for a state repo as a whole: init, check, upgrade, verify, schema."""

@@ -1,4 +1,4 @@
-"""``demandops check``: a state repo as a person edits it, before it is merged."""
+"""``demandops check``: the effect of edits of a state repo, before they are merged."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ from demandops.render.changes.merge_preview import FileChange
 from demandops.staterepo.pull_request import merge_check
 from demandops.staterepo.pull_request.merge_check import Checked
 
-_MOST_LINES = 400
-"""Of unified diffs on a terminal."""
-_MOST_LINES_JSON = 20_000
+_MOST_DIFF_LINES = 400
+_MOST_DIFF_LINES_JSON = 20_000
 
 _SIGNS = {
     "start": "+",
@@ -40,121 +39,122 @@ _SIGNS = {
 @click.option(
     "--base",
     metavar="REV",
-    help="What the edit is to be merged into: it is compared with where it left that. By default "
-    "origin/main, or main.",
+    help="The branch that the edits will be merged into. They are compared with the merge base. "
+    "Default: origin/main, or main.",
 )
 @click.option(
     "--output",
     type=click.Choice(["text", "json", "markdown"]),
     default="text",
     show_default=True,
-    help="How to print; markdown is ready to be posted as a comment on a pull request.",
+    help="The output format; markdown is for a comment on a pull request.",
 )
 def check(directory: Path, base: str | None, output: str) -> None:
-    """Check a checked-out state repo before its edits are merged, and show what they would do.
+    """Check edits of a state repo and show their consequences.
 
-    All files are valid, every application renders, no generated file is edited by hand (the
-    override that would do the same is printed), and a chart that changed has a new version. What
-    follows from the edit is shown: releases that start, change or stop, the files that the
-    generator would write, and who would request what. docs/pull-requests.md has it in a pipeline.
+    DIR is a checked-out state repo. Its files must be valid, every application must render, no
+    generated file may be edited (the override to write instead is printed), and a changed chart
+    needs a new version. Then the consequences of a merge are shown: changed releases, files and
+    bookkeeping. docs/pull-requests.md describes the check in a pipeline.
     """
-    found = merge_check.check(directory, base)
+    checked = merge_check.check(directory, base)
     if output == "json":
-        print_json(_data(found))
+        print_json(_data(checked))
     elif output == "markdown":
-        click.echo(pull_request_comment.report(found), nl=False)
+        click.echo(pull_request_comment.report(checked), nl=False)
     else:
-        _print(directory, found)
-    if found.faults:
+        _print(directory, checked)
+    if checked.faults:
         click.get_current_context().exit(1)
 
 
-def _data(found: Checked) -> dict[str, Any]:
-    known = found.consequence
-    diffs, left = _bounded(known.files if known else (), _MOST_LINES_JSON)
+def _data(checked: Checked) -> dict[str, Any]:
+    consequence = checked.consequence
+    diffs, left = _bounded(consequence.files if consequence else (), _MOST_DIFF_LINES_JSON)
     return {
         "faults": [
-            {"file": one.file, "field": one.field, "message": one.message} for one in found.faults
+            {"file": each.file, "field": each.field, "message": each.message}
+            for each in checked.faults
         ],
-        "warnings": [{"file": one.file, "message": one.message} for one in found.warnings],
+        "warnings": [{"file": each.file, "message": each.message} for each in checked.warnings],
         "overrides": [
             {
-                "instead_of": one.path,
-                "file": one.name,
-                "text": one.text,
-                "left": list(one.not_covered),
-                "also": list(one.other_releases),
+                "instead_of": each.path,
+                "file": each.name,
+                "text": each.text,
+                "left": list(each.not_covered),
+                "also": list(each.other_releases),
             }
-            for one in found.suggestions
+            for each in checked.suggestions
         ],
-        "base": found.base,
-        "base_valid": found.base_in_force,
-        "releases": [_release_data(one) for one in known.releases] if known else None,
+        "base": checked.base,
+        "base_valid": checked.base_in_force,
+        "releases": [_release_data(each) for each in consequence.releases] if consequence else None,
         "files": [
             {
-                "path": one.path,
+                "path": each.path,
                 "change": "add"
-                if one.before is None
+                if each.before is None
                 else "remove"
-                if one.after is None
+                if each.after is None
                 else "change",
-                "diff": diffs.get(one.path),
+                "diff": diffs.get(each.path),
             }
-            for one in known.files
+            for each in consequence.files
         ]
-        if known
+        if consequence
         else None,
-        "outdated": [one.path for one in known.files] if known else [],
+        "outdated": [each.path for each in consequence.files] if consequence else [],
         "diff_lines_left_out": left,
-        "bookkeeping": [_entry_data(one) for one in found.books]
-        if found.books is not None
+        "bookkeeping": [_entry_data(each) for each in checked.books]
+        if checked.books is not None
         else None,
     }
 
 
-def _release_data(one: ReleaseChange) -> dict[str, Any]:
+def _release_data(release: ReleaseChange) -> dict[str, Any]:
     return {
-        "name": one.name,
-        "change": one.change,
-        "what": one.description,
-        "details": list(one.details),
+        "name": release.name,
+        "change": release.change,
+        "what": release.description,
+        "details": list(release.details),
     }
 
 
-def _entry_data(one: EntryChange) -> dict[str, Any]:
+def _entry_data(entry: EntryChange) -> dict[str, Any]:
     return {
-        "kind": one.kind,
-        "name": one.name,
-        "change": one.change,
-        "requesters": list(one.requesters),
-        "lost": list(one.lost),
-        "gained": list(one.gained),
+        "kind": entry.kind,
+        "name": entry.name,
+        "change": entry.change,
+        "requesters": list(entry.requesters),
+        "lost": list(entry.lost),
+        "gained": list(entry.gained),
     }
 
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
-    """Return the unified diffs by path while there is room, and how many lines did not fit."""
+    """Return the diffs that fit in ``most`` lines, by path, and the number of omitted lines."""
     shown: dict[str, str] = {}
     left = 0
-    for one in files:
-        lines = list(one.diff())
+    for file in files:
+        lines = list(file.diff())
         if len(lines) <= most:
-            shown[one.path] = "\n".join(lines) + "\n"
+            shown[file.path] = "\n".join(lines) + "\n"
             most -= len(lines)
         else:
             left += len(lines)
     return shown, left
 
 
-def _print(directory: Path, found: Checked) -> None:
+def _print(directory: Path, checked: Checked) -> None:
     out = console()
-    for one in found.faults:
-        errors.print(f"error: {one}")
-    for one in found.warnings:
-        errors.print(f"warning: {one}")
-    if not found.faults:
+    for each in checked.faults:
+        errors.print(f"error: {each}")
+    for each in checked.warnings:
+        errors.print(f"warning: {each}")
+    if not checked.faults:
         out.print(f"{directory}: all files are valid and everything renders")
-    for line in _lines(found):
+    for line in _lines(checked):
         out.print(_visible(line), soft_wrap=True)
 
 
@@ -163,39 +163,39 @@ def _files(count: int) -> str:
 
 
 def _visible(line: str) -> str:
-    """Return a line whose characters, which people may have written, do nothing to a terminal."""
+    """Return a line without characters that would control the terminal."""
     return "".join(char if char.isprintable() or char in "\n\t" else "�" for char in line)
 
 
-def _lines(found: Checked) -> Iterator[str]:
-    for one in found.suggestions:
-        yield f"\ninstead of editing {one.path}, {one.name}:\n"
-        yield from one.text.splitlines()
-        if one.other_releases:
-            yield f"\n(it fits {', '.join(one.other_releases)} too)"
-    known = found.consequence
-    if known is None:
-        if not found.suggestions:
+def _lines(checked: Checked) -> Iterator[str]:
+    for each in checked.suggestions:
+        yield f"\ninstead of editing {each.path}, {each.name}:\n"
+        yield from each.text.splitlines()
+        if each.other_releases:
+            yield f"\n(it also applies to {', '.join(each.other_releases)})"
+    consequence = checked.consequence
+    if consequence is None:
+        if not checked.suggestions:
             return
-        yield "\nwhat merging would do is shown once the faults are mended"
+        yield "\nmend the errors to see what merging would do"
         return
-    if known.files or found.books:
-        since = f" since {found.base[:10]}" if found.base else ""
+    if consequence.files or checked.books:
+        since = f" since {checked.base[:10]}" if checked.base else ""
         yield f"\nwhat merging would do{since}:"
-    if found.base and not found.base_in_force:
-        yield "(its own files are not valid; compared with the last ones that were)"
-    if known.releases:
+    if checked.base and not checked.base_in_force:
+        yield "(its own files are not valid; compared with its last valid files)"
+    if consequence.releases:
         yield "\ndesired state:"
-        for release in known.releases:
+        for release in consequence.releases:
             yield f"  {_SIGNS[release.change]} {release.name} ({release.description})"
             yield from (f"      {detail}" for detail in release.details)
-    if found.books:
+    if checked.books:
         yield "\nbookkeeping:"
-        for entry in found.books:
+        for entry in checked.books:
             yield f"  {_SIGNS[entry.change]} {entry.kind} {entry.name}{_for(entry)}"
             yield from (f"      - {fact}" for fact in entry.lost)
             yield from (f"      + {fact}" for fact in entry.gained)
-    yield from _file_lines(known.files)
+    yield from _file_lines(consequence.files)
 
 
 def _for(entry: EntryChange) -> str:
@@ -206,8 +206,10 @@ def _file_lines(files: tuple[FileChange, ...]) -> Iterator[str]:
     if not files:
         return
     yield f"\nthe generator will write or remove {_files(len(files))}:"
-    yield from (f"  {'remove' if one.after is None else 'write '} {one.path}" for one in files)
-    shown, left = _bounded(tuple(one for one in files if one.after is not None), _MOST_LINES)
+    yield from (f"  {'remove' if each.after is None else 'write '} {each.path}" for each in files)
+    shown, left = _bounded(
+        tuple(each for each in files if each.after is not None), _MOST_DIFF_LINES
+    )
     for text in shown.values():
         yield ""
         yield from text.splitlines()

@@ -1,4 +1,4 @@
-"""``demandops init``: the state repo itself."""
+"""``demandops init``: a new state repo."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from demandops.staterepo.git.signing import Signer
 @click.option(
     "--bare",
     is_flag=True,
-    help="Make a bare repository, which `serve` and `request` use in place. Without it DIR has the "
-    "files checked out, ready to be pushed to a Git server.",
+    help="Create a bare repository, for `serve` and `request` on this machine. Otherwise the files "
+    "are checked out in DIR, so that you can push them to a Git server.",
 )
 @click.option(
     "--url",
     default="",
     metavar="URL",
-    help="Where the clusters will fetch the state repo from (https or ssh); it stands in "
-    "demandops.yaml and can be changed there.",
+    help="The URL (https or ssh) from which the clusters fetch the state repo. It is written to "
+    "demandops.yaml; you can change it there.",
 )
 @signing_option
 @output_option
 def init(
     directory: Path, gitops: str, bare: bool, url: str, signing_key: Path | None, output: str
 ) -> None:
-    """Lay down a new state repo: the skeleton, the application definitions and a first commit.
+    """Create a state repo.
 
-    To make a cluster follow it, with Flux or Argo CD installed there (docs/flux.md,
-    docs/argocd.md say how):
+    Its first commit has the skeleton and the application definitions. To make a cluster follow the
+    state repo, install Flux or Argo CD there (docs/flux.md, docs/argocd.md) and run:
 
         git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
     """
@@ -60,7 +60,7 @@ def init(
     out = console()
     out.print(f"state repo in {directory}, first commit {commit[:10]} on main")
     out.print(
-        f"a cluster follows it after: git -C {directory} show main:bootstrap/c-its.yaml | "
+        f"to make a cluster follow it: git -C {directory} show main:bootstrap/c-its.yaml | "
         "kubectl apply -f -"
     )
     if bare:

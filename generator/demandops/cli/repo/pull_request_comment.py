@@ -1,8 +1,8 @@
-"""What ``demandops check`` found, as a comment on a pull request.
+"""The result of ``demandops check`` as a comment on a pull request.
 
-What people wrote stands in code spans and fences only, whose marks are longer than any run of them
-inside: it can name nobody, link nowhere and close nothing. A comment has a longest length, so the
-parts come by weight, and what does not fit is said to be left out.
+Text that people wrote appears only in code spans and fences, so that it cannot mention users, link
+or break the layout: the marks are longer than any run of backticks inside. The length of a comment
+is limited, so the most important parts come first and the number of omitted parts is given.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from demandops.render.changes.merge_preview import FileChange
 from demandops.staterepo.pull_request.merge_check import Checked
 
 MARK = "<!-- demandops check -->"
-"""Begins every report, so that a pipeline finds its own comment again."""
+"""The first line of every report, by which a pipeline finds its own comment."""
 
 LONGEST = 60_000
-"""Characters: GitHub takes 65,536, GitLab more."""
+"""The default limit in characters. GitHub allows 65,536, GitLab more."""
 
 _LONGEST_SPAN = 500
 _ROOM_FOR_NOTE = 200
 _VERBS = {"start": "starts", "change": "changes", "stop": "stops"}
-_ENTRY_VERBS = {"added": "new", "changed": "changed", "removed": "gone"}
+_ENTRY_VERBS = {"added": "new", "changed": "changed", "removed": "removed"}
 
 
-def report(found: Checked, longest: int = LONGEST) -> str:
+def report(checked: Checked, longest: int = LONGEST) -> str:
     """Return the report, of at most ``longest`` characters."""
-    parts = [f"{MARK}\n", *_head(found)]
-    parts += _faults(found)
-    parts += _warnings(found)
-    parts += _suggestions(found)
-    parts += _consequence(found)
+    parts = [f"{MARK}\n", *_head(checked)]
+    parts += _faults(checked)
+    parts += _warnings(checked)
+    parts += _suggestions(checked)
+    parts += _consequence(checked)
     return _bounded(parts, longest)
 
 
 def code(text: str) -> str:
-    """Return what somebody wrote as a code span of one line."""
+    """Return text as a code span of one line."""
     text = "".join(char if char.isprintable() else " " for char in text)
     if len(text) > _LONGEST_SPAN:
         text = f"{text[:_LONGEST_SPAN]}…"
@@ -50,7 +50,7 @@ def code(text: str) -> str:
 
 
 def fence(text: str, language: str) -> str:
-    """Return what somebody wrote as a block of code."""
+    """Return text as a block of code."""
     text = "".join(char if char.isprintable() or char in "\n\t" else "�" for char in text)
     marks = _longer_than_any(text, least=3)
     return f"{marks}{language}\n{text.rstrip()}\n{marks}\n"
@@ -61,71 +61,75 @@ def _longer_than_any(text: str, least: int) -> str:
     return "`" * max(least, longest + 1)
 
 
-def _head(found: Checked) -> Iterator[str]:
-    if found.faults:
-        many = "one thing" if len(found.faults) == 1 else f"{len(found.faults)} things"
-        yield f"## DemandOps: {many} to mend\n"
+def _head(checked: Checked) -> Iterator[str]:
+    if checked.faults:
+        many = "1 error" if len(checked.faults) == 1 else f"{len(checked.faults)} errors"
+        yield f"## DemandOps: {many}\n"
     else:
         yield "## DemandOps: valid, and everything renders\n"
-    if found.base:
-        since = "" if found.base_in_force else ", whose last valid files stand in for its own"
-        yield f"\nCompared with {code(found.base[:10])}{since}.\n"
+    if checked.base:
+        since = (
+            ""
+            if checked.base_in_force
+            else ", with its last valid files because its own are not valid"
+        )
+        yield f"\nCompared with {code(checked.base[:10])}{since}.\n"
 
 
-def _faults(found: Checked) -> Iterator[str]:
-    for one in found.faults:
-        places = [code(place) for place in (one.file, one.field) if place]
-        yield f"\n- {': '.join([*places, code(one.message)])}"
-    if found.faults:
+def _faults(checked: Checked) -> Iterator[str]:
+    for fault in checked.faults:
+        places = [code(place) for place in (fault.file, fault.field) if place]
+        yield f"\n- {': '.join([*places, code(fault.message)])}"
+    if checked.faults:
         yield "\n"
 
 
-def _warnings(found: Checked) -> Iterator[str]:
-    for one in found.warnings:
-        yield f"\n- warning: {code(one.file)}: {code(one.message)}"
-    if found.warnings:
+def _warnings(checked: Checked) -> Iterator[str]:
+    for warning in checked.warnings:
+        yield f"\n- warning: {code(warning.file)}: {code(warning.message)}"
+    if checked.warnings:
         yield "\n"
 
 
-def _suggestions(found: Checked) -> Iterator[str]:
-    for one in found.suggestions:
-        body = f"Merge this as {code(one.name)}:\n\n{fence(one.text, 'yaml')}"
-        if one.not_covered:
-            body += f"\nNo override changes {', '.join(map(code, one.not_covered))}.\n"
-        if one.other_releases:
-            body += f"\nIt fits {', '.join(map(code, one.other_releases))} too.\n"
-        yield _folded(f"Instead of editing {_plain(one.path)}", body)
+def _suggestions(checked: Checked) -> Iterator[str]:
+    for suggestion in checked.suggestions:
+        body = f"Merge this as {code(suggestion.name)}:\n\n{fence(suggestion.text, 'yaml')}"
+        if suggestion.not_covered:
+            body += f"\nNo override can change {', '.join(map(code, suggestion.not_covered))}.\n"
+        if suggestion.other_releases:
+            body += f"\nIt also applies to {', '.join(map(code, suggestion.other_releases))}.\n"
+        yield _folded(f"Instead of editing {_plain(suggestion.path)}", body)
 
 
-def _consequence(found: Checked) -> Iterator[str]:
-    known = found.consequence
-    if known is None:
-        yield "\nWhat merging would do is shown once that is mended.\n"
+def _consequence(checked: Checked) -> Iterator[str]:
+    consequence = checked.consequence
+    if consequence is None:
+        yield "\nMend the errors to see what merging would do.\n"
         return
-    if not known.files and not found.books:
-        yield "\nMerging changes nothing that runs, and nobody's demand.\n"
+    if not consequence.files and not checked.books:
+        yield "\nMerging changes no release and no demand.\n"
         return
     yield "\n### Desired state\n"
-    if known.releases:
-        yield f"\n{_counted(known.releases)}\n"
+    if consequence.releases:
+        yield f"\n{_counted(consequence.releases)}\n"
     else:
         yield "\nNo release starts, changes or stops.\n"
-    yield from map(_release, known.releases)
+    yield from map(_release, consequence.releases)
     yield "\n"
     yield "\n### Bookkeeping\n"
-    if found.books is None:
-        yield "\nThere is nothing valid to compare it with.\n"
-    elif not found.books:
+    if checked.books is None:
+        yield "\nNot compared, because the base has no valid files.\n"
+    elif not checked.books:
         yield "\nUnchanged.\n"
-    yield from map(_entry, found.books or ())
+    yield from map(_entry, checked.books or ())
     yield "\n"
-    if known.files:
-        yield f"\n### Files that the generator writes or removes: {len(known.files)}\n"
-    for one in known.files:
-        if one.after is None:
-            yield f"\n- removed: {code(one.path)}"
+    if consequence.files:
+        yield f"\n### Files that the generator writes or removes: {len(consequence.files)}\n"
+    for file in consequence.files:
+        if file.after is None:
+            yield f"\n- removed: {code(file.path)}"
     yield "\n"
-    yield from (_file(one) for one in known.files if one.after is not None)
+    yield from (_file(file) for file in consequence.files if file.after is not None)
 
 
 def _counted(releases: Iterable[ReleaseChange]) -> str:
@@ -138,23 +142,23 @@ def _counted(releases: Iterable[ReleaseChange]) -> str:
     return f"Releases: {', '.join(counts)}."
 
 
-def _release(one: ReleaseChange) -> str:
-    lines = [f"\n- {_VERBS[one.change]} {code(one.name)}: {code(one.description)}"]
-    lines += [f"\n  - {code(detail)}" for detail in one.details]
+def _release(release: ReleaseChange) -> str:
+    lines = [f"\n- {_VERBS[release.change]} {code(release.name)}: {code(release.description)}"]
+    lines += [f"\n  - {code(detail)}" for detail in release.details]
     return "".join(lines)
 
 
-def _entry(one: EntryChange) -> str:
-    line = f"\n- {_ENTRY_VERBS[one.change]}: {one.kind} {code(one.name)}"
-    if one.change != "changed":
-        return f"{line} for {', '.join(map(code, one.requesters))}"
-    facts = [f"\n  - no longer {code(fact)}" for fact in one.lost]
-    facts += [f"\n  - now {code(fact)}" for fact in one.gained]
+def _entry(entry: EntryChange) -> str:
+    line = f"\n- {_ENTRY_VERBS[entry.change]}: {entry.kind} {code(entry.name)}"
+    if entry.change != "changed":
+        return f"{line} for {', '.join(map(code, entry.requesters))}"
+    facts = [f"\n  - no longer {code(fact)}" for fact in entry.lost]
+    facts += [f"\n  - now {code(fact)}" for fact in entry.gained]
     return line + "".join(facts)
 
 
-def _file(one: FileChange) -> str:
-    return _folded(_plain(one.path), fence("\n".join(one.diff()), "diff"))
+def _file(file: FileChange) -> str:
+    return _folded(_plain(file.path), fence("\n".join(file.diff()), "diff"))
 
 
 def _folded(summary: str, body: str) -> str:
@@ -162,7 +166,7 @@ def _folded(summary: str, body: str) -> str:
 
 
 def _plain(path: str) -> str:
-    """Return a path for a summary, which takes HTML and no Markdown."""
+    """Return a path as HTML, because a summary does not render Markdown."""
     safe = re.sub(r"[^A-Za-z0-9_./-]", lambda char: f"&#{ord(char[0])};", path)
     return (
         f"<code>{safe[:_LONGEST_SPAN]}</code>" if len(safe) <= _LONGEST_SPAN else "<code>…</code>"
@@ -170,7 +174,7 @@ def _plain(path: str) -> str:
 
 
 def _bounded(parts: list[str], longest: int) -> str:
-    """Return the parts one after the other, without those that there is no room for."""
+    """Return the parts joined, without those that exceed the limit."""
     room = longest - _ROOM_FOR_NOTE
     taken, left = list[str](), 0
     for part in parts:
@@ -182,7 +186,7 @@ def _bounded(parts: list[str], longest: int) -> str:
     if left:
         many = "One part" if left == 1 else f"{left} parts"
         taken.append(
-            f"\n{many} of this report left out, for a comment has a longest length; "
+            f"\n{many} of this report left out because a comment has a limited length; "
             "`demandops check` shows all.\n"
         )
     return "".join(taken)

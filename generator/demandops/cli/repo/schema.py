@@ -1,4 +1,4 @@
-"""``demandops schema``: JSON Schemas of all that people write, for editors and pipelines."""
+"""``demandops schema``: JSON Schemas of the files that people write."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from demandops.config.repo_settings import RepoSettings
 from demandops.demand.demand_goal import DemandGoal
 from demandops.demand.deployment_request_goal import WireGoal
 
-_SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
+SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "access-domains": (AccessDomainsFile, "policy/access-domains.yaml"),
     "cluster-access": (AccessFile, "the file of `demandops serve --clusters`"),
     "application": (ApplicationDefinition, "appdefs/<name>/appdef.yaml"),
@@ -37,34 +37,34 @@ _SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
 
 
 @click.command()
-@click.argument("name", required=False, type=click.Choice(sorted(_SCHEMAS)), metavar="[NAME]")
+@click.argument("name", required=False, type=click.Choice(sorted(SCHEMAS)), metavar="[NAME]")
 @click.option(
     "--write",
     "folder",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Write all of them to a folder, as <name>.json.",
+    help="Write all schemas to this folder, as <name>.json.",
 )
 def schema(name: str | None, folder: Path | None) -> None:
-    """Print the JSON Schema of a kind of file; without NAME, which there are.
+    """Print the JSON Schema of a kind of file.
 
-    Editors check and complete with them; in VS Code with its YAML extension, say, by
-    `# yaml-language-server: $schema=…/nodes.json` in a file's first line.
+    Without NAME, list the schemas. Editors check and complete files with them. For VS Code and its
+    YAML extension, begin a file with `# yaml-language-server: $schema=…/nodes.json`.
     """
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        for each in _SCHEMAS:
+        for each in SCHEMAS:
             folder.joinpath(f"{each}.json").write_text(_text(each))
-        console().print(f"{len(_SCHEMAS)} schemas in {folder}")
+        console().print(f"{len(SCHEMAS)} schemas in {folder}")
     elif name is None:
-        for each, (_, what) in _SCHEMAS.items():
-            console().print(f"{each:20} {what}")
+        for each, (_, file) in SCHEMAS.items():
+            console().print(f"{each:20} {file}")
     else:
         click.echo(_text(name), nl=False)
 
 
 def _text(name: str) -> str:
-    model, what = _SCHEMAS[name]
-    found: dict[str, Any] = model.model_json_schema(by_alias=True)
-    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": what}
-    return json.dumps({**dialect, **found, "title": what}, indent=2, ensure_ascii=False) + "\n"
+    model, file = SCHEMAS[name]
+    generated: dict[str, Any] = model.model_json_schema(by_alias=True)
+    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": file}
+    return json.dumps({**dialect, **generated, "title": file}, indent=2, ensure_ascii=False) + "\n"

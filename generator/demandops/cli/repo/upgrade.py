@@ -1,4 +1,4 @@
-"""``demandops upgrade``: to this program's rendering, or to the other GitOps controller."""
+"""``demandops upgrade``: render with this version, or for the other GitOps controller."""
 
 from __future__ import annotations
 
@@ -31,18 +31,17 @@ _MOST_PATHS = 50
 @click.option(
     "--gitops",
     type=click.Choice(["flux", "argocd"]),
-    help="The controller that is to read the state repo from now on; the one that reads it now "
-    "where left out.",
+    help="The controller that reads the state repo from now on. Default: the current one.",
 )
 @click.option(
     "--url",
     metavar="URL",
-    help="Where the clusters fetch the state repo from (https or ssh), for the controller's "
-    "section of demandops.yaml where that is missing; by default what the other's says.",
+    help="The URL (https or ssh) from which the clusters fetch the state repo, if demandops.yaml "
+    "has no section for the controller. Default: the URL of the other controller.",
 )
-@click.option("--dry-run", is_flag=True, help="Show what would be written and write nothing.")
+@click.option("--dry-run", is_flag=True, help="Show the changes and write nothing.")
 @click.option(
-    "--yes", is_flag=True, help="Do not ask, on a terminal, before the controller changes."
+    "--yes", is_flag=True, help="Do not ask for confirmation before the controller changes."
 )
 @signing_option
 @output_option
@@ -55,26 +54,26 @@ def upgrade(
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Render everything anew, in one commit.
+    """Render everything again, in one commit.
 
-    Needed after an update of demandops that renders otherwise than before (a generator refuses a
-    state repo of another render version), and to go over from Flux to Argo CD or back. The clusters
-    are then handed over by a person: what to do there, before and after, is printed; docs/argocd.md
-    explains it. Where nothing would change, nothing is committed.
+    Use it when a new version of demandops renders differently (a generator refuses a state repo of
+    another render version), or to change between Flux and Argo CD. To change the controller, a
+    person also works on the clusters: the steps are printed, and docs/argocd.md explains them. If
+    nothing changes, there is no commit.
     """
-    wish = UpgradeRequest(gitops, url)
+    request = UpgradeRequest(gitops, url)
     asks = gitops is not None and not yes and output == "text" and sys.stdin.isatty()
     now = datetime.now(timezone.utc)
     signer = Signer(signing_key) if signing_key and not dry_run else None
-    with progress("reading the ledger") as tell:
+    with progress("reading the ledger") as report:
         if dry_run or asks:
-            made = upgrading.plan(state_repo, wish, now, tell)
+            made = upgrading.plan(state_repo, request, now, report)
         if asks and not dry_run and made.handover.before:
             _print_steps("before this, on the clusters:", made.handover.before)
             if not click.confirm("Is this done?"):
-                raise click.ClickException("nothing was changed; do it first, or say --yes")
+                raise click.ClickException("nothing was changed; do this first, or give --yes")
         if not dry_run:
-            made = upgrading.upgrade(state_repo, wish, now, tell, signer)
+            made = upgrading.upgrade(state_repo, request, now, report, signer)
     if output == "json":
         print_json(_data(made, dry_run))
     else:
@@ -105,23 +104,23 @@ def _print(made: Upgrade, dry_run: bool) -> None:
     new = made.new.repository
     if not made.files:
         out.print(
-            f"nothing to do: all is rendered for {new.gitops} by version {new.render_version}, "
-            f"at {made.commit}"
+            f"nothing to do: everything is rendered for {new.gitops} by version "
+            f"{new.render_version}, at {made.commit}"
         )
         return
-    for line in _told(made, dry_run):
+    for line in _summary(made, dry_run):
         out.print(line, soft_wrap=True)
     if made.handover.before:
         title = (
             "before this, on the clusters:"
             if dry_run
-            else "this was to be done before, on the clusters:"
+            else "this had to be done before, on the clusters:"
         )
         _print_steps(title, made.handover.before)
     _print_steps("after it, on the clusters:", made.handover.after)
 
 
-def _told(made: Upgrade, dry_run: bool) -> Iterable[str]:
+def _summary(made: Upgrade, dry_run: bool) -> Iterable[str]:
     old, new = made.old.repository, made.new.repository
     written = sum(text is not None for text in made.files.values())
     done = f"would write {written} and remove" if dry_run else f"wrote {written} and removed"
@@ -138,7 +137,7 @@ def _told(made: Upgrade, dry_run: bool) -> Iterable[str]:
     for path, text in list(made.files.items())[:_MOST_PATHS]:
         yield f"  {'remove' if text is None else 'write '} {path}"
     if len(made.files) > _MOST_PATHS:
-        yield f"  and {len(made.files) - _MOST_PATHS} more (--output json names all)"
+        yield f"  and {len(made.files) - _MOST_PATHS} more (--output json lists all)"
 
 
 def _print_steps(title: str, steps: Iterable[Step]) -> None:

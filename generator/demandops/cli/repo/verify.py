@@ -1,4 +1,4 @@
-"""``demandops verify``: are the commits what books and configuration give, and signed?"""
+"""``demandops verify``: the proof that commits match their ledger and configuration."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ from demandops.staterepo.audit.verification import Verdict
 @click.option(
     "--whole",
     is_flag=True,
-    help="Load and render every commit from nothing, rather than by what differs from the one "
-    "before.",
+    help="Load and render each commit completely, not only its difference from the commit before.",
 )
 @output_option
 def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> None:
-    """Render the ledger of commits again and compare the bytes with what was committed.
+    """Render the ledger of commits again and compare the bytes.
 
-    Where people keep policy/allowed-signers, every commit of the generator after it must carry a
-    good signature of a key listed there (docs/audit.md). REV, A and B are commits or times.
+    If the state repo has policy/allowed-signers, each later commit of the generator must have a
+    good signature by a key in that file (docs/audit.md). REV, A and B are commits or times.
     """
-    with reader.opened(state_repo) as repo, progress("rendering again") as tell:
-        verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=tell)
+    with reader.opened(state_repo) as repo, progress("rendering again") as report:
+        verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
     if output == "json":
         print_json([_row(verdict) for verdict in verdicts])
     else:
@@ -62,9 +61,9 @@ def _lines(verdicts: list[Verdict]) -> Iterator[str]:
         note = f" ({verdict.skipped})" if verdict.skipped else ""
         yield f"{verdict.commit[:10]} {word}{note}  {verdict.summary}"
         if verdict.fault:
-            yield f"    its books cannot be rendered any more: {verdict.fault}"
+            yield f"    its ledger can no longer be rendered: {verdict.fault}"
         yield from (f"    {path}" for path in verdict.differing)
-        yield from (f"    {path} (not for this commit to change)" for path in verdict.touched)
+        yield from (f"    {path} (this commit must not change it)" for path in verdict.touched)
         if verdict.signature:
             yield f"    it {verdict.signature}"
     skipped = sum(bool(verdict.skipped and verdict.holds) for verdict in verdicts)

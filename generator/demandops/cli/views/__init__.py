@@ -1,1 +1,1 @@
-"""Commands that show: bookkeeping, history, reasons, status."""
+"""Commands that show the state repo or the clusters, and change nothing."""

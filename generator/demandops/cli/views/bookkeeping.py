@@ -1,4 +1,4 @@
-"""``demandops bookkeeping``: who requests what, now and before."""
+"""``demandops bookkeeping``: who requests what, now or at an earlier commit."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _NONE = "(nothing)"
 
 @click.command()
 @state_repo_option
-@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; the newest by default.")
+@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; default: the newest commit.")
 @output_option
 def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     """Show who requests which service and connection."""
     with reader.opened(state_repo) as repo:
-        with progress("reading the ledger") as tell:
-            snapshot = repo.snapshot(at, tell)
+        with progress("reading the ledger") as report:
+            snapshot = repo.snapshot(at, report)
         for problem in repo.problems() if at is None else ():
-            errors.print(f"warning: {problem}; its last valid version is in force")
+            errors.print(f"warning: {problem}; its last valid version is in effect")
     books, commit = derive(snapshot.state.ledger, snapshot.state.config), str(snapshot.commit)
     if output == "json":
         print_json(as_data(books, commit))
@@ -75,7 +75,7 @@ def connections_table(books: Bookkeeping) -> Table:
 
 
 def suspended_table(books: Bookkeeping) -> Table:
-    """Return the claims that overrides keep from running, as a table."""
+    """Return the claims that overrides suspend, as a table."""
     table = Table("Subject", "Demand", "Requesters", "By", "Reason", title="Suspended")
     for entry in books.suspended:
         subject = f"{entry.kind} {entry.id}"

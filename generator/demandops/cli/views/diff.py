@@ -1,4 +1,4 @@
-"""``demandops diff``: what differs between two commits, in bookkeeping and in what runs."""
+"""``demandops diff``: the differences between two commits, in bookkeeping and releases."""
 
 from __future__ import annotations
 
@@ -35,27 +35,28 @@ _SIGN_OF = {"added": "+", "changed": "~", "removed": "-"}
 @state_repo_option
 @output_option
 def diff(before: str, after: str, state_repo: str, output: str) -> None:
-    """Show what differs between two commits, in bookkeeping and in what runs.
+    """Show the differences between two commits.
 
-    A and B are commits, or times: 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h.
+    They are shown in bookkeeping, releases and other files. A and B are commits, or times like
+    2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h.
     """
     with reader.opened(state_repo) as repo:
         old, new = (_loaded(repo, revision) for revision in (before, after))
         releases, others = _releases(repo, old, new)
-    books = [bookkeeping(one.state.ledger, one.state.config) for one in (old, new)]
-    entries = bookkeeping_changes(*books)
+    sides = [bookkeeping(each.state.ledger, each.state.config) for each in (old, new)]
+    entries = bookkeeping_changes(*sides)
     if output == "json":
-        was, now = map(asdict, books)
+        was, now = map(asdict, sides)
         print_json(
             {
                 kind: _entries(
-                    [one for one in entries if f"{one.kind}s" == kind], was[kind], now[kind]
+                    [each for each in entries if f"{each.kind}s" == kind], was[kind], now[kind]
                 )
                 for kind in ("services", "connections")
             }
             | {
                 "releases": {
-                    word: [_row(one) for one in releases if one.change == change]
+                    word: [_row(each) for each in releases if each.change == change]
                     for change, word in _LISTS.items()
                 },
                 "other_files": others,
@@ -65,13 +66,13 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
     out = console()
     for line in list(_entry_lines(entries)) or ["no difference in bookkeeping"]:
         out.print(line)
-    for line in list(_release_lines(releases, others)) or ["no difference in what runs"]:
+    for line in list(_release_lines(releases, others)) or ["no difference in releases"]:
         out.print(line)
 
 
 def _loaded(repo: Reader, revision: str) -> Snapshot:
-    with progress("reading the ledger") as tell:
-        snapshot = repo.last_valid(repo.commit(revision), tell)
+    with progress("reading the ledger") as report:
+        snapshot = repo.last_valid(repo.commit(revision), report)
     warn_of(repo.problems_of(snapshot))
     return snapshot
 
@@ -82,7 +83,7 @@ def _releases(
     before, after = repo.file_reader(str(old.commit)), repo.file_reader(str(new.commit))
     differing = repo.differing(str(old.commit), str(new.commit), CLUSTERS_ROOT)
     files = {path: (before(path), after(path)) for path in differing}
-    sides = [(one.state.ledger, one.state.config) for one in (old, new)]
+    sides = [(each.state.ledger, each.state.config) for each in (old, new)]
     return compare(sides[0], sides[1], files)
 
 
@@ -105,13 +106,13 @@ def _release_lines(releases: Iterable[ReleaseDifference], others: Iterable[str])
 def _entries(
     changes: Iterable[EntryChange], old: dict[str, Any], new: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the entries of one kind that differ, whole, as they were and as they are."""
-    found: dict[str, dict[str, Any]] = {"added": {}, "removed": {}, "changed": {}}
-    for one in changes:
-        sides = {"before": old.get(one.name), "after": new.get(one.name)}
+    """Return the whole entries that were added, removed or changed, by name."""
+    entries: dict[str, dict[str, Any]] = {"added": {}, "removed": {}, "changed": {}}
+    for entry in changes:
+        sides = {"before": old.get(entry.name), "after": new.get(entry.name)}
         whole = {"added": sides["after"], "removed": sides["before"], "changed": sides}
-        found[one.change][one.name] = _plain(whole[one.change])
-    return found
+        entries[entry.change][entry.name] = _plain(whole[entry.change])
+    return entries
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
@@ -121,8 +122,8 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
 
 
 def _entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
-    for one in entries:
-        who = "" if one.change == "changed" else f" for {', '.join(one.requesters)}"
-        yield f"{_SIGN_OF[one.change]} {one.kind} {one.name}{who}"
-        yield from (f"    - {fact}" for fact in one.lost)
-        yield from (f"    + {fact}" for fact in one.gained)
+    for entry in entries:
+        who = "" if entry.change == "changed" else f" for {', '.join(entry.requesters)}"
+        yield f"{_SIGN_OF[entry.change]} {entry.kind} {entry.name}{who}"
+        yield from (f"    - {fact}" for fact in entry.lost)
+        yield from (f"    + {fact}" for fact in entry.gained)

@@ -1,4 +1,4 @@
-"""``demandops log``: the commits of the state repo, all or those that one looks for."""
+"""``demandops log``: the commits of the state repo, all or filtered."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BY_HAND = "by-hand"
 
 @dataclass(frozen=True, slots=True)
 class _Filters:
-    """What a commit must fit; nothing where a filter was not given."""
+    """What a commit must match. None matches every commit."""
 
     requester: str | None
     application: str | None
@@ -36,7 +36,7 @@ class _Filters:
 
 
 class _Time(click.ParamType):  # type: ignore[type-arg]
-    """A time, as :func:`demandops.staterepo.history.revisions.moment` takes it."""
+    """A time, as :func:`demandops.staterepo.history.revisions.moment` parses it."""
 
     name = "time"
 
@@ -46,53 +46,71 @@ class _Time(click.ParamType):  # type: ignore[type-arg]
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> datetime:
-        """Return the time that was written."""
-        found = revisions.moment(str(value), datetime.now(timezone.utc), end=self._end)
-        if found is None:
-            self.fail(f"'{value}' is no time; write it like {revisions.TIMES}", param, ctx)
-        return found
+        """Parse a time."""
+        time = revisions.moment(str(value), datetime.now(timezone.utc), end=self._end)
+        if time is None:
+            self.fail(f"'{value}' is not a time; write it like {revisions.TIMES}", param, ctx)
+        return time
 
 
 @click.command()
 @click.argument("commit_range", required=False, metavar="[REV|A..B]")
 @state_repo_option
-@click.option("--requester", metavar="ID", help="In whose name something was asked or given up.")
-@click.option("--application", metavar="ID", help="About this application.")
-@click.option("--connection", metavar="ID", help="About this connection.")
-@click.option("--node", metavar="ID", help="What runs on this node, or a claim that names it.")
-@click.option("--release", metavar="NAME", help="Those that changed the file of this release.")
-@click.option("--demand", metavar="ID", help="About this demand.")
+@click.option(
+    "--requester", metavar="ID", help="Commits that book or release claims of this requester."
+)
+@click.option("--application", metavar="ID", help="Commits about this application.")
+@click.option("--connection", metavar="ID", help="Commits about this connection.")
+@click.option(
+    "--node",
+    metavar="ID",
+    help="Commits that change a release on this node or a claim that names it.",
+)
+@click.option("--release", metavar="NAME", help="Commits that changed the file of this release.")
+@click.option("--demand", metavar="ID", help="Commits about this demand.")
 @click.option(
     "--operation",
     metavar="WORD",
-    help="join, shutdown, put, release, renew, expire, decommission, follow, expire-override, "
-    "rollback, upgrade, init; or by-hand.",
+    help="Commits of this operation: join, shutdown, put, release, renew, expire, decommission, "
+    "follow, expire-override, rollback, upgrade, init; or by-hand.",
 )
 @click.option(
-    "--since", type=_Time(end=False), metavar="TIME", help=f"Not before: {revisions.TIMES}."
+    "--since",
+    type=_Time(end=False),
+    metavar="TIME",
+    help=f"Commits at or after this time: {revisions.TIMES}.",
 )
-@click.option("--until", type=_Time(end=True), metavar="TIME", help="Not after, written alike.")
-@click.option("-n", "--max-count", type=click.IntRange(1), default=None, help="At most so many.")
+@click.option(
+    "--until", type=_Time(end=True), metavar="TIME", help="Commits at or before this time."
+)
+@click.option(
+    "-n",
+    "--max-count",
+    type=click.IntRange(1),
+    default=None,
+    help="The greatest number of commits to list.",
+)
 @output_option
 def log(
     commit_range: str | None,
     state_repo: str,
     max_count: int | None,
     output: str,
-    **given: Any,  # noqa: ANN401 - as click gives them
+    **given: Any,  # noqa: ANN401 - the filters
 ) -> None:
-    """Show the commits of the state repo, newest first; with filters, those that fit all of them.
+    """List the commits of the state repo, newest first.
 
-    REV, A and B are commits, or times like --since takes.
+    With several filters, a commit must match all of them. REV, A and B are commits, or times
+    written as for --since.
     """
     with reader.opened(state_repo) as repo:
-        found = _walked(repo, commit_range, given.pop("release"))
-        entries = list(islice(_fitting(repo, found, _Filters(**given)), max_count))
+        commits = _walked(repo, commit_range, given.pop("release"))
+        entries = list(islice(_matching(repo, commits, _Filters(**given)), max_count))
     if output == "json":
         print_json([_row(entry) for entry in entries])
         return
     if not entries:
-        console().print("no commit fits")
+        console().print("no commit matches")
         return
     console().print(_table(entries))
 
@@ -105,11 +123,13 @@ def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iter
     )
     path = release if "/" in release else repo.path_called(release, tip)
     if path is None:
-        raise StateRepoError(f"no release was ever called '{release}'; `demandops why` helps along")
+        raise StateRepoError(
+            f"there was never a release '{release}'; `demandops bookkeeping` lists what runs"
+        )
     return repo.touching(path, commit_range)
 
 
-def _fitting(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Iterable[LogEntry]:
+def _matching(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Iterable[LogEntry]:
     trailers = {
         "Requester": given.requester,
         "Application": given.application,
@@ -118,7 +138,7 @@ def _fitting(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Iter
     }
     wanted = [(key, value) for key, value in trailers.items() if value is not None]
 
-    def fits(entry: LogEntry) -> bool:
+    def matches(entry: LogEntry) -> bool:
         if any(value not in entry.trailers.get(key, ()) for key, value in wanted):
             return False
         operation = entry.one("Operation") or _BY_HAND
@@ -130,7 +150,7 @@ def _fitting(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Iter
             return False
         return given.node is None or repo.concerns(entry.commit, given.node)
 
-    return filter(fits, entries)
+    return filter(matches, entries)
 
 
 def _table(entries: Iterable[LogEntry]) -> Table:

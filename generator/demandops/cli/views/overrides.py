@@ -1,4 +1,4 @@
-"""``demandops overrides``: what people have overridden, and what each override does now."""
+"""``demandops overrides``: the overrides, and what each one does now."""
 
 from __future__ import annotations
 
@@ -23,72 +23,72 @@ from demandops.staterepo import reader
 
 @click.command()
 @state_repo_option
-@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; the newest by default.")
+@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; default: the newest commit.")
 @output_option
 def overrides(state_repo: str, at: str | None, output: str) -> None:
-    """List the overrides: what each does, for which releases and claims, whose it is, how long.
+    """List the overrides and what each one does.
 
-    One is in force, expired, or matches nothing at present. The releases are those that it shapes,
-    or keeps from running; the claims those that it suspends, or would keep.
+    The state of an override is `in force`, `expired` or `matches nothing`. The list has the
+    releases that it changes or denies, and the claims that it suspends or keeps.
     """
-    with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
-        snapshot = repo.snapshot(at, tell)
+    with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
+        snapshot = repo.snapshot(at, report)
     state = snapshot.state
-    found = override_report(state.ledger, state.config, datetime.now(timezone.utc))
+    entries = override_report(state.ledger, state.config, datetime.now(timezone.utc))
     if output == "json":
-        print_json([_row(entry) for entry in found])
+        print_json([_row(entry) for entry in entries])
         return
     out = console()
-    if not found:
-        out.print("no overrides; docs/overrides.md says how to write one")
+    if not entries:
+        out.print("no overrides; see docs/overrides.md")
         return
     table = Table("Override", "State", "Does", "To", "Priority", "Owner", "Until", "Reason")
-    for entry in found:
-        one = entry.override
+    for entry in entries:
+        override = entry.override
         table.add_row(
-            one.name,
+            override.name,
             entry.state,
             "\n".join(_effects(entry)),
             "\n".join([*entry.releases, *entry.claims]),
-            str(one.priority),
-            one.owner,
-            written(one.end) if one.end else "",
-            one.reason,
+            str(override.priority),
+            override.owner,
+            written(override.end) if override.end else "",
+            override.reason,
         )
     out.print(table)
     out.print(f"at {snapshot.commit}")
 
 
 def _effects(entry: Entry) -> list[str]:
-    one = entry.override
-    told = {
-        "version": one.version,
-        "replicas": one.replicas,
-        "node": one.node,
-        "images": ", ".join(one.images or ()),
-        "values": ", ".join(one.values or ()),
+    override = entry.override
+    values = {
+        "version": override.version,
+        "replicas": override.replicas,
+        "node": override.node,
+        "images": ", ".join(override.images or ()),
+        "values": ", ".join(override.values or ()),
     }
-    return [f"{name} {told[name]}" if name in told else name for name in one.effects()]
+    return [f"{name} {values[name]}" if name in values else name for name in override.effects()]
 
 
 def _row(entry: Entry) -> dict[str, Any]:
-    one = entry.override
+    override = entry.override
     return {
-        "name": one.name,
-        "file": one.path,
+        "name": override.name,
+        "file": override.path,
         "state": entry.state,
-        "effects": {name: _plain(getattr(one, name)) for name in one.effects()},
+        "effects": {name: _plain(getattr(override, name)) for name in override.effects()},
         "releases": list(entry.releases),
         "claims": list(entry.claims),
-        "priority": one.priority,
-        "owner": one.owner,
-        "until": written(one.end) if one.end else None,
-        "reason": one.reason,
+        "priority": override.priority,
+        "owner": override.owner,
+        "until": written(override.end) if override.end else None,
+        "reason": override.reason,
     }
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Return an effect as it stands in the file; a null of a patch is a part of it."""
+    """Return an effect as written in the file. A patch keeps its null values."""
     if isinstance(value, dict):
         return {name: _plain(item) for name, item in value.items()}
     return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value

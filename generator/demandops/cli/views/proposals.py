@@ -1,4 +1,4 @@
-"""``demandops proposals``: which demands await a person's approval."""
+"""``demandops proposals``: the demands that await a person's approval."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from demandops.staterepo.write.proposal_branch import PendingProposal
 def proposals(state_repo: str, output: str) -> None:
     """List the demands that await approval.
 
-    Each is a branch of the state repo: merging it carries the demand out, deleting it turns the
-    demand down. Links are asked of GitHub or Gitea where DEMANDOPS_FORGE_TOKEN_FILE names a file
-    with a token.
+    Each is a branch of the state repo. Merge the branch to approve the demand; delete it to refuse
+    the demand. If DEMANDOPS_FORGE_TOKEN_FILE names a file with a token, links to pull requests are
+    read from GitHub or Gitea.
     """
     with reader.opened(state_repo) as repo:
-        found = repo.proposals()
-        forge = _forge(_configured(repo)) if found else None
-    rows = [_row(one, forge) for one in found]
+        pending = repo.proposals()
+        forge = _forge(_configured(repo)) if pending else None
+    rows = [_row(each, forge) for each in pending]
     if output == "json":
         print_json(rows)
         return
@@ -38,7 +38,7 @@ def proposals(state_repo: str, output: str) -> None:
         console().print("nothing awaits approval")
         return
     table = Table()
-    table.add_column("Branch", no_wrap=True)  # to be copied whole
+    table.add_column("Branch", no_wrap=True)  # so that it can be copied
     for name in ("Demand", "Requesters", "Since (UTC)", "What"):
         table.add_column(name)
     table.add_column("Link", overflow="fold")
@@ -58,7 +58,7 @@ def _configured(repo: reader.Reader) -> Proposals:
     try:
         return repo.config().repository.proposals
     except InvalidInput:
-        return Proposals()  # a broken file elsewhere does not hide what waits
+        return Proposals()  # an invalid file elsewhere must not hide the proposals
 
 
 def _forge(configured: Proposals) -> Forge | None:
@@ -72,22 +72,22 @@ def _forge(configured: Proposals) -> Forge | None:
         return None
 
 
-def _row(one: PendingProposal, forge: Forge | None) -> dict[str, Any]:
+def _row(proposal: PendingProposal, forge: Forge | None) -> dict[str, Any]:
     return {
-        "branch": one.branch,
-        "commit": one.commit,
-        "demands": list(one.demands),
-        "requesters": list(one.requesters),
-        "since": one.since.isoformat(),
-        "summary": one.summary,
-        "operations": list(one.operations),
-        "link": _link(one, forge),
+        "branch": proposal.branch,
+        "commit": proposal.commit,
+        "demands": list(proposal.demands),
+        "requesters": list(proposal.requesters),
+        "since": proposal.since.isoformat(),
+        "summary": proposal.summary,
+        "operations": list(proposal.operations),
+        "link": _link(proposal, forge),
     }
 
 
-def _link(one: PendingProposal, forge: Forge | None) -> str | None:
+def _link(proposal: PendingProposal, forge: Forge | None) -> str | None:
     try:
-        request = forge.find(one.branch, MAIN_BRANCH) if forge else None
+        request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
     except ForgeError as error:
         errors.print(f"warning: {error}")
         return None

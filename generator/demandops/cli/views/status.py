@@ -1,4 +1,4 @@
-"""``demandops status``: what the clusters have made of the desired state."""
+"""``demandops status``: the state of each release on its cluster."""
 
 from __future__ import annotations
 
@@ -39,36 +39,41 @@ _SHORT = 10
     envvar="DEMANDOPS_CLUSTERS",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="How the clusters are reached; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
+    help="How to reach the clusters; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
 )
 @output_option
 def status(state_repo: str, access_file: Path | None, output: str) -> None:
-    """Show for each release what is desired, what its cluster has seen, and how it is."""
+    """Show the state of each release on its cluster.
+
+    That is the commit that the cluster has applied, and the health of the release.
+    """
     clusters = access.read(access_file).clusters if access_file else {}
     with reader.opened(state_repo) as repo:
         problems = repo.problems()
-        with progress("reading the ledger") as tell:
-            snapshot = repo.snapshot(progress=tell)
-        found = rollout_targets.of_state(snapshot.state)
-        stores = _read(clusters, [target for _, target in found])
+        with progress("reading the ledger") as report:
+            snapshot = repo.snapshot(progress=report)
+        targets = rollout_targets.of_state(snapshot.state)
+        stores = _read(clusters, [target for _, target in targets])
         commit = str(snapshot.commit)
-        rows = [_row(release, target, commit, stores, repo) for release, target in found]
+        rows = [_row(release, target, commit, stores, repo) for release, target in targets]
     if output == "json":
-        told = [asdict(problem) for problem in problems]
-        print_json({"commit": commit, "releases": rows, "problems": told})
+        reported = [asdict(problem) for problem in problems]
+        print_json({"commit": commit, "releases": rows, "problems": reported})
         return
     _print_problems(problems)
     console().print(_table(rows))
     console().print(f"desired: {commit}")
     if not clusters:
-        errors.print("no access to the clusters, so nothing is known of them: give --clusters FILE")
+        errors.print("the state of the clusters is unknown: give --clusters FILE")
 
 
 def _print_problems(problems: Iterable[Problem]) -> None:
-    """Print what is not valid in the state repo, as the generator reported it there."""
+    """Print the problems that the generator reported in the state repo."""
     lines = [f"  {problem}" for problem in problems]
     if lines:
-        console().print(f"{_counted(len(lines))}; of each file the last valid version is in force:")
+        console().print(
+            f"{_counted(len(lines))}; of each file the last valid version is in effect:"
+        )
     for line in lines:
         console().print(line, soft_wrap=True)
 
@@ -78,17 +83,17 @@ def _counted(number: int) -> str:
 
 
 def _read(
-    clusters: Mapping[str, access.ClusterAccess], found: Iterable[Target]
+    clusters: Mapping[str, access.ClusterAccess], targets: Iterable[Target]
 ) -> dict[str, ObjectCache]:
-    """Read all clusters at once: one that is away holds up no other."""
+    """Read all clusters at the same time, so that an unreachable one does not delay the others."""
     wanted: dict[str, dict[ObjectSelector, None]] = {}
-    for target in found:
+    for target in targets:
         watched = health_reader(target.domain).objects_to_watch(target.domain)
         wanted.setdefault(target.domain.cluster, {}).update(dict.fromkeys(watched))
     stores = {
-        name: ObjectCache(name, reached, lambda: None)
-        for name, reached in clusters.items()
-        if reached.kubeconfig and name in wanted
+        name: ObjectCache(name, cluster, lambda: None)
+        for name, cluster in clusters.items()
+        if cluster.kubeconfig and name in wanted
     }
     with ThreadPoolExecutor(max(len(stores), 1)) as pool:
         list(pool.map(lambda store: store.read_once(wanted[store.name]), stores.values()))

@@ -1,4 +1,4 @@
-"""``demandops why``: what runs, who asked for it, what shaped it, and by which commits."""
+"""``demandops why``: why something runs: its requesters, configuration, overrides, commits."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _KINDS = ("release", "application", "connection")
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
-    """What the question is about: a release, a subject, or a file that is neither (any more)."""
+class _Match:
+    """What the name means: a release, a claimed subject, or another file of the state repo."""
 
     kind: str
     name: str
@@ -44,11 +44,11 @@ class _Asked:
 @click.command()
 @click.argument("name", metavar="RELEASE|CONNECTION|APPLICATION|PATH")
 @state_repo_option
-@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; the newest by default.")
+@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; default: the newest commit.")
 @click.option(
     "--kind",
     type=click.Choice(_KINDS),
-    help="What the name is of, where it could be several things.",
+    help="What the name means, if it could mean several things.",
 )
 @click.option(
     "-n",
@@ -57,109 +57,110 @@ class _Asked:
     type=click.IntRange(0),
     default=10,
     show_default=True,
-    help="List at most so many of the commits that changed it.",
+    help="The greatest number of commits to list that changed it.",
 )
 @output_option
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:
-    """Tell why something runs, or ran: who asks for it, what shaped it, and which commits did.
+    """Explain why something runs or ran.
 
-    It takes the name of a release, the id of an application or a connection, or a path below
-    clusters/ or ledger/. Of what runs no more it tells when it was stopped, by whom and why.
+    Shown are the requesters, the configuration and overrides that apply, and the commits. Give the
+    name of a release, the id of an application or a connection, or a path below clusters/ or
+    ledger/. If it no longer runs, the commit that stopped it is shown.
     """
     with reader.opened(state_repo) as repo:
-        with progress("reading the ledger") as tell:
-            snapshot = repo.last_valid(repo.commit(at), tell)
+        with progress("reading the ledger") as report:
+            snapshot = repo.last_valid(repo.commit(at), report)
         warn_of(repo.problems_of(snapshot))
-        asked = _understood(repo, snapshot, name, kind)
+        match = _match(repo, snapshot, name, kind)
         commit = str(snapshot.commit)
-        found: dict[str, Any] = {"commit": commit, "kind": asked.kind, "name": asked.name}
-        if asked.release is not None:
-            found |= why_answer.release(snapshot, asked.release)
-        elif asked.subject is not None:
-            found |= why_answer.subject(snapshot, asked.subject)
+        answer: dict[str, Any] = {"commit": commit, "kind": match.kind, "name": match.name}
+        if match.release is not None:
+            answer |= why_answer.release(snapshot, match.release)
+        elif match.subject is not None:
+            answer |= why_answer.subject(snapshot, match.subject)
         else:
-            found |= {"runs": False, **_denied(snapshot, asked)}
-        found["file"] = asked.path
-        found |= why_answer.commits(repo, asked.path, commit, most)
+            answer |= {"runs": False, **_denied(snapshot, match)}
+        answer["file"] = match.path
+        answer |= why_answer.commits(repo, match.path, commit, most)
     if output == "json":
-        print_json(found)
+        print_json(answer)
         return
     out = console()
-    for line in why_answer.lines(found):
+    for line in why_answer.lines(answer):
         out.print(line, soft_wrap=True)
 
 
-def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Asked:
-    """Find what a name means.
+def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Match:
+    """Return what a name means.
 
     Raises:
-        StateRepoError: where it means nothing, or several things.
+        StateRepoError: it means nothing, or several things.
     """
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
-    found = [one for one in _by_name(repo, snapshot, name) if kind in (None, one.kind)]
-    running = [one for one in found if one.release or _is_held(snapshot, one)]
-    if len(running or found) == 1:
-        return (running or found)[0]
-    if found:
-        kinds = ", ".join(one.kind for one in found)
-        raise StateRepoError(f"{shown(name)} names more than one: {kinds}; say which by --kind")
+    matches = [each for each in _by_name(repo, snapshot, name) if kind in (None, each.kind)]
+    running = [each for each in matches if each.release or _is_claimed(snapshot, each)]
+    if len(running or matches) == 1:
+        return (running or matches)[0]
+    if matches:
+        kinds = ", ".join(each.kind for each in matches)
+        raise StateRepoError(f"{shown(name)} can mean several: {kinds}; choose one with --kind")
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     ledger, config = snapshot.state.ledger, snapshot.state.config
     known = {*explanation.release_names(ledger, config), *repo.ever_stopped(str(snapshot.commit))}
-    known |= {id for one in SubjectKind for id in ledger.subjects(one)}
-    raise StateRepoError(f"nothing called {shown(name)} runs, or ever did{near(name, known)}")
+    known |= {id for each in SubjectKind for id in ledger.subjects(each)}
+    raise StateRepoError(f"nothing called {shown(name)} runs or ever ran{near(name, known)}")
 
 
-def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
+def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Match]:
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    found = []
+    matches = []
     release = explanation.release_named(ledger, config, name)
     path = path_of(release) if release else repo.path_called(name, str(snapshot.commit))
-    if path is None:  # one that an override denies may never have run
+    if path is None:  # a release that an override denies may never have run
         stopped = explanation.denied_release_named(ledger, config, name)
         path = path_of(stopped[0]) if stopped else None
     if path is not None:
-        found.append(_Asked("release", name, path, release))
+        matches.append(_Match("release", name, path, release))
     for kind in SubjectKind:
         subject = Subject(kind, name)
         folder = claim_file.folder_of(subject)
         if ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
-            found.append(_Asked(kind.value[:-1], name, folder, subject=subject))
-    return found
+            matches.append(_Match(kind.value[:-1], name, folder, subject=subject))
+    return matches
 
 
-def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Asked:
+def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Match:
     path = path.rstrip("/")
     text = repo.file_reader(str(snapshot.commit))(path)
     key = snapshot.keys.get(path)
     if key is not None:
-        return _Asked("claim", key.demand, path, subject=key.subject)
+        return _Match("claim", key.demand, path, subject=key.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
     release = explanation.release_named(snapshot.state.ledger, snapshot.state.config, name)
     if release is not None and path_of(release) == path:
-        return _Asked("release", name, path, release)
+        return _Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
-        raise StateRepoError(f"{shown(path)} is no file of the state repo, and never was")
+        raise StateRepoError(f"{shown(path)} is not in the state repo and never was")
     if text is not None or not path.startswith(("clusters/", "ledger/")):
-        return _Asked("file", path, path)
-    return _Asked("claim" if claim_file.kind_of(path) else "release", name, path)
+        return _Match("file", path, path)
+    return _Match("claim" if claim_file.kind_of(path) else "release", name, path)
 
 
-def _denied(snapshot: Snapshot, asked: _Asked) -> dict[str, Any]:
-    """Return which override keeps a release from running that is asked for, if one does."""
-    if asked.kind != "release":
+def _denied(snapshot: Snapshot, match: _Match) -> dict[str, Any]:
+    """Return the override that denies a release, if there is one."""
+    if match.kind != "release":
         return {}
-    name = asked.path.rsplit("/", 1)[-1].removesuffix(".yaml")
+    name = match.path.rsplit("/", 1)[-1].removesuffix(".yaml")
     stopped = explanation.denied_release_named(snapshot.state.ledger, snapshot.state.config, name)
     return why_answer.denied(*stopped) if stopped else {}
 
 
-def _is_held(snapshot: Snapshot, asked: _Asked) -> bool:
-    return asked.subject is not None and bool(snapshot.state.ledger.claims_on(asked.subject))
+def _is_claimed(snapshot: Snapshot, match: _Match) -> bool:
+    return match.subject is not None and bool(snapshot.state.ledger.claims_on(match.subject))
 
 
 def _has_history(repo: Reader, snapshot: Snapshot, path: str) -> bool:

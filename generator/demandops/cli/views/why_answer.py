@@ -18,53 +18,55 @@ from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
 
-_PEOPLES_COMMITS = 5
+_MOST_CARRIED_OUT = 5
 
 
-def release(snapshot: Snapshot, found: Release) -> dict[str, Any]:
+def release(snapshot: Snapshot, running: Release) -> dict[str, Any]:
     """Return why a release runs."""
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    claims = explanation.claims_behind(without_suspended(ledger, config), found)
+    claims = explanation.claims_behind(without_suspended(ledger, config), running)
     return {
         "runs": True,
-        "what": describe_change(None, found, existed=False).description,
-        **_where(found),
+        "what": describe_change(None, running, existed=False).description,
+        **_where(running),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
         "claims": [_claim(claim, config) for claim in claims],
         "shaped_by": [
-            {"file": one.file, "entry": one.entry or None, "what": one.what}
-            for one in explanation.shaping_files(found, config)
+            {"file": each.file, "entry": each.entry or None, "what": each.what}
+            for each in explanation.shaping_files(running, config)
         ],
-        "overrides": [_override(one, effects) for one, effects in found.shaping.by],
+        "overrides": [_override(by, effects) for by, effects in running.shaping.by],
     }
 
 
-def denied(found: Release, by: Override) -> dict[str, Any]:
-    """Return what keeps a release from running that claims ask for."""
+def denied(stopped: Release, by: Override) -> dict[str, Any]:
+    """Return why a release does not run although claims request it."""
     return {
         "runs": False,
-        "what": describe_change(None, found, existed=False).description,
-        **_where(found),
+        "what": describe_change(None, stopped, existed=False).description,
+        **_where(stopped),
         "denied_by": _override(by, ("deny",)),
     }
 
 
-def subject(snapshot: Snapshot, found: Subject) -> dict[str, Any]:
-    """Return who holds an application or a connection, and what runs because of that."""
+def subject(snapshot: Snapshot, claimed: Subject) -> dict[str, Any]:
+    """Return the claims on an application or a connection, and the releases that it needs."""
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    claims = sorted(ledger.claims_on(found), key=lambda claim: claim.booked)
-    releases = explanation.releases_of(ledger, config, found)
+    claims = sorted(ledger.claims_on(claimed), key=lambda claim: claim.booked)
+    releases = explanation.releases_of(ledger, config, claimed)
     return {
         "runs": any(suspended_by(claim, config) is None for claim in claims),
-        "what": str(found),
+        "what": str(claimed),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
         "claims": [_claim(claim, config) for claim in claims],
-        "releases": [{"name": one.name, **_where(one), "file": path_of(one)} for one in releases],
+        "releases": [
+            {"name": each.name, **_where(each), "file": path_of(each)} for each in releases
+        ],
     }
 
 
 def commits(repo: Reader, path: str, commit: str, most: int) -> dict[str, Any]:
-    """Return which commits made a path what it is."""
+    """Return the commits that created, changed and removed a path."""
     history = repo.history(path, commit, most)
     return {
         "started": _commit(repo, history.started),
@@ -74,12 +76,12 @@ def commits(repo: Reader, path: str, commit: str, most: int) -> dict[str, Any]:
     }
 
 
-def _where(found: Release) -> dict[str, Any]:
+def _where(release: Release) -> dict[str, Any]:
     return {
-        "cluster": found.node.cluster,
-        "domain": found.domain.name,
-        "namespace": found.domain.namespace,
-        "node": found.node.id,
+        "cluster": release.node.cluster,
+        "domain": release.domain.name,
+        "namespace": release.domain.namespace,
+        "node": release.node.id,
     }
 
 
@@ -123,71 +125,71 @@ def _commit(repo: Reader, entry: LogEntry | None) -> dict[str, Any] | None:
         "summary": entry.summary,
         "why": entry.why or None,
         "carries_out": [
-            {"commit": one.commit, "author": one.author, "summary": one.summary}
-            for one in repo.behind(entry, _PEOPLES_COMMITS)
+            {"commit": each.commit, "author": each.author, "summary": each.summary}
+            for each in repo.behind(entry, _MOST_CARRIED_OUT)
         ],
     }
 
 
-def lines(found: dict[str, Any]) -> Iterator[str]:
-    """Yield an answer as people read it."""
-    at = found["commit"][:10]
-    told = f"{found['kind']} {found['name']}"
-    if not found["runs"]:
+def lines(answer: dict[str, Any]) -> Iterator[str]:
+    """Yield an answer as lines of text."""
+    at = answer["commit"][:10]
+    title = f"{answer['kind']} {answer['name']}"
+    if not answer["runs"]:
         word = "does not run"
-        if found["kind"] in ("file", "claim"):
-            word = "is gone" if found["stopped"] else "stands"
-        yield f"{told} {word} at {at}"
-        yield f"  file        {found['file']}"
-        if found.get("denied_by"):
-            yield f"  denied by   {_told_override(found['denied_by'])}"
-        if found.get("claims"):
-            yield from _claims(found)
-        yield from _history(found)
+        if answer["kind"] in ("file", "claim"):
+            word = "no longer exists" if answer["stopped"] else "exists"
+        yield f"{title} {word} at {at}"
+        yield f"  file        {answer['file']}"
+        if answer.get("denied_by"):
+            yield f"  denied by   {_override_text(answer['denied_by'])}"
+        if answer.get("claims"):
+            yield from _claims(answer)
+        yield from _history(answer)
         return
-    yield f"{told} runs at {at}"
-    yield f"  what        {found['what']}"
-    if "node" in found:
+    yield f"{title} runs at {at}"
+    yield f"  what        {answer['what']}"
+    if "node" in answer:
         yield (
-            f"  where       node {found['node']}, cluster {found['cluster']}, namespace "
-            f"{found['namespace']}, access domain {found['domain']}"
+            f"  where       node {answer['node']}, cluster {answer['cluster']}, namespace "
+            f"{answer['namespace']}, access domain {answer['domain']}"
         )
-    yield f"  file        {found['file']}"
-    for one in found.get("releases", ()):
-        yield f"  needs       {one['name']} on {one['node']} ({one['file']})"
-    yield from _claims(found)
-    if found.get("shaped_by"):
-        yield "shaped by"
-        for one in found["shaped_by"]:
-            entry = f" {one['entry']}" if one["entry"] else ""
-            yield f"  {one['file']}{entry}: {one['what']}"
-    if found.get("overrides"):
+    yield f"  file        {answer['file']}"
+    for each in answer.get("releases", ()):
+        yield f"  needs       {each['name']} on {each['node']} ({each['file']})"
+    yield from _claims(answer)
+    if answer.get("shaped_by"):
+        yield "configured by"
+        for each in answer["shaped_by"]:
+            entry = f" {each['entry']}" if each["entry"] else ""
+            yield f"  {each['file']}{entry}: {each['what']}"
+    if answer.get("overrides"):
         yield "overridden by"
-        yield from (f"  {_told_override(one)}" for one in found["overrides"])
-    yield from _history(found)
+        yield from (f"  {_override_text(each)}" for each in answer["overrides"])
+    yield from _history(answer)
 
 
-def _claims(found: dict[str, Any]) -> Iterator[str]:
-    yield "asked for by"
-    for claim in found["claims"]:
+def _claims(answer: dict[str, Any]) -> Iterator[str]:
+    yield "requested by"
+    for claim in answer["claims"]:
         since = claim["since"][:19].replace("T", " ")
         yield f"  {', '.join(claim['requesters'])} since {since} UTC, for {claim['subject']}"
         yield f"    demand {claim['demand']}, request '{claim['request']}'{_lease(claim)}"
         yield f"    {claim['file']}"
         if claim["suspended_by"]:
-            yield f"    suspended by {_told_override(claim['suspended_by'])}"
+            yield f"    suspended by {_override_text(claim['suspended_by'])}"
         if claim["kept_by"]:
-            yield f"    kept by {_told_override(claim['kept_by'])}"
+            yield f"    kept by {_override_text(claim['kept_by'])}"
             yield f"    to release it: {claim['release_by']} by pull request"
         else:
             yield f"    to release it: {claim['release_by']}, or delete that file by pull request"
 
 
-def _told_override(one: dict[str, Any]) -> str:
-    until = f", until {one['until'][:19].replace('T', ' ')} UTC" if one["until"] else ""
+def _override_text(override: dict[str, Any]) -> str:
+    until = f", until {override['until'][:19].replace('T', ' ')} UTC" if override["until"] else ""
     return (
-        f"{one['file']}: {', '.join(one['effects'])} (priority {one['priority']}{until}), of "
-        f"{one['owner']}: {one['reason']}"
+        f"{override['file']}: {', '.join(override['effects'])} (priority "
+        f"{override['priority']}{until}), of {override['owner']}: {override['reason']}"
     )
 
 
@@ -198,26 +200,26 @@ def _lease(claim: dict[str, Any]) -> str:
     return f", lease of {claim['lease']['seconds']} s until {until} UTC"
 
 
-def _history(found: dict[str, Any]) -> Iterator[str]:
-    if found["stopped"]:
+def _history(answer: dict[str, Any]) -> Iterator[str]:
+    if answer["stopped"]:
         yield "stopped by"
-        yield from _told(found["stopped"], why=True)
-    if found["changes"]:
+        yield from _commit_lines(answer["stopped"], why=True)
+    if answer["changes"]:
         yield "changed by"
-        for entry in found["changes"]:
-            yield from _told(entry, why=False)
-    if found["more_changes"]:
-        yield f"  and {found['more_changes']} more before (-n); git log -- {found['file']}"
-    if found["started"]:
+        for entry in answer["changes"]:
+            yield from _commit_lines(entry, why=False)
+    if answer["more_changes"]:
+        yield f"  and {answer['more_changes']} earlier ones: -n, or git log -- {answer['file']}"
+    if answer["started"]:
         yield "started by"
-        yield from _told(found["started"], why=True)
+        yield from _commit_lines(answer["started"], why=True)
 
 
-def _told(entry: dict[str, Any], *, why: bool) -> Iterator[str]:
+def _commit_lines(entry: dict[str, Any], *, why: bool) -> Iterator[str]:
     when = entry["time"][:19].replace("T", " ")
     word = entry["operation"] or "by hand"
     yield f"  {entry['commit'][:10]} {when} UTC  {word}, {entry['author']}: {entry['summary']}"
     if why and entry["why"]:
         yield f"    {entry['why']}"
-    for one in entry["carries_out"]:
-        yield f"    carries out {one['commit'][:10]} by {one['author']}: {one['summary']}"
+    for each in entry["carries_out"]:
+        yield f"    carries out {each['commit'][:10]} by {each['author']}: {each['summary']}"

@@ -1,0 +1,78 @@
+"""The layout of the packages: names, sizes of folders, the list in `pyproject.toml`."""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+from demandops.cli import main
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = (ROOT / "generator" / "demandops", ROOT / "ros_bridge" / "demandops_ros")
+MODULES = sorted(path for package in PACKAGES for path in package.rglob("*.py"))
+MOST_MODULES = 12
+
+SAME_NAME = {
+    "__init__": "every package has one",
+    "flux": "render/gitops writes Flux's files, cluster/health reads Flux's objects",
+    "argocd": "render/gitops writes Argo CD's files, cluster/health reads Argo CD's objects",
+}
+"""The module names that may occur more than once, and why."""
+
+COMMANDS = PACKAGES[0] / "cli"
+"""A module here has the name of its command, whatever other rooms have."""
+
+
+def dotted(path: Path) -> str:
+    (source,) = (package.parent for package in PACKAGES if path.is_relative_to(package))
+    return ".".join(path.relative_to(source).parts)
+
+
+def setuptools() -> dict[str, Any]:
+    return dict(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"])
+
+
+def test_the_wheel_has_every_package() -> None:
+    packages = {dotted(path.parent) for path in MODULES if path.name == "__init__.py"}
+    data = {name for name in setuptools()["package-dir"] if "._data." in name}
+    listed = setuptools()["packages"]
+    assert len(listed) == len(set(listed))
+    assert set(listed) == packages | data
+
+
+def test_every_folder_with_modules_is_a_package() -> None:
+    assert [path for path in MODULES if not path.with_name("__init__.py").exists()] == []
+
+
+def test_data_packages_are_folders_of_the_repository() -> None:
+    folders = setuptools()["package-dir"].values()
+    assert [folder for folder in folders if not (ROOT / folder).is_dir()] == []
+
+
+def test_a_module_name_occurs_once() -> None:
+    by_name: defaultdict[str, list[str]] = defaultdict(list)
+    for path in MODULES:
+        is_command = path.is_relative_to(COMMANDS) and path.stem in main.COMMANDS
+        if path.stem not in SAME_NAME and not is_command:
+            by_name[path.stem].append(dotted(path))
+    assert {name: paths for name, paths in by_name.items() if len(paths) > 1} == {}
+
+
+@pytest.mark.parametrize("name", sorted(SAME_NAME))
+def test_an_allowed_name_still_occurs_more_than_once(name: str) -> None:
+    assert sum(path.stem == name for path in MODULES) > 1
+
+
+def test_a_folder_has_at_most_twelve_modules() -> None:
+    count: defaultdict[str, int] = defaultdict(int)
+    for path in MODULES:
+        count[dotted(path.parent)] += path.stem != "__init__"
+    assert {name: number for name, number in count.items() if number > MOST_MODULES} == {}

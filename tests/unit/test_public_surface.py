@@ -1,0 +1,190 @@
+"""The public surface is `public_surface.yaml`. A change of that file is a change for users.
+
+Everything else is internal. `docs/public-api.md` is the same list for people.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import click
+import demandops
+import demandops_ros
+import pytest
+import yaml
+from demandops import settings
+from demandops.cli import main
+from demandops.cli.repo.schema import SCHEMAS
+
+ROOT = Path(__file__).parents[2]
+INTERFACES = ROOT / "ros_bridge" / "interfaces"
+PAGE = (ROOT / "docs" / "public-api.md").read_text()
+PUBLIC = yaml.safe_load(Path(__file__).with_name("public_surface.yaml").read_text())
+
+Json = dict[str, Any]
+
+
+def commands() -> Json:
+    return {name: parameters(main.load(name)) for name in main.COMMANDS}
+
+
+def parameters(command: click.Command) -> list[str]:
+    return [parameter(each) for each in command.params]
+
+
+def parameter(each: click.Parameter) -> str:
+    if isinstance(each, click.Argument):
+        return str(each.metavar)
+    assert isinstance(each, click.Option)
+    choices = each.type.choices if isinstance(each.type, click.Choice) else ()
+    value = "|".join(choices) or each.metavar or each.type.name.upper()
+    text = " ".join(each.opts if each.is_flag else [*each.opts, value])
+    return f"{text} [env: {each.envvar}]" if each.envvar else text
+
+
+def client() -> Json:
+    return {name: members(getattr(demandops_ros, name)) for name in demandops_ros.__all__}
+
+
+def members(exported: Any) -> Json | str:
+    """Return the documented constructor, methods and fields of a class."""
+    if not inspect.isclass(exported):
+        return "type"
+    names = ["__init__"] if getattr(vars(exported).get("__init__"), "__doc__", None) else []
+    names += [name for name in vars(exported) if not name.startswith("_")]
+    return {name: arguments(getattr(exported, name)) for name in names}
+
+
+def arguments(member: Any) -> str:
+    if not inspect.isfunction(member):
+        return "field"
+    signature = inspect.signature(member)
+    bare = [
+        each.replace(
+            annotation=inspect.Parameter.empty,
+            default=... if inspect.isfunction(each.default) else each.default,
+        )
+        for each in list(signature.parameters.values())[1:]
+    ]
+    return str(inspect.Signature(bare))
+
+
+def interfaces() -> Json:
+    suffixes = (".action", ".msg", ".srv")
+    files = sorted(path for path in INTERFACES.rglob("*.*") if path.suffix in suffixes)
+    return {
+        f"{path.relative_to(INTERFACES).parts[0]}/{path.stem}": fields_of_interface(path)
+        for path in files
+    }
+
+
+def fields_of_interface(path: Path) -> list[str]:
+    lines = (line.partition("#")[0].split() for line in path.read_text().splitlines())
+    return [" ".join(words) for words in lines if words]
+
+
+def files() -> Json:
+    return {
+        name: fields_of_schema(model.model_json_schema()) for name, (model, _) in SCHEMAS.items()
+    }
+
+
+def fields_of_schema(schema: Json) -> Json:
+    """Return the names of fields by the path of the mapping that has them."""
+    found: dict[str, list[str]] = {}
+    for parent, name in walk(schema, schema.get("$defs", {}), ""):
+        names = found.setdefault(parent or "(top)", [])
+        if name not in names:
+            names.append(name)
+    return {parent: " ".join(names) for parent, names in found.items()}
+
+
+def walk(schema: Json, definitions: Json, path: str) -> Iterator[tuple[str, str]]:
+    if "$ref" in schema:
+        schema = definitions[schema["$ref"].rsplit("/", 1)[-1]]
+    for kind in ("anyOf", "oneOf", "allOf"):
+        for each in schema.get(kind, ()):
+            yield from walk(each, definitions, path)
+    for name, each in schema.get("properties", {}).items():
+        constant = each.get("const")
+        yield path, f"{name}={constant}" if constant else name
+        yield from walk(each, definitions, f"{path}.{name}".lstrip("."))
+    if isinstance(schema.get("items"), dict):
+        yield from walk(schema["items"], definitions, f"{path}[]")
+    patterns = schema.get("patternProperties", {}).values()
+    for each in (schema.get("additionalProperties"), *patterns):
+        if isinstance(each, dict):
+            yield from walk(each, definitions, f"{path}.*")
+
+
+def claim_files() -> Json:
+    """Return the top-level fields of the claims in the golden folders."""
+    found: dict[str, set[str]] = {}
+    for path in ROOT.glob("tests/golden/*/expected/**/ledger/**/*.yaml"):
+        claim = yaml.safe_load(path.read_text())
+        found.setdefault(f"{claim['apiVersion']} {claim['kind']}", set()).update(claim)
+    return {kind: " ".join(sorted(names)) for kind, names in sorted(found.items())}
+
+
+def environment() -> list[str]:
+    sources = (ROOT / "generator").rglob("*.py"), (ROOT / "ros_bridge/demandops_ros").rglob("*.py")
+    texts = [path.read_text() for paths in sources for path in paths]
+    return sorted({name for text in texts for name in re.findall(r"\bDEMANDOPS_[A-Z_]+\b", text)})
+
+
+def exit_codes() -> Json:
+    return {each.name: each.value for each in main.ExitCode}
+
+
+SECTIONS: dict[str, Callable[[], object]] = {
+    "options": lambda: parameters(main.cli),
+    "commands": commands,
+    "exit codes": exit_codes,
+    "environment": environment,
+    "client": client,
+    "ROS interfaces": interfaces,
+    "files": files,
+    "claim files": claim_files,
+}
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_the_public_surface_is_the_listed_one(section: str) -> None:
+    if section in ("commands", "client"):
+        pytest.importorskip("rclpy")
+    assert SECTIONS[section]() == PUBLIC[section]
+
+
+def test_every_section_is_listed() -> None:
+    assert list(PUBLIC) == list(SECTIONS)
+
+
+def test_the_package_exports_its_version_alone() -> None:
+    names = {name for name, value in vars(demandops).items() if not isinstance(value, ModuleType)}
+    assert {name for name in names if not name.startswith("_")} == set()
+    assert demandops.__all__ == ["__version__"]
+
+
+def test_people_find_everything_in_the_documentation() -> None:
+    listed = {word for text in re.findall(r"`([^`]+)`", PAGE) for word in text.split()}
+    interface_names = {name.split("/")[1] for name in PUBLIC["ROS interfaces"]}
+    kinds = {text for kind in PUBLIC["claim files"] for text in kind.split()}
+    names = {*PUBLIC["commands"], *PUBLIC["environment"], *PUBLIC["client"], *PUBLIC["files"]}
+    names |= {
+        *map(str, PUBLIC["exit codes"].values()),
+        *interface_names,
+        *kinds,
+        settings.API_VERSION,
+    }
+    assert names - listed == set()
+
+
+if __name__ == "__main__":  # writes the listing anew; review the difference
+    listing = {name: section() for name, section in SECTIONS.items()}
+    text = yaml.safe_dump(listing, sort_keys=False, width=100, allow_unicode=True)
+    Path(__file__).with_name("public_surface.yaml").write_text(text)
