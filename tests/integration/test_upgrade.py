@@ -23,7 +23,7 @@ from asking import perception
 from demandops.errors import StateRepoError
 from demandops.service import Generator
 from demandops.staterepo import upgrade
-from demandops.staterepo.git import clone
+from demandops.staterepo.git import remote_repository
 
 Run = Callable[..., Any]
 StateRepo = Any
@@ -327,14 +327,14 @@ def test_a_url_is_pushed_to_and_tried_again_when_somebody_was_first(
     demandops: Run, state: StateRepo, book: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert book().code == 0
-    push, others = clone.ClonedRepository.publish, []
+    push, others = remote_repository.RemoteRepository.publish, []
 
     def after_somebody_else(self: Any, expected: Any, commit: Any) -> bool:
         if not others:
             others.append(state.commit({"README.md": "Ours.\n"}))
         return push(self, expected, commit)
 
-    monkeypatch.setattr(clone.ClonedRepository, "publish", after_somebody_else)
+    monkeypatch.setattr(remote_repository.RemoteRepository, "publish", after_somebody_else)
     url = f"file://{state.path}"
     ran = demandops("upgrade", "--state-repo", url, "--gitops", "argocd", "--output", "json")
     assert ran.json()["commit"] == state.tip
@@ -348,7 +348,7 @@ def test_a_state_repo_that_never_stands_still_is_told(
     state: StateRepo, monkeypatch: pytest.MonkeyPatch, upgraded: Callable[..., Ran]
 ) -> None:
     monkeypatch.setattr(upgrade, "_PAUSE_S", 0)
-    monkeypatch.setattr(upgrade.Line, "publish", lambda self: False)
+    monkeypatch.setattr(upgrade.CommitBatch, "publish", lambda self: False)
     before = state.tip
     ran = upgraded("--gitops", "argocd")
     assert (ran.code, state.tip) == (1, before)

@@ -24,7 +24,7 @@ from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_line
+from demandops.staterepo.write import commit_batch
 
 log = logging.getLogger("demandops")
 
@@ -47,7 +47,7 @@ class Evaluator:
 
     def __call__(
         self,
-        line: commit_line.CommitLine,
+        line: commit_batch.CommitBatch,
         ticket: Ticket,
         arrived: dict[str, commit_log.Arrival],
         earlier: list[Result],
@@ -113,7 +113,7 @@ class Evaluator:
         return found
 
 
-def _commit(line: commit_line.CommitLine, ticket: Ticket, decision: Decision) -> Receipt:
+def _commit(line: commit_batch.CommitBatch, ticket: Ticket, decision: Decision) -> Receipt:
     if decision.files:
         commit = line.commit(decision, ticket.operation, ticket.received, _now())
         ticket.tell("committed", f"committed {commit}")

@@ -17,7 +17,7 @@ from demandops.service.demand_queue import DemandQueue
 from demandops.service.timing.polling import Contact, Link, PollTimer
 from demandops.staterepo.git.repository import CutShort, StateRepository
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_line
+from demandops.staterepo.write import commit_batch
 
 log = logging.getLogger("demandops")
 
@@ -47,8 +47,8 @@ class Follower:
         repository: StateRepository,
         waiting: DemandQueue,
         fetch_interval: float,
-        line: Callable[[], commit_line.CommitLine],
-        taken: Callable[[commit_line.CommitLine], None],
+        line: Callable[[], commit_batch.CommitBatch],
+        taken: Callable[[commit_batch.CommitBatch], None],
     ) -> None:
         """Make it.
 

@@ -19,7 +19,7 @@ from demandops.service.worker import Worker
 from demandops.staterepo.git import connect
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.load.snapshot import Progress, Snapshot
-from demandops.staterepo.write import commit_line
+from demandops.staterepo.write import commit_batch
 from demandops.staterepo.write.journal import Slot
 
 log = logging.getLogger("demandops")
@@ -63,7 +63,7 @@ class Generator:
         try:
             repository = connect.connect(state_repo, self._slot.folder, log.info, patient=patient)
             repository.signer = signer
-            snapshot = commit_line.first_snapshot(repository, progress)
+            snapshot = commit_batch.first_snapshot(repository, progress)
         except BaseException:
             self._slot.close()
             raise

@@ -25,10 +25,10 @@ from demandops.staterepo.history import commit_log, path_history, revisions
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.history.path_history import PathHistory
 from demandops.staterepo.load import (
-    effective_config,
+    in_force_trailers,
     last_valid_config,
     problem_report,
-    rollback_source,
+    rollback_target,
 )
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
@@ -108,7 +108,7 @@ class Reader:
         commit = trees.commit_of(self._repository.objects, self.commit(revision))
         told = self._told_at(commit)
         if told is not None and told.one("In-Force"):
-            return effective_config.at(self._repository.objects, commit, told)
+            return in_force_trailers.at(self._repository.objects, commit, told)
         return snapshots.load(self._repository.objects, commit.id, progress)
 
     def _told_at(self, commit: Commit) -> LogEntry | None:
@@ -253,15 +253,15 @@ class Reader:
 
     def restoration(self, to: str, **more: object) -> Restoration:
         """Return the request to go back to a commit."""
-        return rollback_source.restoration(self._repository.objects, to, **more)
+        return rollback_target.restoration(self._repository.objects, to, **more)
 
     def configured_since(self, commit: str) -> list[str]:
         """Return the files of people that are not what they were at a commit."""
-        return rollback_source.configured_since(self._repository.objects, commit, self._tip)
+        return rollback_target.configured_since(self._repository.objects, commit, self._tip)
 
     def person(self) -> tuple[str, str]:
         """Return name and e-mail address of who runs this."""
-        return rollback_source.person(self._repository.objects)
+        return rollback_target.person(self._repository.objects)
 
 
 @contextmanager

@@ -37,7 +37,7 @@ from demandops.staterepo.history import commit_log, commit_message
 from demandops.staterepo.load import last_valid_config
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
-from demandops.staterepo.write.commit_line import CommitLine
+from demandops.staterepo.write.commit_batch import CommitBatch
 
 _ATTEMPTS = 10
 _PAUSE_S = 0.1
@@ -123,10 +123,10 @@ def upgrade(
 
 def _planned(
     repository: StateRepository, wish: UpgradeRequest, now: datetime, progress: Progress
-) -> tuple[Upgrade, CommitLine, TakenIn]:
+) -> tuple[Upgrade, CommitBatch, TakenIn]:
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
-    line, old = CommitLine(repository, snapshot), snapshot.state.config
+    line, old = CommitBatch(repository, snapshot), snapshot.state.config
     tree = trees.commit_of(objects, tip).tree
     files = trees.texts(tree, CONFIG_ROOTS)
     before = files[ROOT_FILE]

@@ -34,7 +34,7 @@ from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.history.commit_log import Arrival
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_line
+from demandops.staterepo.write import commit_batch
 from demandops.staterepo.write.proposal_branch import BranchMoved, Heads, branch_of
 
 log = logging.getLogger("demandops")
@@ -272,7 +272,7 @@ class Approvals:
         It is booked where main's history has its operation, or main's books hold what it asks: a
         squash may lose the trailer, and never the claims.
         """
-        read = commit_line.CommitLine(self._repository, snapshot).read
+        read = commit_batch.CommitBatch(self._repository, snapshot).read
         decision: Decision | DemandOpsError
         try:
             decision = decide(snapshot.state, ticket.goal, ticket.received, read)

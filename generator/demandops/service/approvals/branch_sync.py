@@ -21,7 +21,7 @@ from demandops.service.demand_queue import DemandQueue
 from demandops.service.ticket import Record, Ticket
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_line
+from demandops.staterepo.write import commit_batch
 from demandops.staterepo.write.proposal_branch import Branches, Heads, gitlab_options
 
 log = logging.getLogger("demandops")
@@ -135,7 +135,7 @@ class BranchSync:
         self, left: list[tuple[Ticket, Decision]], snapshot: Snapshot
     ) -> tuple[list[tuple[Ticket, Decision]], list[tuple[Ticket, DemandOpsError]]]:
         """Judge what is left one after the other, with leases that count from the approval."""
-        line = commit_line.CommitLine(self._repository, snapshot)
+        line = commit_batch.CommitBatch(self._repository, snapshot)
         state, written = snapshot.state, dict[str, str | None]()
         steps, faulty = list[tuple[Ticket, Decision]](), list[tuple[Ticket, DemandOpsError]]()
 
@@ -163,7 +163,7 @@ class BranchSync:
         head: str,
     ) -> bool:
         """Commit the demands on main as it is and put the branch there; false where one goes."""
-        line = commit_line.CommitLine(self._repository, snapshot)
+        line = commit_batch.CommitBatch(self._repository, snapshot)
         now = datetime.now(timezone.utc)
         for ticket, step in steps:
             if step.files:

@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from demandops.config.config import Config
 from demandops.errors import InvalidInput
 from demandops.plan.overrides.lifecycle import due
-from demandops.staterepo.write.commit_line import CommitLine
+from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
@@ -23,7 +23,7 @@ class OverrideClock:
         self._failed: dict[tuple[str, datetime], datetime] = {}
         self._not_before: datetime | None = None
 
-    def end(self, line: CommitLine, now: datetime) -> None:
+    def end(self, line: CommitBatch, now: datetime) -> None:
         """Commit on a line that what is over has ended; what cannot be carried out stays."""
         for override in due(line.head.state.config, now):
             tried = self._failed.get((override.name, override.end or now))

@@ -33,7 +33,7 @@ from demandops.staterepo.audit import allowed_changes
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import LogEntry, entry_of
 from demandops.staterepo.history.commit_message import PROPOSAL
-from demandops.staterepo.load import effective_config
+from demandops.staterepo.load import in_force_trailers
 
 _CHARTS = "/_charts/"
 
@@ -180,7 +180,7 @@ class _Row:
 
     def _loaded(self, commit: Commit, entry: LogEntry) -> State:
         try:
-            return effective_config.at(self._repo, commit, entry).state
+            return in_force_trailers.at(self._repo, commit, entry).state
         except InvalidInput as error:
             raise _Unreadable(error.faults[0]) from None
 

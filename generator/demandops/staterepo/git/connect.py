@@ -10,8 +10,8 @@ from pathlib import Path
 
 from demandops.errors import StateRepoError
 from demandops.staterepo.git.address import check_url, is_url
-from demandops.staterepo.git.bare import BareRepository
-from demandops.staterepo.git.clone import ClonedRepository, Say
+from demandops.staterepo.git.local_repository import LocalRepository
+from demandops.staterepo.git.remote_repository import RemoteRepository, Say
 from demandops.staterepo.git.repository import StateRepository
 
 
@@ -31,10 +31,10 @@ def connect(
     """
     if is_url(address):
         check_url(address)
-        return ClonedRepository(address, folder / "clone.git", say, patient)
+        return RemoteRepository(address, folder / "clone.git", say, patient)
     path = Path(address).expanduser()
     if not path.is_dir():
         raise StateRepoError(
             f"{address} does not exist; make a state repo with `demandops init {address} --bare`"
         )
-    return BareRepository(path)
+    return LocalRepository(path)

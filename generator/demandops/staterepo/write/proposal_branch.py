@@ -20,7 +20,7 @@ from pygit2 import Oid, Repository
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.clone import ClonedRepository
+from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import MAIN, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
@@ -57,7 +57,7 @@ class Branches:
 
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository
-        self._remote = repository if isinstance(repository, ClonedRepository) else None
+        self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> Heads:
         """Ask where the branches are now.
@@ -217,11 +217,11 @@ def waiting(repository: StateRepository) -> Iterator[PendingProposal]:
     Raises:
         RemoteAway: where the remote does not answer.
     """
-    if isinstance(repository, ClonedRepository):
+    if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
     repo = Repository(repository.objects.path)
     space = f"refs/remotes/origin/{PREFIX}"
-    if not isinstance(repository, ClonedRepository):
+    if not isinstance(repository, RemoteRepository):
         space = f"{_HEADS}{PREFIX}"
     main = repository.tip()
     for name in sorted(name for name in repo.references if name.startswith(space)):

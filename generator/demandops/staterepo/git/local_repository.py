@@ -20,7 +20,7 @@ _STALE_LOCK_S = 5.0
 log = logging.getLogger("demandops")
 
 
-class BareRepository(StateRepository):
+class LocalRepository(StateRepository):
     """A bare repository on this disk, written in place and fsynced."""
 
     def __init__(self, path: Path) -> None:

@@ -32,7 +32,12 @@ from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.history import authorship, commit_log, commit_message
-from demandops.staterepo.load import effective_config, last_valid_config, problem_report, quarantine
+from demandops.staterepo.load import (
+    in_force_trailers,
+    last_valid_config,
+    problem_report,
+    quarantine,
+)
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Advance, Progress, Snapshot
 
@@ -40,7 +45,7 @@ _ATTEMPTS = 5
 _PAUSE_S = 0.02
 
 
-class CommitLine:
+class CommitBatch:
     """Commits made on top of one published tip, in the order of the demands."""
 
     def __init__(self, repository: StateRepository, start: Snapshot) -> None:
@@ -68,7 +73,7 @@ class CommitLine:
         Args:
             proposal: the branch that it awaits approval on; nothing where it needs none.
         """
-        more = [*self._settled, *effective_config.trailers(self.head)]
+        more = [*self._settled, *in_force_trailers.trailers(self.head)]
         if proposal:
             more.append((commit_message.PROPOSAL, proposal))
         text = commit_message.of_decision(decision, operation, received, more)
@@ -146,7 +151,7 @@ class CommitLine:
                 [
                     *commit_message.of_overrides(overrides),
                     *authorship.trailers(causes),
-                    *effective_config.trailers(self.head),
+                    *in_force_trailers.trailers(self.head),
                 ],
             )
             made = self._write(files, text, authorship.author(causes, now), now)
@@ -185,7 +190,7 @@ class CommitLine:
         taken = ended(_books(state), override, now)
         state = _with(state, taken)
         change = self.everything(state, taken.files)
-        more = effective_config.trailers(self.head)
+        more = in_force_trailers.trailers(self.head)
         text = commit_message.of_ended(override, change.releases, taken.keys, more)
         made = self._write(change.files, text, commit_message.generator_signature(now), now)
         self.head = self.head.after(made, state, taken.keys)
@@ -319,5 +324,5 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
     made = trees.commit_of(repository.objects, base)
     told = commit_log.entry_of(made)
     if told.one("In-Force"):
-        return effective_config.at(repository.objects, made, told)
+        return in_force_trailers.at(repository.objects, made, told)
     return snapshots.load_last_valid(repository.objects, base, progress)

@@ -43,7 +43,7 @@ Say = Callable[[str], None]
 log = logging.getLogger("demandops")
 
 
-class ClonedRepository(StateRepository):
+class RemoteRepository(StateRepository):
     """A bare clone of a remote; clone, fetch and push run git itself, with the user's set-up."""
 
     def __init__(self, url: str, folder: Path, say: Say, patient: bool) -> None:
