@@ -67,7 +67,7 @@ class Worker:
         """Stop waiting for a remote that is away; from any thread."""
         self._giving_up.set()
         self.follower.give_up()
-        self._repository.give_up()
+        self._repository.abort()
         self._waiting.wake()
 
     def take_up(self, batch: list[Ticket]) -> None:

@@ -33,7 +33,7 @@ from demandops.staterepo.load import (
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.write.journal import Slot
-from demandops.staterepo.write.proposal_branch import PendingProposal, waiting
+from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
 
 
 class Reader:
@@ -67,14 +67,14 @@ class Reader:
         """The state repo itself, for a command that writes to it."""
         return self._repository
 
-    def refuse_other_rendering(self) -> None:
+    def refuse_other_render_version(self) -> None:
         """Raise where a generator of another version writes this repo, as a generator does.
 
         Raises:
             StateRepoError: saying which version it is and what to do.
         """
         tip = trees.commit_of(self._repository.objects, self._tip)
-        last_valid_config.refuse_other_rendering(tip.tree)
+        last_valid_config.refuse_other_render_version(tip.tree)
 
     def commit(self, revision: str | None = None) -> str:
         """Return the id of a commit, by a revision or a time; the newest where none is given.
@@ -106,14 +106,14 @@ class Reader:
             InvalidInput, StateRepoError: where it holds no valid state repo.
         """
         commit = trees.commit_of(self._repository.objects, self.commit(revision))
-        told = self._told_at(commit)
-        if told is not None and told.one("In-Force"):
-            return in_force_trailers.at(self._repository.objects, commit, told)
+        told = self._generator_record(commit)
+        if told is not None and told.first("In-Force"):
+            return in_force_trailers.snapshot_at(self._repository.objects, commit, told)
         return snapshots.load(self._repository.objects, commit.id, progress)
 
-    def _told_at(self, commit: Commit) -> LogEntry | None:
+    def _generator_record(self, commit: Commit) -> LogEntry | None:
         """Return the generator's newest commit up to one: it says what is in force."""
-        base = commit_log.last_generated(self._repository.objects, commit.id)
+        base = commit_log.last_generator_commit(self._repository.objects, commit.id)
         if base is None:
             return None
         return commit_log.entry_of(trees.commit_of(self._repository.objects, base))
@@ -127,7 +127,9 @@ class Reader:
         told = self.file_reader(str(snapshot.commit))(problem_report.PATH)
         return problem_report.read(told) or snapshot.problems
 
-    def last_valid(self, revision: str, progress: Progress = lambda done, total: None) -> Snapshot:
+    def last_valid_snapshot(
+        self, revision: str, progress: Progress = lambda done, total: None
+    ) -> Snapshot:
         """Load what is in force at a commit, whether or not the generator has been there since.
 
         Of what is not valid there it is the last version that was; the problems are told.
@@ -161,19 +163,19 @@ class Reader:
         Raises:
             RemoteAway: where the remote does not answer.
         """
-        return list(waiting(self._repository))
+        return list(pending_proposals(self._repository))
 
     def log(self, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
         since, until = self._sides(spec or "")
         yield from commit_log.walk(self._repository.objects, until, since)
 
-    def touching(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
+    def commits_changing(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield those commits that changed a file or folder."""
         since, until = self._sides(spec or "")
         objects = self._repository.objects
         known = {one.commit for one in commit_log.walk(objects, until, since)} if since else None
-        for touch in path_history.touching(objects, until, path):
+        for touch in path_history.changes_to(objects, until, path):
             if known is None or touch.entry.commit in known:
                 yield touch.entry
 
@@ -216,36 +218,36 @@ class Reader:
         for verdict in verification.verify(objects, commits, whole=whole):
             verdicts.append(verdict)
             progress(len(verdicts), len(commits))
-        return commit_signatures.checked(objects, verdicts)
+        return commit_signatures.with_signatures(objects, verdicts)
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
         """Return how a file or folder came to what it is at a commit."""
-        return path_history.of_path(self._repository.objects, revision, path, most)
+        return path_history.history_of(self._repository.objects, revision, path, most)
 
-    def path_called(self, name: str, revision: str) -> str | None:
+    def release_path(self, name: str, revision: str) -> str | None:
         """Return the path of a release, or of the last one of that name, which was stopped."""
         objects = self._repository.objects
-        standing = path_history.called(objects, revision, name)
-        return standing or path_history.once_called(objects, revision, name)
+        standing = path_history.release_path(objects, revision, name)
+        return standing or path_history.stopped_release_path(objects, revision, name)
 
-    def ever_stopped(self, revision: str) -> set[str]:
+    def stopped_release_names(self, revision: str) -> set[str]:
         """Return the names of all releases that were stopped at some time."""
-        return path_history.ever_stopped(self._repository.objects, revision)
+        return path_history.stopped_release_names(self._repository.objects, revision)
 
-    def differing(self, before: str, after: str, root: str) -> dict[str, bool]:
+    def changed_files(self, before: str, after: str, root: str) -> dict[str, bool]:
         """Return the files below a folder that differ between two commits, and which are left."""
         objects = self._repository.objects
         sides = [trees.commit_of(objects, revision).tree for revision in (before, after)]
-        found = trees.below_root(objects, sides[0], sides[1], root)
+        found = trees.differences_below(objects, sides[0], sides[1], root)
         return {path: blob is not None for path, blob in found}
 
-    def concerns(self, commit: str, node: str) -> bool:
+    def changes_node(self, commit: str, node: str) -> bool:
         """Tell whether a commit changed what runs on a node, or a claim that names it."""
-        return path_history.concerns(self._repository.objects, commit, node)
+        return path_history.changes_node(self._repository.objects, commit, node)
 
-    def behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
+    def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
         """Return the commits of people that a commit carries out, newest first."""
-        since, follows = entry.one("Since"), entry.one("Follows")
+        since, follows = entry.first("Since"), entry.first("Follows")
         if not (since and follows):
             return []
         walked = commit_log.walk(self._repository.objects, follows, since)
@@ -255,11 +257,13 @@ class Reader:
         """Return the request to go back to a commit."""
         return rollback_target.restoration(self._repository.objects, to, **more)
 
-    def configured_since(self, commit: str) -> list[str]:
+    def config_files_changed_since(self, commit: str) -> list[str]:
         """Return the files of people that are not what they were at a commit."""
-        return rollback_target.configured_since(self._repository.objects, commit, self._tip)
+        return rollback_target.config_files_changed_since(
+            self._repository.objects, commit, self._tip
+        )
 
-    def person(self) -> tuple[str, str]:
+    def git_user(self) -> tuple[str, str]:
         """Return name and e-mail address of who runs this."""
         return rollback_target.person(self._repository.objects)
 

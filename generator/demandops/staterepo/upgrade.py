@@ -69,21 +69,24 @@ class Upgrade:
 
 
 def plan(
-    address: str, wish: UpgradeRequest, now: datetime, progress: Progress = lambda done, total: None
+    address: str,
+    request: UpgradeRequest,
+    now: datetime,
+    progress: Progress = lambda done, total: None,
 ) -> Upgrade:
     """Return what an upgrade would change; nothing is written.
 
     Raises:
-        InvalidInput: where the state repo is not valid or the wish cannot be fulfilled.
+        InvalidInput: where the state repo is not valid or the request cannot be fulfilled.
         StateRepoError: where it cannot be read.
     """
     with reader.opened(address) as repo:
-        return _planned(repo.repository, wish, now, progress)[0]
+        return _planned(repo.repository, request, now, progress)[0]
 
 
 def upgrade(
     address: str,
-    wish: UpgradeRequest,
+    request: UpgradeRequest,
     now: datetime,
     progress: Progress = lambda done, total: None,
     signer: Signer | None = None,
@@ -92,25 +95,27 @@ def upgrade(
 
     Args:
         address: a folder with a bare repository, or a URL that git clones.
-        wish: which controller the state repo is for.
+        request: which controller the state repo is for.
         now: the time of the commit.
         progress: told (files read, files in all) while the ledger is read.
         signer: signs the commit, if given.
 
     Raises:
-        InvalidInput: where the state repo is not valid or the wish cannot be fulfilled.
+        InvalidInput: where the state repo is not valid or the request cannot be fulfilled.
         StateRepoError: where it cannot be read or written, or never stood still.
     """
     with reader.opened(address) as repo:
         repository = repo.repository
         repository.signer = signer
         for attempt in range(1, _ATTEMPTS + 1):
-            made, line, taken = _planned(repository, wish, now, progress)
+            made, line, taken = _planned(repository, request, now, progress)
             if not made.files:
                 return made
             author = _person(repository.objects, now)
             state = replace(line.head.state, ledger=taken.ledger, config=taken.config)
-            commit = line.record(made.files, state, _message(made, taken), author, now, taken.keys)
+            commit = line.commit_files(
+                made.files, state, _message(made, taken), author, now, taken.keys
+            )
             if line.publish():
                 return Upgrade(commit, made.old, made.new, made.files)
             time.sleep(_PAUSE_S * attempt * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
@@ -122,7 +127,7 @@ def upgrade(
 
 
 def _planned(
-    repository: StateRepository, wish: UpgradeRequest, now: datetime, progress: Progress
+    repository: StateRepository, request: UpgradeRequest, now: datetime, progress: Progress
 ) -> tuple[Upgrade, CommitBatch, TakenIn]:
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
@@ -130,15 +135,15 @@ def _planned(
     tree = trees.commit_of(objects, tip).tree
     files = trees.texts(tree, CONFIG_ROOTS)
     before = files[ROOT_FILE]
-    files[ROOT_FILE] = _root(before, old, wish)
-    marked = last_valid_config.markers_at(tree)
+    files[ROOT_FILE] = _root(before, old, request)
+    marked = last_valid_config.end_markers_at(tree)
     config = load(files).with_ended(ended_override_file.read(marked))
     state = State.of(config, snapshot.state.ledger)
     taken = _taken_in(repository, snapshot, state, marked, now)
     state = replace(state, ledger=taken.ledger, config=taken.config)
     if old.repository.gitops != config.repository.gitops:
         _refuse_held(state)
-    found = dict(line.everything(state, taken.files).files)
+    found = dict(line.render_all(state, taken.files).files)
     if files[ROOT_FILE] != before:
         found[ROOT_FILE] = files[ROOT_FILE]
     return Upgrade(str(tip), old, state.config, dict(sorted(found.items()))), line, taken
@@ -153,7 +158,7 @@ def _taken_in(
 ) -> TakenIn:
     """Return the books with what people changed since the generator's last commit taken in."""
     objects = repository.objects
-    last = commit_log.last_generated(objects, tip.commit)
+    last = commit_log.last_generator_commit(objects, tip.commit)
     before = tip.state if last is None else snapshots.load_last_valid(objects, last).state
     after = state.ledger
     keys = {claim.key for books in (before.ledger, after) for claim in books}
@@ -179,10 +184,10 @@ def _refuse_held(state: State) -> None:
         raise InvalidInput(faults)
 
 
-def _root(text: str, config: Config, wish: UpgradeRequest) -> str:
+def _root(text: str, config: Config, request: UpgradeRequest) -> str:
     """Return ``demandops.yaml`` as wished, with whatever else a person wrote in it."""
     repository = config.repository
-    gitops = wish.gitops or repository.gitops
+    gitops = request.gitops or repository.gitops
     try:
         if repository.render_version != RENDER_VERSION:
             text = strict_yaml.edited(text, "renderVersion", RENDER_VERSION)
@@ -192,8 +197,8 @@ def _root(text: str, config: Config, wish: UpgradeRequest) -> str:
         if section is None:
             # both fetch the same repo, so the one that stands says from where
             known = getattr(repository, repository.gitops)
-            text = strict_yaml.edited(text, gitops, {"url": wish.url or known.url})
-        elif wish.url not in (None, section.url):
+            text = strict_yaml.edited(text, gitops, {"url": request.url or known.url})
+        elif request.url not in (None, section.url):
             told = f"is {section.url} already; change it there, or leave out --url"
             raise InvalidInput([fault(f"{gitops}.url", told)])
     except InvalidInput as error:
@@ -235,7 +240,9 @@ def _message(made: Upgrade, taken: TakenIn) -> str:
         f"Gitops: {new.gitops}",
         *(
             f"{key}: {path}"
-            for key, path in commit_message.of_overrides(commit_message.keeping(taken.keys))
+            for key, path in commit_message.override_trailers(
+                commit_message.keep_override_paths(taken.keys)
+            )
         ),
         f"Render-Version: {new.render_version}",
     ]

@@ -24,7 +24,7 @@ from demandops.staterepo.git.local_repository import LocalRepository
 from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.write.commit_batch import CommitBatch
 from demandops.staterepo.write.journal import Journal
-from demandops.staterepo.write.proposal_branch import Branches
+from demandops.staterepo.write.proposal_branch import ProposalBranches
 
 Demand = dict[str, Any]
 
@@ -86,13 +86,13 @@ def arm(where: str) -> None:
         _after(RemoteRepository, "publish", at)
         _after(LocalRepository, "publish", at)
     elif point == "unanswered":
-        _after(Journal, "done", at)
+        _after(Journal, "mark_done", at)
     elif point == "proposing":
-        _before(Branches, "put", at)
+        _before(ProposalBranches, "put", at)
     elif point == "proposed":
-        _after(Branches, "put", at)
+        _after(ProposalBranches, "put", at)
     elif point == "retracting":
-        _before(Branches, "remove", at)
+        _before(ProposalBranches, "remove", at)
     elif point == "withdrawn":
         Lanes.withdrawn = staticmethod(at)  # type: ignore[method-assign]
     elif point:

@@ -214,7 +214,7 @@ def _rehearse(documents: list[_Document], state_repo: str, output: str) -> list[
     """Decide every request on top of the one before, in memory only."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as tell:
-        repo.refuse_other_rendering()
+        repo.refuse_other_render_version()
         state = repo.snapshot(progress=tell).state
         standing, written = repo.file_reader(), dict[str, str | None]()
 

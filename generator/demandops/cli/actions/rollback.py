@@ -72,11 +72,11 @@ def rollback(  # noqa: PLR0913, PLR0917 - one for each option
     if not (dry_run or (reason and reason.strip())):
         raise click.UsageError("say why: -m REASON")
     with reader.opened(state_repo) as repo:
-        wish = _Wish(repo.commit(revision), drop_newer, reason or "", repo.person())
+        wish = _Wish(repo.commit(revision), drop_newer, reason or "", repo.git_user())
         base = repo.commit()
         found: dict[str, Any] = {"to": wish.to, "outcome": "refused", "commit": None}
         found |= _consequence(None)
-        found |= {"configuration_since": repo.configured_since(wish.to), "errors": []}
+        found |= {"configuration_since": repo.config_files_changed_since(wish.to), "errors": []}
         try:
             found |= _rehearsed(repo, wish, base)
         except InvalidInput as error:
@@ -94,7 +94,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - one for each option
 def _rehearsed(repo: Reader, wish: _Wish, base: str) -> dict[str, Any]:
     """Decide the rollback on top of a commit, in memory only."""
     with progress("reading the ledger") as tell:
-        state = repo.last_valid(base, tell).state
+        state = repo.last_valid_snapshot(base, tell).state
     request = repo.restoration(wish.to, drop_newer=wish.drop_newer)
     decision = decide(state, request, datetime.now(timezone.utc), repo.file_reader(base))
     return {"outcome": decision.outcome, **_consequence(decision)}

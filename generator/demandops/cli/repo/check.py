@@ -14,7 +14,7 @@ from demandops.plan.views.bookkeeping_diff import EntryChange
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.changes.merge_preview import FileChange
 from demandops.staterepo.pull_request import merge_check
-from demandops.staterepo.pull_request.merge_check import Checked
+from demandops.staterepo.pull_request.merge_check import CheckResult
 
 _MOST_LINES = 400
 """Of unified diffs on a terminal."""
@@ -69,8 +69,8 @@ def check(directory: Path, base: str | None, output: str) -> None:
         click.get_current_context().exit(1)
 
 
-def _data(found: Checked) -> dict[str, Any]:
-    known = found.consequence
+def _data(found: CheckResult) -> dict[str, Any]:
+    known = found.preview
     diffs, left = _bounded(known.files if known else (), _MOST_LINES_JSON)
     return {
         "faults": [
@@ -88,7 +88,7 @@ def _data(found: Checked) -> dict[str, Any]:
             for one in found.suggestions
         ],
         "base": found.base,
-        "base_valid": found.base_in_force,
+        "base_valid": found.base_valid,
         "releases": [_release_data(one) for one in known.releases] if known else None,
         "files": [
             {
@@ -106,8 +106,8 @@ def _data(found: Checked) -> dict[str, Any]:
         else None,
         "outdated": [one.path for one in known.files] if known else [],
         "diff_lines_left_out": left,
-        "bookkeeping": [_entry_data(one) for one in found.books]
-        if found.books is not None
+        "bookkeeping": [_entry_data(one) for one in found.bookkeeping]
+        if found.bookkeeping is not None
         else None,
     }
 
@@ -146,7 +146,7 @@ def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], 
     return shown, left
 
 
-def _print(directory: Path, found: Checked) -> None:
+def _print(directory: Path, found: CheckResult) -> None:
     out = console()
     for one in found.faults:
         errors.print(f"error: {one}")
@@ -167,31 +167,31 @@ def _visible(line: str) -> str:
     return "".join(char if char.isprintable() or char in "\n\t" else "�" for char in line)
 
 
-def _lines(found: Checked) -> Iterator[str]:
+def _lines(found: CheckResult) -> Iterator[str]:
     for one in found.suggestions:
         yield f"\ninstead of editing {one.path}, {one.name}:\n"
         yield from one.text.splitlines()
         if one.also:
             yield f"\n(it fits {', '.join(one.also)} too)"
-    known = found.consequence
+    known = found.preview
     if known is None:
         if not found.suggestions:
             return
         yield "\nwhat merging would do is shown once the faults are mended"
         return
-    if known.files or found.books:
+    if known.files or found.bookkeeping:
         since = f" since {found.base[:10]}" if found.base else ""
         yield f"\nwhat merging would do{since}:"
-    if found.base and not found.base_in_force:
+    if found.base and not found.base_valid:
         yield "(its own files are not valid; compared with the last ones that were)"
     if known.releases:
         yield "\ndesired state:"
         for release in known.releases:
             yield f"  {_SIGNS[release.change]} {release.name} ({release.what})"
             yield from (f"      {detail}" for detail in release.details)
-    if found.books:
+    if found.bookkeeping:
         yield "\nbookkeeping:"
-        for entry in found.books:
+        for entry in found.bookkeeping:
             yield f"  {_SIGNS[entry.change]} {entry.kind} {entry.name}{_for(entry)}"
             yield from (f"      - {fact}" for fact in entry.lost)
             yield from (f"      + {fact}" for fact in entry.gained)

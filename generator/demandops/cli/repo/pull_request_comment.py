@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from demandops.plan.views.bookkeeping_diff import EntryChange
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.changes.merge_preview import FileChange
-from demandops.staterepo.pull_request.merge_check import Checked
+from demandops.staterepo.pull_request.merge_check import CheckResult
 
 MARK = "<!-- demandops check -->"
 """Begins every report, so that a pipeline finds its own comment again."""
@@ -27,7 +27,7 @@ _VERBS = {"start": "starts", "change": "changes", "stop": "stops"}
 _ENTRY_VERBS = {"added": "new", "changed": "changed", "removed": "gone"}
 
 
-def report(found: Checked, longest: int = LONGEST) -> str:
+def report(found: CheckResult, longest: int = LONGEST) -> str:
     """Return the report, of at most ``longest`` characters."""
     parts = [f"{MARK}\n", *_head(found)]
     parts += _faults(found)
@@ -61,18 +61,18 @@ def _longer_than_any(text: str, least: int) -> str:
     return "`" * max(least, longest + 1)
 
 
-def _head(found: Checked) -> Iterator[str]:
+def _head(found: CheckResult) -> Iterator[str]:
     if found.faults:
         many = "one thing" if len(found.faults) == 1 else f"{len(found.faults)} things"
         yield f"## DemandOps: {many} to mend\n"
     else:
         yield "## DemandOps: valid, and everything renders\n"
     if found.base:
-        since = "" if found.base_in_force else ", whose last valid files stand in for its own"
+        since = "" if found.base_valid else ", whose last valid files stand in for its own"
         yield f"\nCompared with {code(found.base[:10])}{since}.\n"
 
 
-def _faults(found: Checked) -> Iterator[str]:
+def _faults(found: CheckResult) -> Iterator[str]:
     for one in found.faults:
         places = [code(place) for place in (one.file, one.field) if place]
         yield f"\n- {': '.join([*places, code(one.message)])}"
@@ -80,14 +80,14 @@ def _faults(found: Checked) -> Iterator[str]:
         yield "\n"
 
 
-def _warnings(found: Checked) -> Iterator[str]:
+def _warnings(found: CheckResult) -> Iterator[str]:
     for one in found.warnings:
         yield f"\n- warning: {code(one.file)}: {code(one.message)}"
     if found.warnings:
         yield "\n"
 
 
-def _suggestions(found: Checked) -> Iterator[str]:
+def _suggestions(found: CheckResult) -> Iterator[str]:
     for one in found.suggestions:
         body = f"Merge this as {code(one.name)}:\n\n{fence(one.text, 'yaml')}"
         if one.left:
@@ -97,12 +97,12 @@ def _suggestions(found: Checked) -> Iterator[str]:
         yield _folded(f"Instead of editing {_plain(one.path)}", body)
 
 
-def _consequence(found: Checked) -> Iterator[str]:
-    known = found.consequence
+def _consequence(found: CheckResult) -> Iterator[str]:
+    known = found.preview
     if known is None:
         yield "\nWhat merging would do is shown once that is mended.\n"
         return
-    if not known.files and not found.books:
+    if not known.files and not found.bookkeeping:
         yield "\nMerging changes nothing that runs, and nobody's demand.\n"
         return
     yield "\n### Desired state\n"
@@ -113,11 +113,11 @@ def _consequence(found: Checked) -> Iterator[str]:
     yield from map(_release, known.releases)
     yield "\n"
     yield "\n### Bookkeeping\n"
-    if found.books is None:
+    if found.bookkeeping is None:
         yield "\nThere is nothing valid to compare it with.\n"
-    elif not found.books:
+    elif not found.bookkeeping:
         yield "\nUnchanged.\n"
-    yield from map(_entry, found.books or ())
+    yield from map(_entry, found.bookkeeping or ())
     yield "\n"
     if known.files:
         yield f"\n### Files that the generator writes or removes: {len(known.files)}\n"

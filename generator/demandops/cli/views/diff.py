@@ -71,7 +71,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 
 def _loaded(repo: Reader, revision: str) -> Snapshot:
     with progress("reading the ledger") as tell:
-        snapshot = repo.last_valid(repo.commit(revision), tell)
+        snapshot = repo.last_valid_snapshot(repo.commit(revision), tell)
     warn_of(repo.problems_of(snapshot))
     return snapshot
 
@@ -80,7 +80,7 @@ def _releases(
     repo: Reader, old: Snapshot, new: Snapshot
 ) -> tuple[list[ReleaseDifference], list[str]]:
     before, after = repo.file_reader(str(old.commit)), repo.file_reader(str(new.commit))
-    differing = repo.differing(str(old.commit), str(new.commit), CLUSTERS_ROOT)
+    differing = repo.changed_files(str(old.commit), str(new.commit), CLUSTERS_ROOT)
     files = {path: (before(path), after(path)) for path in differing}
     sides = [(one.state.ledger, one.state.config) for one in (old, new)]
     return compare(sides[0], sides[1], files)

@@ -70,7 +70,7 @@ def why(
     """
     with reader.opened(state_repo) as repo:
         with progress("reading the ledger") as tell:
-            snapshot = repo.last_valid(repo.commit(at), tell)
+            snapshot = repo.last_valid_snapshot(repo.commit(at), tell)
         warn_of(repo.problems_of(snapshot))
         asked = _understood(repo, snapshot, name, kind)
         commit = str(snapshot.commit)
@@ -109,7 +109,7 @@ def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    known = {*explanation.names(ledger, config), *repo.ever_stopped(str(snapshot.commit))}
+    known = {*explanation.names(ledger, config), *repo.stopped_release_names(str(snapshot.commit))}
     known |= {id for one in SubjectKind for id in ledger.subjects(one)}
     raise StateRepoError(f"nothing called {shown(name)} runs, or ever did{near(name, known)}")
 
@@ -118,7 +118,7 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
     ledger, config = snapshot.state.ledger, snapshot.state.config
     found = []
     release = explanation.find(ledger, config, name)
-    path = path_of(release) if release else repo.path_called(name, str(snapshot.commit))
+    path = path_of(release) if release else repo.release_path(name, str(snapshot.commit))
     if path is None:  # one that an override denies may never have run
         stopped = explanation.denied_called(ledger, config, name)
         path = path_of(stopped[0]) if stopped else None

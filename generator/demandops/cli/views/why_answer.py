@@ -118,13 +118,13 @@ def _commit(repo: Reader, entry: LogEntry | None) -> dict[str, Any] | None:
         "commit": entry.commit,
         "time": entry.time.isoformat(),
         "author": entry.author,
-        "operation": entry.one("Operation") or None,
+        "operation": entry.first("Operation") or None,
         "requesters": entry.trailers.get("Requester", []),
         "summary": entry.summary,
         "why": entry.why or None,
         "carries_out": [
             {"commit": one.commit, "author": one.author, "summary": one.summary}
-            for one in repo.behind(entry, _PEOPLES_COMMITS)
+            for one in repo.person_commits_behind(entry, _PEOPLES_COMMITS)
         ],
     }
 

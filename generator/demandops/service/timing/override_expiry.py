@@ -30,7 +30,7 @@ class OverrideClock:
             if tried is not None and now < tried + _AGAIN:
                 continue
             try:
-                line.end(override, now)
+                line.end_override(override, now)
                 log.info("%s ended at its time, %s", override.path, override.expires)
             except InvalidInput as error:
                 self._failed[override.name, override.end or now] = now

@@ -25,7 +25,7 @@ _ENDING = ("follow", "upgrade", "expire-override")
 """Operations that may say, or take back, that an override ended."""
 
 
-def not_its_own(repo: Repository, commit: Commit, entry: LogEntry) -> tuple[str, ...]:
+def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> tuple[str, ...]:
     """Return the files that a commit changed although its message does not account for it.
 
     People's files, and claims of demands that it does not name or that are not written as the
@@ -37,7 +37,7 @@ def not_its_own(repo: Repository, commit: Commit, entry: LogEntry) -> tuple[str,
 
 
 def _foreign(repo: Repository, commit: Commit, entry: LogEntry) -> Iterator[str]:
-    before, operation = commit.parents[0].tree, entry.one("Operation")
+    before, operation = commit.parents[0].tree, entry.first("Operation")
     named = _named(entry)
     for path, blob in trees.differences(repo, before, commit.tree, ""):
         root = path.split("/", 1)[0]

@@ -26,7 +26,7 @@ _GOOD = "G"
 _CONFIG = ("-c", "gpg.ssh.program=ssh-keygen", "-c", "gpg.minTrustLevel=undefined")
 
 
-def checked(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
+def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
     """Return the verdicts with what is to be said of each commit's signature."""
     verdicts = list(verdicts)
     lists: dict[str, list[str]] = {}
@@ -39,15 +39,15 @@ def checked(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
             lists.setdefault(allowed, []).append(verdict.commit)
     found: dict[str, tuple[str, str]] = {}
     for allowed, commits in lists.items():
-        found |= _asked(repo, allowed, commits)
-    return [_told(verdict, armour[verdict.commit], found) for verdict in verdicts]
+        found |= _check_with_git(repo, allowed, commits)
+    return [_with_signature(verdict, armour[verdict.commit], found) for verdict in verdicts]
 
 
 def _allowed(commit: Commit) -> str | None:
     return trees.read_text(commit.parents[0].tree, ALLOWED_SIGNERS) if commit.parents else None
 
 
-def _told(verdict: Verdict, armour: str, found: dict[str, tuple[str, str]]) -> Verdict:
+def _with_signature(verdict: Verdict, armour: str, found: dict[str, tuple[str, str]]) -> Verdict:
     verdict = replace(verdict, signed=bool(armour))
     if verdict.commit not in found:
         return verdict
@@ -63,7 +63,9 @@ def _told(verdict: Verdict, armour: str, found: dict[str, tuple[str, str]]) -> V
     return replace(verdict, holds=False, signature=fault)
 
 
-def _asked(repo: Repository, allowed: str, commits: list[str]) -> dict[str, tuple[str, str]]:
+def _check_with_git(
+    repo: Repository, allowed: str, commits: list[str]
+) -> dict[str, tuple[str, str]]:
     """Return commit → (git's word for its signature, whose it is)."""
     with tempfile.TemporaryDirectory(prefix="demandops-") as folder, git.Repo(repo.path) as opened:
         file = Path(folder) / "allowed-signers"

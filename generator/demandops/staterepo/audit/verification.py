@@ -119,16 +119,16 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
     Args:
         whole: whether to load and render every commit from nothing.
     """
-    row = _Row(repo)
+    row = _Proofs(repo)
     for place, revision in enumerate(commits, 1):
         commit = trees.commit_of(repo, revision)
         entry = entry_of(commit)
-        verdict = Verdict(entry.commit, entry.summary, True, _why_not(entry))
+        verdict = Verdict(entry.commit, entry.summary, True, _skip_reason(entry))
         if verdict.skipped:
             yield verdict
             continue
-        touched = allowed_changes.not_its_own(repo, commit, entry)
-        alone = whole or place == len(commits) or bool(entry.one("In-Force"))
+        touched = allowed_changes.disallowed_files(repo, commit, entry)
+        alone = whole or place == len(commits) or bool(entry.first("In-Force"))
         try:
             differing = row.differing(commit, entry, alone=alone)
         except _Unreadable as error:
@@ -145,7 +145,7 @@ class _Unreadable(Exception):
     """A commit that cannot be judged, for a file of people in it is not valid."""
 
 
-class _Row:
+class _Proofs:
     """Commits that are proven one after the other."""
 
     def __init__(self, repo: Repository) -> None:
@@ -180,7 +180,7 @@ class _Row:
 
     def _loaded(self, commit: Commit, entry: LogEntry) -> State:
         try:
-            return in_force_trailers.at(self._repo, commit, entry).state
+            return in_force_trailers.snapshot_at(self._repo, commit, entry).state
         except InvalidInput as error:
             raise _Unreadable(error.faults[0]) from None
 
@@ -189,14 +189,14 @@ def _differing(wanted: Mapping[str, Oid], standing: Mapping[str, Oid]) -> tuple[
     return tuple(
         path
         for path in sorted({*wanted, *standing})
-        if wanted.get(path) != standing.get(path) and not trees.is_note(path)
+        if wanted.get(path) != standing.get(path) and not trees.is_readme(path)
     )
 
 
-def _why_not(entry: LogEntry) -> str:
+def _skip_reason(entry: LogEntry) -> str:
     if not entry.by_generator:
         return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
-    version = entry.one("Render-Version")
+    version = entry.first("Render-Version")
     if version != str(RENDER_VERSION):
         return f"rendered by version {version}, this is version {RENDER_VERSION}"
     return ""
@@ -234,7 +234,9 @@ def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[Cla
         InvalidInput: where a claim file is not valid.
     """
     changes = []
-    for path, blob in trees.below_root(repo, proof.tree, commit.tree, ledger_format.LEDGER_ROOT):
+    for path, blob in trees.differences_below(
+        repo, proof.tree, commit.tree, ledger_format.LEDGER_ROOT
+    ):
         if ledger_format.kind_of(path) is None:
             continue
         known = proof.claims.get(path)
@@ -273,7 +275,7 @@ def _bring_forward(
         if change.after is not None:
             proof.claims[path] = change.after
     for root in GENERATED_ROOTS:
-        for path, blob in trees.below_root(repo, proof.tree, commit.tree, root):
+        for path, blob in trees.differences_below(repo, proof.tree, commit.tree, root):
             proof.standing.pop(path, None)
             if blob is not None:
                 proof.standing[path] = blob
@@ -285,7 +287,7 @@ def _standing(tree: Tree) -> Iterator[tuple[str, Oid]]:
     for root in GENERATED_ROOTS:
         entry = trees.child(tree, root)
         if isinstance(entry, Tree):
-            yield from trees.entries(entry, f"{root}/")
+            yield from trees.files_below(entry, f"{root}/")
         elif entry is not None:
             yield root, entry.id
 

@@ -71,7 +71,7 @@ class LocalRepository(StateRepository):
 
     @property
     def always_current(self) -> bool:
-        """Say yes: there is no copy that could be behind."""
+        """Return true: there is no copy that could be behind."""
         return True
 
 

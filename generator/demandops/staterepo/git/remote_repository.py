@@ -24,7 +24,7 @@ from demandops.staterepo.git.repository import (
     ENVIRONMENT,
     MAIN,
     TIMEOUT_S,
-    CutShort,
+    FetchInterrupted,
     PushDenied,
     RemoteAway,
     StateRepository,
@@ -38,7 +38,7 @@ _PASSING = re.compile(r"lock|failed to update ref|incorrect old value")
 _POLL_S = 0.02
 _NO_RIGHT = re.compile(r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE)
 
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")
 
@@ -46,26 +46,26 @@ log = logging.getLogger("demandops")
 class RemoteRepository(StateRepository):
     """A bare clone of a remote; clone, fetch and push run git itself, with the user's set-up."""
 
-    def __init__(self, url: str, folder: Path, say: Say, patient: bool) -> None:
+    def __init__(self, url: str, folder: Path, notify: Notify, allow_offline: bool) -> None:
         self.address = without_secrets(url)
         self._url = url
         self._folder = folder
-        self._given_up = False
-        self._talking: subprocess.Popen[bytes] | None = None
+        self._aborted = False
+        self._process: subprocess.Popen[bytes] | None = None
         for lock in folder.rglob("*.lock"):  # the folder is ours alone: a killed process left it
             lock.unlink(missing_ok=True)
-        if not self._is_sound():
-            self._clone(say)
+        if not self._is_usable():
+            self._clone(notify)
         self._git = git.Repo(folder)
         self.objects = Repository(str(folder))
         try:
             self.refresh()
         except RemoteAway as error:
-            if not patient:
+            if not allow_offline:
                 raise
             log.warning("%s; going on from what was fetched last", error)
 
-    def _is_sound(self) -> bool:
+    def _is_usable(self) -> bool:
         """Tell whether the clone of an earlier run can be used (a crash may have cut it off)."""
         try:
             repo = Repository(str(self._folder))
@@ -74,8 +74,8 @@ class RemoteRepository(StateRepository):
         except (pygit2.GitError, KeyError):
             return False
 
-    def _clone(self, say: Say) -> None:
-        say(f"cloning {self.address}")
+    def _clone(self, notify: Notify) -> None:
+        notify(f"cloning {self.address}")
         if self._folder.exists():
             shutil.rmtree(self._folder)
         self._folder.parent.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ class RemoteRepository(StateRepository):
         try:
             # told here, not configured: a push that outlives a killed generator moves nothing here
             spec = f"+{MAIN}:{_REMOTE_MAIN}"
-            self._talk(repo, "fetch", "--no-tags", "--quiet", "origin", spec, urgent=urgent)
+            self._run_git(repo, "fetch", "--no-tags", "--quiet", "origin", spec, urgent=urgent)
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
             if "couldn't find remote ref" in text:
@@ -113,7 +113,7 @@ class RemoteRepository(StateRepository):
         self._fetch(self._git)
         return self.tip()
 
-    def look(self, urgent: Callable[[], bool]) -> Oid:
+    def refresh_unless_urgent(self, urgent: Callable[[], bool]) -> Oid:
         """Fetch, but give way to what is urgent: a demand is not to wait for a slow remote."""
         self._fetch(self._git, urgent)
         return self.tip()
@@ -123,7 +123,7 @@ class RemoteRepository(StateRepository):
         try:
             lease = f"--force-with-lease={MAIN}:{expected}"  # forces nothing: commit is on top
             spec = f"{commit}:{MAIN}"
-            self._talk(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
+            self._run_git(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
         except git.GitCommandError as error:
             text = without_secrets(f"{error.stdout}\n{error.stderr}")
             if _BEHIND.search(text):  # git looked at the remote first: nothing was sent
@@ -133,18 +133,18 @@ class RemoteRepository(StateRepository):
                 return True  # it was taken, and the answer got lost
             if tip != expected:
                 return False
-            raise self._why_not(text) from None
+            raise self._push_error(text) from None
         self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         return True
 
-    def listed(self, *patterns: str) -> dict[str, str]:
+    def list_references(self, *patterns: str) -> dict[str, str]:
         """Ask the remote for its references that match, and return name → commit.
 
         Raises:
             RemoteAway: where it cannot be reached.
         """
         try:
-            out, _ = self._talk(self._git, "ls-remote", "--quiet", "origin", *patterns)
+            out, _ = self._run_git(self._git, "ls-remote", "--quiet", "origin", *patterns)
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
             raise RemoteAway(f"{self.address} cannot be asked: {_last_line(text)}") from None
@@ -159,7 +159,7 @@ class RemoteRepository(StateRepository):
         """
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
         try:
-            self._talk(self._git, "fetch", "--no-tags", "--quiet", "--prune", "origin", spec)
+            self._run_git(self._git, "fetch", "--no-tags", "--quiet", "--prune", "origin", spec)
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
             raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
@@ -177,17 +177,17 @@ class RemoteRepository(StateRepository):
         """
         told = [f"--push-option={option}" for option in options]
         expects = f"--force-with-lease={lease}"
-        out, err = self._talk(self._git, "push", "--porcelain", *told, expects, "origin", spec)
+        out, err = self._run_git(self._git, "push", "--porcelain", *told, expects, "origin", spec)
         return f"{out}\n{err}"
 
-    def why_not(self, error: git.GitCommandError) -> StateRepoError:
+    def push_error(self, error: git.GitCommandError) -> StateRepoError:
         """Return why a push was not taken: to be tried again, or denied."""
-        return self._why_not(without_secrets(f"{error.stdout}\n{error.stderr}"))
+        return self._push_error(without_secrets(f"{error.stdout}\n{error.stderr}"))
 
-    def _talk(
+    def _run_git(
         self, repo: git.Repo, *command: str, urgent: Callable[[], bool] = lambda: False
     ) -> tuple[str, str]:
-        if self._given_up:
+        if self._aborted:
             raise RemoteAway(f"{self.address} was given up")
         with repo.git.custom_environment(**ENVIRONMENT):
             guard = repo.git.execute(  # kept: it ends the process when it goes
@@ -197,26 +197,26 @@ class RemoteRepository(StateRepository):
             )
         process = guard.proc
         assert process is not None  # noqa: S101 - it was started just now
-        self._talking = process
-        if self._given_up:  # between the first look and now
-            self.give_up()
+        self._process = process
+        if self._aborted:  # between the first look and now
+            self.abort()
         try:
-            out, err = _heard(process, urgent)
+            out, err = _wait_for(process, urgent)
         finally:
-            self._talking = None
+            self._process = None
         if process.returncode:
             raise git.GitCommandError(list(command), process.returncode, err, out)
         return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
 
-    def give_up(self) -> None:
+    def abort(self) -> None:
         """End what git is waiting for, and start nothing more."""
-        self._given_up = True
-        process = self._talking
+        self._aborted = True
+        process = self._process
         if process is not None:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGTERM)
 
-    def _why_not(self, text: str) -> StateRepoError:
+    def _push_error(self, text: str) -> StateRepoError:
         """Tell a push that can be tried again from one that is denied."""
         refused = _REFUSED.search(text)
         if refused and not _PASSING.search(refused[1]):
@@ -230,11 +230,11 @@ class RemoteRepository(StateRepository):
 
     @property
     def always_current(self) -> bool:
-        """Say no: the remote may have moved since the last fetch."""
+        """Return false: the remote may have moved since the last fetch."""
         return False
 
 
-def _heard(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:
+def _wait_for(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:
     """Return what git says; end it where it takes too long, or something urgent comes."""
     end = time.monotonic() + TIMEOUT_S
     while True:
@@ -244,13 +244,13 @@ def _heard(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tupl
             hurry = urgent()
             if not hurry and time.monotonic() < end:
                 continue
-            heard = _ended(process)
+            heard = _terminate(process)
             if hurry:
-                raise CutShort("a look at the remote was ended for a demand") from None
+                raise FetchInterrupted("a look at the remote was ended for a demand") from None
             return heard
 
 
-def _ended(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
+def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
     """End git and all that it started; kindly first, so that it takes its locks with it."""
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):

@@ -27,7 +27,7 @@ class RemoteAway(StateRepoError):
     """The remote did not answer; what is kept in the outbox goes there when it is back."""
 
 
-class CutShort(StateRepoError):
+class FetchInterrupted(StateRepoError):
     """A look at the remote was ended because something more urgent came."""
 
 
@@ -55,12 +55,12 @@ class StateRepository(ABC):
             RemoteAway: where it cannot be reached.
         """
 
-    def look(self, urgent: Callable[[], bool]) -> Oid:
+    def refresh_unless_urgent(self, urgent: Callable[[], bool]) -> Oid:
         """As :meth:`refresh`, but ended as soon as ``urgent`` says that something else is to do.
 
         Raises:
             RemoteAway: where it cannot be reached.
-            CutShort: where it was ended.
+            FetchInterrupted: where it was ended.
         """
         return self.refresh()
 
@@ -93,7 +93,7 @@ class StateRepository(ABC):
         one, two = (_under(objects, name, path) for name in (commit, other))
         return one is not None and one == two
 
-    def changed(self, since: str, commit: str) -> list[str] | None:
+    def changed_paths(self, since: str, commit: str) -> list[str] | None:
         """Return the paths in which two commits differ; None where one is not known here.
 
         May be called from any thread.
@@ -106,7 +106,7 @@ class StateRepository(ABC):
         ends = (end for delta in found.deltas for end in (delta.old_file, delta.new_file))
         return sorted({end.path for end in ends})
 
-    def give_up(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
+    def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End what is under way with a remote; nothing where there is none."""
 
     def tidy(self) -> None:

@@ -71,11 +71,11 @@ class Signer:
                 "somebody to confirm?"
             ) from None
         if done.returncode:
-            raise SigningFailed(_why_not(self.key, done.stderr.decode("utf-8", "replace")))
+            raise SigningFailed(_key_fault(self.key, done.stderr.decode("utf-8", "replace")))
         return done.stdout.decode("ascii").rstrip("\n")
 
 
-def _why_not(key: Path, said: str) -> str:
+def _key_fault(key: Path, said: str) -> str:
     """Return what is wrong with a key, from what ssh-keygen said of it."""
     if "UNPROTECTED PRIVATE KEY" in said or "bad permissions" in said:
         return f"signing key {key} can be read by others; run: chmod 600 {key}"

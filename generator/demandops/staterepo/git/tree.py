@@ -39,13 +39,13 @@ def read_text(tree: Tree, path: str) -> str | None:
     return entry.data.decode("utf-8", "replace") if isinstance(entry, pygit2.Blob) else None
 
 
-def blob(tree: Tree, path: str) -> Oid | None:
+def blob_id(tree: Tree, path: str) -> Oid | None:
     """Return the id of a file, or nothing where there is none."""
     entry = child(tree, path)
     return entry.id if isinstance(entry, pygit2.Blob) else None
 
 
-def id_of(tree: Tree, name: str) -> Oid | None:
+def entry_id(tree: Tree, name: str) -> Oid | None:
     """Return the id of an entry of a tree, a file or a folder, or nothing."""
     entry = child(tree, name)
     return entry.id if entry is not None else None
@@ -59,12 +59,12 @@ def child(tree: Tree, name: str) -> pygit2.Object | None:
         return None
 
 
-def entries(tree: Tree, prefix: str = "") -> Iterator[tuple[str, Oid]]:
+def files_below(tree: Tree, prefix: str = "") -> Iterator[tuple[str, Oid]]:
     """Yield (path, blob id) of every file below a tree, in Git's order."""
     for entry in tree:
         path = f"{prefix}{entry.name}"
         if isinstance(entry, Tree):
-            yield from entries(entry, f"{path}/")
+            yield from files_below(entry, f"{path}/")
         elif isinstance(entry, pygit2.Blob):
             yield path, entry.id
 
@@ -77,7 +77,7 @@ def texts(tree: Tree, roots: tuple[str, ...]) -> dict[str, str]:
             continue
         entry = tree[root]
         if isinstance(entry, Tree):
-            for path, _ in entries(entry, f"{root}/"):
+            for path, _ in files_below(entry, f"{root}/"):
                 found[path] = read_text(tree, path) or ""
         elif isinstance(entry, pygit2.Blob):
             found[root] = entry.data.decode("utf-8", "replace")
@@ -110,7 +110,7 @@ def differences(
             yield path, None
 
 
-def below_root(
+def differences_below(
     repo: Repository, before: Tree, after: Tree, root: str
 ) -> Iterator[tuple[str, Oid | None]]:
     """Yield (path, blob id or nothing) of each file that differs at or below a top-level entry."""
@@ -123,7 +123,7 @@ def below_root(
     yield from differences(repo, sides[0], sides[1], f"{root}/")
 
 
-def is_note(path: str) -> bool:
+def is_readme(path: str) -> bool:
     """Tell what people may put beside generated files: a README is no manifest."""
     return path.rsplit("/", 1)[-1] == "README.md"
 

@@ -29,7 +29,7 @@ _EMAIL = re.compile(r"[^\s<>\x00-\x1f\x7f]+")
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class PersonCommit:
     """A person's commit that was taken in."""
 
     commit: str
@@ -43,17 +43,19 @@ class Cause:
         return f"{self.name} <{self.email}>"
 
 
-def since(repo: Repository, known: Oid, to: Oid) -> tuple[Cause, ...]:
+def person_commits_since(repo: Repository, known: Oid, to: Oid) -> tuple[PersonCommit, ...]:
     """Return people's commits up to ``to`` that ``known`` does not have, newest first.
 
     Those that touch nothing the generator goes by (a README) caused nothing and are left out.
     """
     return tuple(
-        cause_of(commit) for commit in _peoples(repo, known, to) if _touches(commit, _ROOTS)
+        person_commit_of(commit)
+        for commit in _person_commits(repo, known, to)
+        if _touches(commit, _ROOTS)
     )
 
 
-class Origins:
+class FaultOrigins:
     """Finds which of people's commits since ``known`` a path is as it is by."""
 
     def __init__(self, repo: Repository, known: Oid, to: Oid) -> None:
@@ -63,42 +65,42 @@ class Origins:
     def __call__(self, path: str) -> tuple[str, str] | None:
         """Return commit and author of the newest that touches ``path``, else of the newest."""
         if self._commits is None:  # most reports stand already, and then nobody asks
-            self._commits = list(_peoples(*self._world))
+            self._commits = list(_person_commits(*self._world))
         for paths in ((path,) if path else (), _ROOTS):
             for commit in self._commits:
                 if _touches(commit, paths):
-                    cause = cause_of(commit)
+                    cause = person_commit_of(commit)
                     return cause.commit, cause.who
         return None
 
 
-def _peoples(repo: Repository, known: Oid, to: Oid) -> Iterable[Commit]:
+def _person_commits(repo: Repository, known: Oid, to: Oid) -> Iterable[Commit]:
     walker = repo.walk(to, SortMode.TOPOLOGICAL)
     walker.hide(known)
-    return (commit for commit in walker if not commit_message.is_generators(commit.message))
+    return (commit for commit in walker if not commit_message.is_by_generator(commit.message))
 
 
 def _touches(commit: Commit, paths: Iterable[str]) -> bool:
     parent = commit.parents[0].tree if commit.parents else None
-    return any(_at(parent, path) != _at(commit.tree, path) for path in paths)
+    return any(_entry_id(parent, path) != _entry_id(commit.tree, path) for path in paths)
 
 
-def _at(tree: Tree | None, path: str) -> Oid | None:
+def _entry_id(tree: Tree | None, path: str) -> Oid | None:
     entry = trees.child(tree, path) if tree is not None else None
     return entry.id if entry is not None else None
 
 
-def cause_of(commit: Commit) -> Cause:
+def person_commit_of(commit: Commit) -> PersonCommit:
     """Return a commit and its author, in characters that a trailer and a signature can carry."""
     name = _UNFIT.sub("", commit.author.name).strip(" .,:;\"'\\") or "unnamed"
     email = commit.author.email if _EMAIL.fullmatch(commit.author.email or "") else ""
     moment = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
-    return Cause(
+    return PersonCommit(
         str(commit.id), name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL, moment
     )
 
 
-def trailers(causes: tuple[Cause, ...]) -> list[tuple[str, str]]:
+def caused_by_trailers(causes: tuple[PersonCommit, ...]) -> list[tuple[str, str]]:
     """Return ``Caused-By: <commit> <name> <email>`` for each, the oldest first.
 
     A bounded number: where there are more, the newest are named, and ``Since`` tells the rest.
@@ -106,7 +108,7 @@ def trailers(causes: tuple[Cause, ...]) -> list[tuple[str, str]]:
     return [("Caused-By", f"{one.commit} {one.who}") for one in reversed(causes[:_MOST_NAMED])]
 
 
-def author(causes: tuple[Cause, ...], now: datetime) -> pygit2.Signature:
+def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Signature:
     """Return who a follow commit is of: the people whose commits it carries out.
 
     A sole person stands there as in their own commits, so that ``git log --author`` finds both;

@@ -31,7 +31,7 @@ class LogEntry:
     trailers: dict[str, list[str]]
     why: str = ""
 
-    def one(self, key: str) -> str:
+    def first(self, key: str) -> str:
         """Return the first value of a trailer, or nothing."""
         return next(iter(self.trailers.get(key, ())), "")
 
@@ -90,14 +90,14 @@ _OUTCOMES: dict[str, Literal["changed", "unchanged", "refused"]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class RecordedOutcome:
     """Where a demand is found in history, and what came of it."""
 
     commit: str
     outcome: Literal["changed", "unchanged", "refused"]
 
 
-def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Arrival]:
+def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, RecordedOutcome]:
     """Return operation id → arrival of every demand that was settled after ``base``.
 
     Where ``base`` is not known here (a remote that was laid anew), all of history is read.
@@ -113,11 +113,11 @@ def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Arrival
     for entry in walk(repo, tip, until):
         for key, outcome in _OUTCOMES.items():
             for operation in entry.trailers.get(key, ()):
-                found[operation] = Arrival(entry.commit, outcome)
+                found[operation] = RecordedOutcome(entry.commit, outcome)
     return found
 
 
-def last_generated(repo: Repository, tip: Oid) -> Oid | None:
+def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
     """Return the newest commit of the generator on the first-parent line, or nothing."""
     commit: Commit | None = commit_of(repo, tip)
     while commit is not None:

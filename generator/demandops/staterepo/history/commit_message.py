@@ -35,7 +35,7 @@ _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
 
 
-def is_generators(message: str) -> bool:
+def is_by_generator(message: str) -> bool:
     """Tell whether a commit is the generator's, so that its files fit its books.
 
     A proposal is merged by a person, perhaps onto others' changes: its files are looked at anew.
@@ -228,7 +228,7 @@ def of_follow(
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
 
 
-def of_ended(
+def of_override_end(
     override: Override,
     releases: tuple[ReleaseChange, ...],
     kept: Iterable[ClaimKey],
@@ -248,14 +248,14 @@ def of_ended(
     ]
     trailers = [
         ("Operation", "expire-override"),
-        *of_overrides([override.path, *keeping(kept)]),
+        *override_trailers([override.path, *keep_override_paths(kept)]),
         *more,
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
 
 
-def of_overrides(paths: Iterable[str]) -> list[tuple[str, str]]:
+def override_trailers(paths: Iterable[str]) -> list[tuple[str, str]]:
     """Return the trailers that name overrides."""
     return [("Override", path) for path in sorted(set(paths))]
 
@@ -263,10 +263,10 @@ def of_overrides(paths: Iterable[str]) -> list[tuple[str, str]]:
 def _overrides(decision: Decision) -> list[tuple[str, str]]:
     """Return the trailers that name the overrides that shaped a demand's commit."""
     keys = (change.key for change in decision.changes.claims)
-    return of_overrides([*decision.overrides, *keeping(keys)])
+    return override_trailers([*decision.overrides, *keep_override_paths(keys)])
 
 
-def keeping(keys: Iterable[ClaimKey]) -> list[str]:
+def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
     """Return the files of the overrides whose own claims these are."""
     demands = (key.demand for key in keys if key.demand.startswith(KEPT))
     return [f"{OVERRIDES_ROOT}/{demand.removeprefix(KEPT)}.yaml" for demand in demands]

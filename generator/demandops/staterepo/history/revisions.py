@@ -17,7 +17,7 @@ from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 
 TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
-"""Examples of all that :func:`moment` takes."""
+"""Examples of all that :func:`parse_time` takes."""
 
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
 _CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2})?")
@@ -25,7 +25,7 @@ _DAY, _MINUTE, _SECOND = timedelta(days=1), timedelta(minutes=1), timedelta(seco
 _MAIN = re.compile(rf"^(?:HEAD|{MAIN_BRANCH})(?=$|[~^@])")
 
 
-def moment(text: str, now: datetime, *, end: bool = False) -> datetime | None:
+def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | None:
     """Return the time that a text names, or nothing where it names none.
 
     Args:
@@ -75,9 +75,9 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     named = _reference(repo, text)
     if named is not None:
         return named
-    at = moment(text, now, end=True)
+    at = parse_time(text, now, end=True)
     if at is not None:
-        return at_time(repo, tip, at)
+        return commit_at_time(repo, tip, at)
     found = _revision(repo, _MAIN.sub(str(tip), text))
     if found is None:
         raise StateRepoError(
@@ -87,7 +87,7 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     return found
 
 
-def at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
+def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
     """Return the newest commit on the first-parent line that was made at ``at`` or before.
 
     Raises:
@@ -99,13 +99,14 @@ def at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
         if not commit.parents:
             first = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
             raise StateRepoError(
-                f"at {shown(at)} there was no state repo yet; its first commit is of {shown(first)}"
+                f"at {format_time(at)} there was no state repo yet; its first commit is of "
+                f"{format_time(first)}"
             )
         commit = commit.parents[0]
     return commit
 
 
-def shown(at: datetime) -> str:
+def format_time(at: datetime) -> str:
     """Return a time as people read it."""
     return at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
 

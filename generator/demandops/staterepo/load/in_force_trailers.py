@@ -1,4 +1,4 @@
-"""What the generator goes by while something of people's is not valid, told in its commits.
+"""What the generator goes by while something of people's is not valid, record in its commits.
 
 ``In-Force`` names the newest commit where all was valid, ``Configuration`` the one whose
 configuration is in force, ``Stands-In`` each file of it that is in force in another version, as
@@ -19,60 +19,67 @@ from demandops.ledger import ended_override_file
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load import last_valid_config, quarantine
 from demandops.staterepo.load import snapshot as snapshots
-from demandops.staterepo.load.last_valid_config import Source
+from demandops.staterepo.load.last_valid_config import ConfigSource
 from demandops.staterepo.load.snapshot import Snapshot
 
 _NONE = "none"
 
 
-def trailers(snapshot: Snapshot) -> list[tuple[str, str]]:
+def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
     """Return the trailers that say what is in force, where it is not all that stands there."""
-    if not snapshot.problems or snapshot.sound is None:
+    if not snapshot.problems or snapshot.last_valid_commit is None:
         return []
-    source = snapshot.configuration
+    source = snapshot.config_source
     return [
-        ("In-Force", str(snapshot.sound)),
+        ("In-Force", str(snapshot.last_valid_commit)),
         ("Configuration", str(source.commit)),
         *(
             ("Stands-In", f"{quote(path)} {blob or _NONE}")
-            for path, blob in sorted(source.stand_ins.items())
+            for path, blob in sorted(source.replacements.items())
         ),
     ]
 
 
-def at(repo: Repository, commit: Commit, told: LogEntry) -> Snapshot:
+def snapshot_at(repo: Repository, commit: Commit, record: LogEntry) -> Snapshot:
     """Return what the generator went by at a commit, or goes by since.
 
     Args:
-        told: its own newest commit up to that one.
+        record: its own newest commit up to that one.
 
     Raises:
         InvalidInput, StateRepoError: where something of that is not valid.
     """
-    if not told.one("In-Force"):
+    if not record.first("In-Force"):
         return snapshots.load(repo, commit.id)
-    sound = snapshots.load(repo, told.one("In-Force"))
-    source = _source(told)
-    advance = snapshots.advance(repo, sound, commit.id)
+    last_valid = snapshots.load(repo, record.first("In-Force"))
+    source = _source(record)
+    advance = snapshots.advance(repo, last_valid, commit.id)
     config = load_config(source.texts(repo))
-    config = config.with_ended(ended_override_file.read(last_valid_config.markers_at(commit.tree)))
+    config = config.with_ended(
+        ended_override_file.read(last_valid_config.end_markers_at(commit.tree))
+    )
     state = State.of(config, advance.snapshot.state.ledger)
-    snapshot, _, _ = quarantine.held_back(
+    snapshot, _, _ = quarantine.quarantine_invalid(
         repo,
         replace(advance.snapshot, state=state),
-        sound,
+        last_valid,
         advance.subjects,
         lambda path: None,
     )
     # what is wrong is found anew when the commits behind this one are taken in
     problems = snapshot.problems or (Fault("invalid", "", "is to be looked at again"),)
-    return replace(snapshot, source=source, sound=sound.commit, problems=problems)
+    return replace(
+        snapshot,
+        other_config_source=source,
+        last_valid_commit=last_valid.commit,
+        problems=problems,
+    )
 
 
-def _source(told: LogEntry) -> Source:
-    commit = told.one("Configuration") or told.one("In-Force")
-    stand_ins: dict[str, Oid | None] = {}
-    for line in told.trailers.get("Stands-In", ()):
+def _source(record: LogEntry) -> ConfigSource:
+    commit = record.first("Configuration") or record.first("In-Force")
+    replacements: dict[str, Oid | None] = {}
+    for line in record.trailers.get("Stands-In", ()):
         path, _, blob = line.rpartition(" ")
-        stand_ins[unquote(path)] = None if blob == _NONE else Oid(hex=blob)
-    return Source(Oid(hex=commit), stand_ins)
+        replacements[unquote(path)] = None if blob == _NONE else Oid(hex=blob)
+    return ConfigSource(Oid(hex=commit), replacements)

@@ -44,7 +44,7 @@ Origin = Callable[[str], tuple[str, str] | None]
 """Gives for a path the commit and the author that a fault in it came with."""
 
 
-def reported(
+def with_origins(
     faults: Iterable[Fault], known: Iterable[Problem], origin: Origin
 ) -> tuple[Problem, ...]:
     """Return a problem for each fault; one that is known keeps what is said of its origin."""

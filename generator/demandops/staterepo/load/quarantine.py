@@ -23,7 +23,7 @@ from demandops.staterepo.history import commit_message
 from demandops.staterepo.load.snapshot import Snapshot
 
 
-def held_back(
+def quarantine_invalid(
     repo: Repository, snapshot: Snapshot, before: Snapshot, subjects: Iterable[Subject], read: Read
 ) -> tuple[Snapshot, list[Subject], list[Fault]]:
     """Hold back what of ``subjects`` cannot be planned, neither as configured now nor as before.
@@ -38,8 +38,8 @@ def held_back(
         if found and _faults(
             replace(before.state, ledger=snapshot.state.ledger), before, subject, read
         ):
-            faults += _told_of(found, snapshot, before, subject)
-            snapshot = _holding(repo, snapshot, before, subject)
+            faults += _located_in_claim_files(found, snapshot, before, subject)
+            snapshot = _with_last_valid_claims(repo, snapshot, before, subject)
         else:
             good.append(subject)
     return snapshot, good, faults
@@ -53,7 +53,7 @@ def _faults(state: State, before: Snapshot, subject: Subject, read: Read) -> tup
     return ()
 
 
-def _told_of(
+def _located_in_claim_files(
     faults: Iterable[Fault], snapshot: Snapshot, before: Snapshot, subject: Subject
 ) -> list[Fault]:
     """Return faults of a subject, each told to be in the file of a claim that is another now."""
@@ -63,21 +63,25 @@ def _told_of(
     return [found.within(paths[0]) if paths else found for found in faults]
 
 
-def _holding(repo: Repository, snapshot: Snapshot, before: Snapshot, subject: Subject) -> Snapshot:
+def _with_last_valid_claims(
+    repo: Repository, snapshot: Snapshot, before: Snapshot, subject: Subject
+) -> Snapshot:
     ledger, keys = snapshot.state.ledger, snapshot.keys
     claims = (*before.state.ledger.of(subject), *ledger.of(subject))
     known = {ledger_format.path_of(claim.key): claim.key for claim in claims}
-    ours = _generators(repo, snapshot, before, known)
+    ours = _claims_by_generator(repo, snapshot, before, known)
     for path, key in known.items():
         claim = ours[path] if path in ours else before.state.ledger.get(key)
         ledger = ledger.replace(key, claim)
         if claim is not None:
             keys = keys.insert(path, key)
-    held = tuple(dict.fromkeys((*snapshot.held, *known)))
-    return replace(snapshot, state=replace(snapshot.state, ledger=ledger), keys=keys, held=held)
+    held = tuple(dict.fromkeys((*snapshot.quarantined_files, *known)))
+    return replace(
+        snapshot, state=replace(snapshot.state, ledger=ledger), keys=keys, quarantined_files=held
+    )
 
 
-def _generators(
+def _claims_by_generator(
     repo: Repository, snapshot: Snapshot, before: Snapshot, paths: Iterable[str]
 ) -> dict[str, Claim | None]:
     """Return what a generator last wrote to the paths since ``before``, where one did."""
@@ -86,11 +90,11 @@ def _generators(
     found: dict[str, Claim | None] = {}
     left = set(paths)
     for commit in walker:
-        if not commit.parents or not commit_message.is_generators(commit.message):
+        if not commit.parents or not commit_message.is_by_generator(commit.message):
             continue
         old, new = commit.parents[0].tree, commit.tree
         for path in sorted(left):
-            if trees.blob(old, path) != trees.blob(new, path):
+            if trees.blob_id(old, path) != trees.blob_id(new, path):
                 found[path] = _claim(trees.read_text(new, path), path)
                 left.remove(path)
     return found

@@ -51,7 +51,7 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     )
 
 
-def configured_since(repo: Repository, commit: str | Oid, tip: str | Oid) -> list[str]:
+def config_files_changed_since(repo: Repository, commit: str | Oid, tip: str | Oid) -> list[str]:
     """Return the files of people that are not what they were at ``commit``."""
     before, after = commit_of(repo, commit).tree, commit_of(repo, tip).tree
     changed = trees.differences(repo, before, after, "")

@@ -26,7 +26,7 @@ from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
 from demandops.staterepo.load import last_valid_config
-from demandops.staterepo.load.last_valid_config import Source
+from demandops.staterepo.load.last_valid_config import ConfigSource
 
 Progress = Callable[[int, int], None]
 
@@ -35,26 +35,27 @@ Progress = Callable[[int, int], None]
 class Snapshot:
     """A commit and what it says.
 
-    ``keys`` finds the claim behind a ledger file, so that a removed file is understood.
-    ``problems`` are files that are not valid and whose last valid version is in force; ``sound`` is
-    the newest commit without any; ``held`` are ledger files that are not in force as they stand;
-    ``source`` is where the configuration in force is, where it is not the commit's own.
+    ``keys``: the claim of each ledger file, so that the claim of a removed file is known.
+    ``problems``: what is not valid; the last valid versions are in effect instead.
+    ``last_valid_commit``: the newest commit without problems.
+    ``quarantined_files``: ledger files whose content at this commit is not in effect.
+    ``other_config_source``: where the configuration in effect is, if not in this commit.
     """
 
     commit: Oid
     state: State
     keys: HashTrieMap[str, ClaimKey]
     problems: tuple[Fault, ...] = ()
-    sound: Oid | None = None
-    held: tuple[str, ...] = ()
-    source: Source | None = None
+    last_valid_commit: Oid | None = None
+    quarantined_files: tuple[str, ...] = ()
+    other_config_source: ConfigSource | None = None
 
     @property
-    def configuration(self) -> Source:
+    def config_source(self) -> ConfigSource:
         """Where the configuration in force is."""
-        return self.source or Source(self.commit)
+        return self.other_config_source or ConfigSource(self.commit)
 
-    def after(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
+    def with_commit(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
         """Return the snapshot of a commit of our own, whose state is known already."""
         keys = self.keys
         for key in changes:
@@ -63,8 +64,10 @@ class Snapshot:
                 keys = keys.insert(path, key)
             elif path in keys:
                 keys = keys.remove(path)
-        sound = self.sound if self.problems else commit
-        return replace(self, commit=commit, state=state, keys=keys, sound=sound)
+        last_valid_commit = self.last_valid_commit if self.problems else commit
+        return replace(
+            self, commit=commit, state=state, keys=keys, last_valid_commit=last_valid_commit
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +78,7 @@ class Advance:
     subjects: tuple[Subject, ...]
     config_changed: bool
 
-    def then(self, further: Advance) -> Advance:
+    def followed_by(self, further: Advance) -> Advance:
         """Return both steps as one: ``further`` starts where this one ends."""
         return Advance(
             further.snapshot,
@@ -101,7 +104,7 @@ def load(
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
     if faults:
         raise InvalidInput(faults)
-    return Snapshot(commit.id, State.of(config, ledger), keys, sound=commit.id)
+    return Snapshot(commit.id, State.of(config, ledger), keys, last_valid_commit=commit.id)
 
 
 def load_last_valid(
@@ -118,9 +121,9 @@ def load_last_valid(
         config = last_valid_config.config_at(commit.tree)
     except InvalidInput as error:
         problems += error.faults
-        config = last_valid_config.newest_valid(commit, error)
+        config = last_valid_config.newest_valid_config(commit, error)
         config = config.with_ended(
-            ended_override_file.read(last_valid_config.markers_at(commit.tree))
+            ended_override_file.read(last_valid_config.end_markers_at(commit.tree))
         )
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
     for path in dict.fromkeys(found.file for found in faults):
@@ -128,9 +131,11 @@ def load_last_valid(
         if claim is not None:
             ledger, keys = ledger.replace(claim.key, claim), keys.insert(path, claim.key)
     problems += faults
-    sound = None if problems else commit.id
+    last_valid_commit = None if problems else commit.id
     held = tuple(dict.fromkeys(found.file for found in faults))
-    return Snapshot(commit.id, State.of(config, ledger), keys, tuple(problems), sound, held)
+    return Snapshot(
+        commit.id, State.of(config, ledger), keys, tuple(problems), last_valid_commit, held
+    )
 
 
 def _last_valid_claim(commit: Commit, path: str) -> Claim | None:
@@ -146,12 +151,12 @@ def _last_valid_claim(commit: Commit, path: str) -> Claim | None:
     return None
 
 
-def _edited_by_hand(repo: Repository, before: Oid, to: Oid) -> bool:
+def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
     """Tell whether a commit that is not the generator's changed generated files on the way."""
     walker = repo.walk(to, SortMode.TOPOLOGICAL)
     walker.hide(before)
     for commit in walker:
-        if commit_message.is_generators(commit.message) or not commit.parents:
+        if commit_message.is_by_generator(commit.message) or not commit.parents:
             continue
         if _differ(commit.parents[0].tree, commit.tree, GENERATED_ROOTS):
             return True
@@ -181,7 +186,7 @@ def _ledger_at(
 def _ledger_files(tree: Tree) -> Iterable[tuple[str, Oid]]:
     root = ledger_format.LEDGER_ROOT
     if root in tree and isinstance(tree[root], Tree):
-        yield from trees.entries(tree[root], f"{root}/")  # type: ignore[arg-type]
+        yield from trees.files_below(tree[root], f"{root}/")  # type: ignore[arg-type]
 
 
 def _text(repo: Repository, blob: Oid) -> str:
@@ -194,13 +199,16 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     What is not valid there is left as it was before, and told in the new snapshot's problems.
     """
     before, after = trees.commit_of(repo, snapshot.commit).tree, trees.commit_of(repo, to).tree
-    last_valid_config.refuse_other_rendering(after)
+    last_valid_config.refuse_other_render_version(after)
     state, problems = snapshot.state, list[Fault]()
-    config_changed = _edited_by_hand(repo, snapshot.commit, to)
-    source = snapshot.source
+    config_changed = _has_manual_edit(repo, snapshot.commit, to)
+    source = snapshot.other_config_source
     if snapshot.problems or _differ(before, after, CONFIG_ROOTS):
-        now = last_valid_config.found(
-            repo, (snapshot.configuration, snapshot.sound), to, lambda files: _tried(files, state)
+        now = last_valid_config.load_last_valid_config(
+            repo,
+            (snapshot.config_source, snapshot.last_valid_commit),
+            to,
+            lambda files: _load_and_rehearse(files, state),
         )
         problems += now.faults
         source = now.source if problems else None
@@ -208,7 +216,7 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             config = now.config.with_ended(state.config.ended)
             config_changed = config_changed or config != state.config
             state = State(config, State.of(config, state.ledger).engine, state.ledger)
-    ended = ended_override_file.read(last_valid_config.markers_at(after))
+    ended = ended_override_file.read(last_valid_config.end_markers_at(after))
     if ended != state.config.ended:
         state = replace(state, config=state.config.with_ended(ended))
         config_changed = True
@@ -216,7 +224,7 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     changed = dict(
         trees.differences(repo, _subtree(before, "ledger"), _subtree(after, "ledger"), "ledger/")
     )
-    changed |= {path: trees.blob(after, path) for path in snapshot.held}
+    changed |= {path: trees.blob_id(after, path) for path in snapshot.quarantined_files}
     for path, blob in sorted(changed.items()):
         if ledger_format.kind_of(path) is None:
             continue
@@ -237,19 +245,22 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             ledger = ledger.replace(claim.key, claim)
             subjects.append(claim.subject)
         keys = keys.insert(path, claim.key)
-    state, sound = replace(state, ledger=ledger), snapshot.sound if problems else to
+    state, last_valid_commit = (
+        replace(state, ledger=ledger),
+        snapshot.last_valid_commit if problems else to,
+    )
     return Advance(
-        Snapshot(to, state, keys, tuple(problems), sound, tuple(held), source),
+        Snapshot(to, state, keys, tuple(problems), last_valid_commit, tuple(held), source),
         tuple(dict.fromkeys(subjects)),
         config_changed,
     )
 
 
 def _differ(one: Tree, other: Tree, roots: Iterable[str]) -> bool:
-    return any(trees.id_of(one, root) != trees.id_of(other, root) for root in roots)
+    return any(trees.entry_id(one, root) != trees.entry_id(other, root) for root in roots)
 
 
-def _tried(files: Mapping[str, str], state: State) -> Config:
+def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
     """Return the configuration of a commit, tried on invented demands if it changed."""
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
@@ -280,6 +291,6 @@ class ReadAhead:
         if known is None or self._start != before.commit:
             known = Advance(before, (), False)
         if known.snapshot.commit != tip or known.snapshot.problems:
-            known = known.then(advance(repo, known.snapshot, tip))
+            known = known.followed_by(advance(repo, known.snapshot, tip))
         self._known, self._start = known, before.commit
         return known

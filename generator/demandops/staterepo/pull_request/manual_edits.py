@@ -12,7 +12,7 @@ from demandops.config.override import OVERRIDES_ROOT
 from demandops.errors import Fault, fault
 from demandops.ledger import claim_file as ledger_format
 from demandops.plan.release import Release
-from demandops.render.changes import merge_preview as consequences
+from demandops.render.changes import merge_preview
 from demandops.render.changes.override_suggestion import Suggestion, fits_too, suggest
 from demandops.render.gitops.paths import BOOTSTRAP_ROOT, path_of
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
@@ -23,7 +23,7 @@ _LOST = "is generated, and an edit by hand is lost; take it back"
 _MOST_LEFT = 5
 
 
-def edited(files: Mapping[str, str], before: Mapping[str, str]) -> list[str]:
+def changed_paths(files: Mapping[str, str], before: Mapping[str, str]) -> list[str]:
     """Return the generator's own files that differ from what they were, sorted."""
     return [
         path
@@ -34,14 +34,14 @@ def edited(files: Mapping[str, str], before: Mapping[str, str]) -> list[str]:
 
 def _is_generators(path: str) -> bool:
     root = path.split("/", maxsplit=1)[0]
-    if trees.is_note(path):
+    if trees.is_readme(path):
         return False
     if root == ledger_format.LEDGER_ROOT:  # claims are judged as such
         return ledger_format.kind_of(path) is None
     return root in (*GENERATED_ROOTS, NOTES_ROOT)
 
 
-def refused(
+def faults_and_suggestions(
     files: Mapping[str, str], base: Base, paths: Collection[str], owner: str
 ) -> tuple[list[Fault], tuple[Suggestion, ...]]:
     """Return a fault for each edit by hand, and the override that would do what it was to do.
@@ -78,7 +78,7 @@ def _fits(release: Release | None, other: Release) -> bool:
 def _by_path(base: Base) -> dict[str, Release]:
     if base.state is None:
         return {}
-    known = consequences.releases_of(base.state.ledger, base.state.config)
+    known = merge_preview.releases_of(base.state.ledger, base.state.config)
     return {path_of(release): release for release in known.values()}
 
 

@@ -29,7 +29,7 @@ from demandops.plan.release_keys import ReleaseKey
 from demandops.plan.views.bookkeeping import bookkeeping
 from demandops.plan.views.bookkeeping_diff import EntryChange, difference
 from demandops.plan.views.override_report import survey, warnings
-from demandops.render.changes import merge_preview as consequences
+from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview
 from demandops.render.changes.override_suggestion import Suggestion
 from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
@@ -39,25 +39,25 @@ from demandops.staterepo.pull_request.worktree import Base, author_of, base_of, 
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
+class CheckResult:
     """What a check found.
 
-    ``consequence`` is missing where the files are not valid; ``books`` is missing there too, and
+    ``preview`` is missing where the files are not valid; ``bookkeeping`` is missing there too, and
     where there is nothing valid to compare with. ``base`` is what was compared with, if anything;
-    where its own files are not valid (``base_in_force``), the last valid ones stand in. What is in
+    where its own files are not valid (``base_valid``), the last valid ones stand in. What is in
     ``warnings`` is no fault and may still not be meant.
     """
 
     faults: tuple[Fault, ...]
     suggestions: tuple[Suggestion, ...] = ()
-    consequence: MergePreview | None = None
-    books: tuple[EntryChange, ...] | None = None
+    preview: MergePreview | None = None
+    bookkeeping: tuple[EntryChange, ...] | None = None
     base: str | None = None
-    base_in_force: bool = True
+    base_valid: bool = True
     warnings: tuple[Fault, ...] = ()
 
 
-def check(folder: Path, base: str | None = None, now: datetime | None = None) -> Checked:
+def check(folder: Path, base: str | None = None, now: datetime | None = None) -> CheckResult:
     """Check the files of a folder, that everything renders, and what follows from the edit.
 
     Args:
@@ -74,9 +74,9 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
     start = base_of(folder, base)
     before = start.files if start else files
     ledger = _ledger(files, faults)
-    found = Checked((), base=start.commit if start else None)
-    found = replace(found, base_in_force=start is None or start.in_force)
-    edited = manual_edits.edited(files, before)
+    found = CheckResult((), base=start.commit if start else None)
+    found = replace(found, base_valid=start is None or start.valid)
+    edited = manual_edits.changed_paths(files, before)
     try:
         moment = now or datetime.now(timezone.utc)
         state = _state(files, before, ledger, faults, moment)
@@ -85,26 +85,26 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
         standing = {
             path: text
             for path, text in before.items()
-            if _generated(path) and not trees.is_note(path)
+            if _generated(path) and not trees.is_readme(path)
         }
         wanted = _wanted(state, standing, claims)
     except InvalidInput as error:
-        refused, suggested = _hand_edits(folder, files, start, edited)
+        refused, suggested = _manual_edits(folder, files, start, edited)
         faults += error.faults
         return replace(found, faults=_ordered([*faults, *refused]), suggestions=suggested)
     # what the generator would write all the same is no edit: a proposal of its own, an upgrade
     edited = [
         path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
     ]
-    refused, suggested = _hand_edits(folder, files, start, edited)
-    new = consequences.releases_of(state.ledger, state.config)
+    refused, suggested = _manual_edits(folder, files, start, edited)
+    new = merge_preview.releases_of(state.ledger, state.config)
     old = new if start is None else _releases(start)
     return replace(
         found,
         faults=_ordered([*faults, *refused]),
         suggestions=suggested,
-        consequence=consequences.consequence(old, new, standing, wanted),
-        books=_books(start, state),
+        preview=merge_preview.consequence(old, new, standing, wanted),
+        bookkeeping=_bookkeeping_changes(start, state),
         warnings=_warnings(state, moment),
     )
 
@@ -199,17 +199,17 @@ def _wanted(state: State, standing: Mapping[str, str], edited: Collection[str]) 
     try:
         return rendered(state, standing)
     except InvalidInput as error:
-        found = consequences.faults(state.ledger, state.config, state.engine, edited)
+        found = merge_preview.faults(state.ledger, state.config, state.engine, edited)
         raise InvalidInput(found or error.faults) from None
 
 
 def _releases(start: Base) -> dict[ReleaseKey, Release]:
     if start.state is None:
         return {}
-    return consequences.releases_of(start.state.ledger, start.state.config)
+    return merge_preview.releases_of(start.state.ledger, start.state.config)
 
 
-def _books(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
+def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
     if start is None:
         return ()
     if start.state is None:
@@ -221,12 +221,12 @@ def _books(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
     return difference(old, bookkeeping(state.ledger, state.config))
 
 
-def _hand_edits(
+def _manual_edits(
     folder: Path, files: Mapping[str, str], start: Base | None, edited: list[str]
 ) -> tuple[list[Fault], tuple[Suggestion, ...]]:
     if start is None or not edited:
         return [], ()
-    return manual_edits.refused(files, start, edited, author_of(folder))
+    return manual_edits.faults_and_suggestions(files, start, edited, author_of(folder))
 
 
 def _unversioned_charts(

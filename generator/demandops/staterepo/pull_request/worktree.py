@@ -32,7 +32,7 @@ class Base:
     commit: str
     files: Mapping[str, str]
     state: State | None
-    in_force: bool
+    valid: bool
     """Whether its own files are valid, or ``state`` is from an earlier commit."""
 
 

@@ -73,17 +73,17 @@ class CommitBatch:
         Args:
             proposal: the branch that it awaits approval on; nothing where it needs none.
         """
-        more = [*self._settled, *in_force_trailers.trailers(self.head)]
+        more = [*self._settled, *in_force_trailers.trailers_of(self.head)]
         if proposal:
             more.append((commit_message.PROPOSAL, proposal))
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
         made = self._write(decision.files, text, commit_message.author(decision, received), now)
         keys = [change.key for change in decision.changes.claims]
-        self.head = self.head.after(made, decision.state, keys)
+        self.head = self.head.with_commit(made, decision.state, keys)
         return str(made)
 
-    def record(
+    def commit_files(
         self,
         files: Mapping[str, str | None],
         state: State,
@@ -97,10 +97,10 @@ class CommitBatch:
         ``state`` is what the files give then, ``keys`` the claims that changed with them.
         """
         made = self._write(files, text, author, now)
-        self.head = self.head.after(made, state, keys)
+        self.head = self.head.with_commit(made, state, keys)
         return str(made)
 
-    def note(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
+    def note_settled(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
         """Have the next commit name a demand that changed nothing, if there is a next one.
 
         Should the process die before it answers, that demand must not be judged again behind a
@@ -114,73 +114,79 @@ class CommitBatch:
         What cannot be planned or rendered (a node that is in use is gone from the inventory) is
         left as it was before, and told in the head's problems.
         """
-        snapshot, good, found = self._held_back(advance.snapshot, before, advance.subjects)
+        snapshot, good, found = self._quarantine(advance.snapshot, before, advance.subjects)
         state, problems = snapshot.state, [*snapshot.problems, *found]
         change = Changeset({}, ())
         keys: tuple[ClaimKey, ...] = ()
         whole = advance.config_changed
         if whole:
             try:
-                state, change, keys = self._taken_in(state, before, good, now)
+                state, change, keys = self._render_for_new_config(state, before, good, now)
             except InvalidInput as error:
                 problems += error.faults
                 config = before.state.config.with_ended(state.config.ended)
                 state = replace(before.state, ledger=state.ledger, config=config)
-                snapshot, good, found = self._held_back(
+                snapshot, good, found = self._quarantine(
                     replace(snapshot, state=state), before, good
                 )
                 state, whole = snapshot.state, False
-                snapshot = replace(snapshot, source=before.configuration)
+                snapshot = replace(snapshot, other_config_source=before.config_source)
                 problems += found
         if not whole:
-            state, change, keys = self._carried_out(state, before, good, (problems, now))
-        state, begun = _with_leases_begun(state, now)
+            state, change, keys = self._render_subjects(state, before, good, (problems, now))
+        state, begun = _start_leases(state, now)
         change = replace(change, files={**change.files, **begun})
-        sound = before.sound if problems else snapshot.commit
-        self.head = replace(snapshot, state=state, problems=tuple(problems), sound=sound)
+        last_valid_commit = before.last_valid_commit if problems else snapshot.commit
+        self.head = replace(
+            snapshot, state=state, problems=tuple(problems), last_valid_commit=last_valid_commit
+        )
         files = {**change.files, **self._report(problems, before)}
         if files:
             overrides = [*differing(before.state.config, state.config), *change.overrides]
-            overrides += commit_message.keeping(keys)
-            causes = authorship.since(self._objects, before.sound or before.commit, snapshot.commit)
+            overrides += commit_message.keep_override_paths(keys)
+            causes = authorship.person_commits_since(
+                self._objects, before.last_valid_commit or before.commit, snapshot.commit
+            )
             text = commit_message.of_follow(
                 change.releases,
                 str(snapshot.commit),
                 str(before.commit),
                 problems,
                 [
-                    *commit_message.of_overrides(overrides),
-                    *authorship.trailers(causes),
-                    *in_force_trailers.trailers(self.head),
+                    *commit_message.override_trailers(overrides),
+                    *authorship.caused_by_trailers(causes),
+                    *in_force_trailers.trailers_of(self.head),
                 ],
             )
-            made = self._write(files, text, authorship.author(causes, now), now)
-            self.head = self.head.after(made, state, keys)
+            made = self._write(files, text, authorship.follow_author(causes, now), now)
+            self.head = self.head.with_commit(made, state, keys)
 
-    def _held_back(
+    def _quarantine(
         self, snapshot: Snapshot, before: Snapshot, subjects: Iterable[Subject]
     ) -> tuple[Snapshot, list[Subject], list[Fault]]:
-        return quarantine.held_back(self._objects, snapshot, before, subjects, self.read)
+        return quarantine.quarantine_invalid(self._objects, snapshot, before, subjects, self.read)
 
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
         """Return the report on what is not valid, where it is not what stands there already."""
         standing = self.read(problem_report.PATH)
-        origin = authorship.Origins(self._objects, before.sound or before.commit, self.start.commit)
+        origin = authorship.FaultOrigins(
+            self._objects, before.last_valid_commit or before.commit, self.start.commit
+        )
         wanted = problem_report.write(
-            problem_report.reported(problems, problem_report.read(standing), origin)
+            problem_report.with_origins(problems, problem_report.read(standing), origin)
         )
         return {} if wanted == standing else {problem_report.PATH: wanted}
 
-    def _taken_in(
+    def _render_for_new_config(
         self, state: State, before: Snapshot, subjects: Iterable[Subject], now: datetime
     ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
         """Render everything for a configuration that changed."""
-        marked = last_valid_config.markers_at(self._tree)
+        marked = last_valid_config.end_markers_at(self._tree)
         taken = taken_in(_books(before.state), _books(state), subjects, marked, now)
         state = _with(state, taken)
-        return state, self.everything(state, taken.files), taken.keys
+        return state, self.render_all(state, taken.files), taken.keys
 
-    def end(self, override: Override, now: datetime) -> None:
+    def end_override(self, override: Override, now: datetime) -> None:
         """Commit that an override's time is over, and what follows.
 
         Raises:
@@ -189,13 +195,13 @@ class CommitBatch:
         state = self.head.state
         taken = ended(_books(state), override, now)
         state = _with(state, taken)
-        change = self.everything(state, taken.files)
-        more = in_force_trailers.trailers(self.head)
-        text = commit_message.of_ended(override, change.releases, taken.keys, more)
+        change = self.render_all(state, taken.files)
+        more = in_force_trailers.trailers_of(self.head)
+        text = commit_message.of_override_end(override, change.releases, taken.keys, more)
         made = self._write(change.files, text, commit_message.generator_signature(now), now)
-        self.head = self.head.after(made, state, taken.keys)
+        self.head = self.head.with_commit(made, state, taken.keys)
 
-    def _carried_out(
+    def _render_subjects(
         self,
         state: State,
         before: Snapshot,
@@ -223,7 +229,7 @@ class CommitBatch:
         change = consequence(state, books, good, self.read)
         return state, replace(change, files={**files, **change.files}), tuple(keys)
 
-    def everything(
+    def render_all(
         self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
     ) -> Changeset:
         """Return all generated files that differ from what stands, with ``more`` of the ledger.
@@ -285,7 +291,7 @@ class CommitBatch:
         return self._repository.publish(self.start.commit, self.head.commit)
 
 
-def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, str]]:
+def _start_leases(state: State, now: datetime) -> tuple[State, dict[str, str]]:
     """Start the leases of claims that a person approved; return their files as well.
 
     A lease that counted from the demand could be over before anybody has approved it.
@@ -318,11 +324,11 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
         StateRepoError: where this is no state repo.
     """
     tip = repository.tip()
-    last_valid_config.refuse_other_rendering(trees.commit_of(repository.objects, tip).tree)
-    base = commit_log.last_generated(repository.objects, tip)
+    last_valid_config.refuse_other_render_version(trees.commit_of(repository.objects, tip).tree)
+    base = commit_log.last_generator_commit(repository.objects, tip)
     base = base or tip
     made = trees.commit_of(repository.objects, base)
     told = commit_log.entry_of(made)
-    if told.one("In-Force"):
-        return in_force_trailers.at(repository.objects, made, told)
+    if told.first("In-Force"):
+        return in_force_trailers.snapshot_at(repository.objects, made, told)
     return snapshots.load_last_valid(repository.objects, base, progress)

@@ -61,7 +61,7 @@ class Journal:
             self._file.write("".join(lines))
             self._sync()
 
-    def done(self, operations: Iterable[str], *, durably: bool = False) -> None:
+    def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Forget demands that are published, refused or withdrawn.
 
         Not fsynced unless told so: the next :meth:`append` does it, and only after it could a
@@ -145,7 +145,7 @@ class Slot:
                 break
         else:
             raise OSError(f"{_MAX_SLOTS} processes use {root} already")
-        self.outbox = Journal(self.folder / "outbox.jsonl")
+        self.journal = Journal(self.folder / "outbox.jsonl")
         self._adopt_orphans(root)
 
     def _adopt_orphans(self, root: Path) -> None:
@@ -161,12 +161,12 @@ class Slot:
             lock = _lock(folder)
             if lock is not None:
                 with lock:
-                    self.outbox.append(_load(journal).values())
+                    self.journal.append(_load(journal).values())
                     journal.unlink()
 
     def close(self) -> None:
         """Give the slot back."""
-        self.outbox.close()
+        self.journal.close()
         self._lock.close()
 
 

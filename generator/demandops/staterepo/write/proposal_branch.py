@@ -37,7 +37,7 @@ class BranchMoved(StateRepoError):
     """Somebody else moved or took away a branch: it is not at the commit that was put there."""
 
 
-def branch_of(name: str, operation: str) -> str:
+def branch_name(name: str, operation: str) -> str:
     """Return the branch for a demand: readable, and of this operation alone."""
     slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_MAX_SLUG].rstrip("-")
     digest = hashlib.sha256(operation.encode()).hexdigest()[:12]
@@ -45,21 +45,21 @@ def branch_of(name: str, operation: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Heads:
+class BranchHeads:
     """Where the state repo's branches are: main, and those of proposals by name."""
 
     main: str
     branches: dict[str, str]
 
 
-class Branches:
+class ProposalBranches:
     """The branches ``demand/…`` of a state repo, on this disk or behind a URL."""
 
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
-    def heads(self) -> Heads:
+    def heads(self) -> BranchHeads:
         """Ask where the branches are now.
 
         Raises:
@@ -68,9 +68,9 @@ class Branches:
         if self._remote is None:
             found = _heads(Repository(self._repository.objects.path))
         else:
-            found = self._remote.listed(MAIN, f"{_HEADS}{PREFIX}*")
+            found = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
         named = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
-        return Heads(named.pop(MAIN_BRANCH, ""), named)
+        return BranchHeads(named.pop(MAIN_BRANCH, ""), named)
 
     def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
         """Make a branch point to ``commit``, durably; return the link that the server told.
@@ -119,7 +119,7 @@ class Branches:
                 return ""  # it was taken, and the answer got lost
             if now != expected:
                 raise BranchMoved(f"{branch} was changed by somebody else") from None
-            raise self._remote.why_not(error) from None
+            raise self._remote.push_error(error) from None
 
     def _move(self, branch: str, commit: Oid | None, expected: str) -> None:
         references = self._repository.objects.references
@@ -148,7 +148,7 @@ class Branches:
         except StateRepoError:
             return ""
 
-    def is_fresh(self, tip: Oid, commit: str, base: str, made: Oid) -> bool:
+    def is_up_to_date(self, tip: Oid, commit: str, base: str, made: Oid) -> bool:
         """Tell whether merging ``commit`` into ``tip`` gives the files of ``made``, and cleanly.
 
         Args:
@@ -211,7 +211,7 @@ class PendingProposal:
     operations: tuple[str, ...]
 
 
-def waiting(repository: StateRepository) -> Iterator[PendingProposal]:
+def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     """Yield the proposals that are not merged, by branch.
 
     Raises:
