@@ -43,7 +43,7 @@ ROOT_FILE = "demandops.yaml"
 URL = "https://git.example/fleet/state-repo.git"
 OLDER = (
     "demandops.yaml: renderVersion: is 1, but this generator renders version 2; stop older "
-    "generators, then have all rendered anew by `demandops upgrade`"
+    "generators, then run `demandops upgrade` to render everything again"
 )
 NEWER = (
     "demandops.yaml: renderVersion: is 2, but this generator renders version 1; update the "
@@ -78,7 +78,7 @@ def newer(newer_program: Path, state: StateRepo, data_home: Path) -> Run:
             [*command, *options],
             cwd=newer_program,
             input=stdin,
-            env=os.environ,
+            env=os.environ | {"PYTHONPATH": f"{newer_program / 'generator'}"},
             capture_output=True,
             text=True,
             check=False,
@@ -142,9 +142,10 @@ def test_all_goes_over_in_one_commit_and_back_and_verifies(
 def test_the_commit_says_what_it_did(state: StateRepo, upgraded: Callable[..., Ran]) -> None:
     assert upgraded("--gitops", "argocd").code == 0
     assert state.commits()[0] == (
-        "Render everything anew, for Argo CD\n"
+        "Render everything again, for Argo CD\n"
         "\n"
-        "Why: `demandops upgrade` renders all by render version 1, and from Flux to Argo CD.\n"
+        "Why: `demandops upgrade` renders everything with render version 1, for Argo CD "
+        "instead of Flux.\n"
         "\n"
         "Files written or removed:\n"
         "  1 in bootstrap/c-its.yaml\n"
@@ -340,7 +341,7 @@ def test_a_url_is_pushed_to_and_tried_again_when_somebody_was_first(
     assert ran.json()["commit"] == state.tip
     assert state.files()["README.md"] == "Ours.\n"
     summaries = [text.split("\n")[0] for text in state.commits()]
-    assert summaries[:2] == ["Render everything anew, for Argo CD", "By hand"]
+    assert summaries[:2] == ["Render everything again, for Argo CD", "By hand"]
     assert verified(demandops, state) == [None]
 
 

@@ -465,7 +465,7 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
         followed(bare, made)
     problem = (
         f"{NODES}: nodes[0].cluster: 'c-itz' is not in clusters.yaml; "
-        f"did you mean 'c-its'? (since {made[:10]} of Petra Platform <petra@example.org>)"
+        f"did you mean 'c-its'? (since {made[:10]} by Petra Platform <petra@example.org>)"
     )
     capsys.readouterr()
     assert run(["status", "--state-repo", str(bare)]) == 0

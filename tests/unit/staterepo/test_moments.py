@@ -101,7 +101,7 @@ def test_before_the_first_commit(repo: pygit2.Repository) -> None:
     with pytest.raises(StateRepoError) as told:
         resolved(repo, "9:59:59")
     assert str(told.value) == (
-        "at 2026-01-31 09:59:59 UTC there was no state repo yet; its first commit is of "
+        "at 2026-01-31 09:59:59 UTC the state repo did not exist yet; its first commit is of "
         "2026-01-31 10:00:00 UTC"
     )
 

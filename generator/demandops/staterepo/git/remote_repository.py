@@ -1,4 +1,7 @@
-"""A state repo behind a URL: a bare clone, and git itself to fetch and push."""
+"""The state repo behind a URL: a bare clone, fetched and pushed by git.
+
+Explains why a fetch or a push failed: remote unreachable, or push rejected.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,7 @@ log = logging.getLogger("demandops")
 
 
 class RemoteRepository(StateRepository):
-    """A bare clone of a remote; clone, fetch and push run git itself, with the user's set-up."""
+    """A bare clone of a remote; git runs with the user's configuration."""
 
     def __init__(self, url: str, folder: Path, notify: Notify, allow_offline: bool) -> None:
         self.address = without_secrets(url)
@@ -52,7 +55,9 @@ class RemoteRepository(StateRepository):
         self._folder = folder
         self._aborted = False
         self._process: subprocess.Popen[bytes] | None = None
-        for lock in folder.rglob("*.lock"):  # the folder is ours alone: a killed process left it
+        for lock in folder.rglob(
+            "*.lock"
+        ):  # only this process uses the folder: a killed one left it
             lock.unlink(missing_ok=True)
         if not self._is_usable():
             self._clone(notify)
@@ -63,10 +68,10 @@ class RemoteRepository(StateRepository):
         except RemoteAway as error:
             if not allow_offline:
                 raise
-            log.warning("%s; going on from what was fetched last", error)
+            log.warning("%s; continuing with what was fetched last", error)
 
     def _is_usable(self) -> bool:
-        """Tell whether the clone of an earlier run can be used (a crash may have cut it off)."""
+        """Return whether an earlier run left a complete clone."""
         try:
             repo = Repository(str(self._folder))
             target = repo.references[_REMOTE_MAIN].target
@@ -90,7 +95,7 @@ class RemoteRepository(StateRepository):
 
     def _fetch(self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False) -> None:
         try:
-            # told here, not configured: a push that outlives a killed generator moves nothing here
+            # given here, not configured, so that a push that outlives its generator moves no ref
             spec = f"+{MAIN}:{_REMOTE_MAIN}"
             self._run_git(repo, "fetch", "--no-tags", "--quiet", "origin", spec, urgent=urgent)
         except git.GitCommandError as error:
@@ -103,7 +108,7 @@ class RemoteRepository(StateRepository):
             raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
 
     def tip(self) -> Oid:
-        """Return the remote's commit as of the last fetch or push."""
+        """Return the remote's commit at the last fetch or push."""
         target = self.objects.references[_REMOTE_MAIN].target
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target
@@ -114,23 +119,23 @@ class RemoteRepository(StateRepository):
         return self.tip()
 
     def refresh_unless_urgent(self, urgent: Callable[[], bool]) -> Oid:
-        """Fetch, but give way to what is urgent: a demand is not to wait for a slow remote."""
+        """Fetch, but stop if something is urgent: a demand must not wait for a slow remote."""
         self._fetch(self._git, urgent)
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Push ``commit``; the remote takes it only on top of what it has."""
+        """Push ``commit``; the remote accepts it only on top of its own tip."""
         try:
             lease = f"--force-with-lease={MAIN}:{expected}"  # forces nothing: commit is on top
             spec = f"{commit}:{MAIN}"
             self._run_git(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
         except git.GitCommandError as error:
             text = without_secrets(f"{error.stdout}\n{error.stderr}")
-            if _BEHIND.search(text):  # git looked at the remote first: nothing was sent
+            if _BEHIND.search(text):  # git compared with the remote first: nothing was sent
                 return False
             tip = self.refresh()
             if tip == commit or self.objects.descendant_of(tip, commit):
-                return True  # it was taken, and the answer got lost
+                return True  # the push succeeded, but the answer was lost
             if tip != expected:
                 return False
             raise self._push_error(text) from None
@@ -138,24 +143,24 @@ class RemoteRepository(StateRepository):
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
-        """Ask the remote for its references that match, and return name → commit.
+        """Return name → commit of the remote's references that match.
 
         Raises:
-            RemoteAway: where it cannot be reached.
+            RemoteAway: the remote cannot be reached.
         """
         try:
             out, _ = self._run_git(self._git, "ls-remote", "--quiet", "origin", *patterns)
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
-            raise RemoteAway(f"{self.address} cannot be asked: {_last_line(text)}") from None
+            raise RemoteAway(f"{self.address} cannot be read: {_last_line(text)}") from None
         pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
     def fetch_branches(self, prefix: str) -> None:
-        """Fetch the branches whose names begin so, and forget those that are gone.
+        """Fetch the branches whose names start with ``prefix``; drop those that were deleted.
 
         Raises:
-            RemoteAway: where the remote cannot be reached.
+            RemoteAway: the remote cannot be reached.
         """
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
         try:
@@ -165,32 +170,34 @@ class RemoteRepository(StateRepository):
             raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
 
     def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
-        """Push one reference and return what the remote had to say.
+        """Push one reference and return git's output.
 
         Args:
-            spec: what goes where.
-            lease: ``<reference>:<commit>``, what the remote must have, or nothing there.
-            options: what the server is told (``git push --push-option``).
+            spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
+            lease: ``<reference>:<commit>``, which commit the remote must have; empty for none.
+            options: options for the server (``git push --push-option``).
 
         Raises:
-            git.GitCommandError: where the remote did not take it.
+            git.GitCommandError: the push failed.
         """
-        told = [f"--push-option={option}" for option in options]
+        push_options = [f"--push-option={option}" for option in options]
         expects = f"--force-with-lease={lease}"
-        out, err = self._run_git(self._git, "push", "--porcelain", *told, expects, "origin", spec)
+        out, err = self._run_git(
+            self._git, "push", "--porcelain", *push_options, expects, "origin", spec
+        )
         return f"{out}\n{err}"
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return why a push was not taken: to be tried again, or denied."""
+        """Return the error for a failed push: unreachable (try again) or denied."""
         return self._push_error(without_secrets(f"{error.stdout}\n{error.stderr}"))
 
     def _run_git(
         self, repo: git.Repo, *command: str, urgent: Callable[[], bool] = lambda: False
     ) -> tuple[str, str]:
         if self._aborted:
-            raise RemoteAway(f"{self.address} was given up")
+            raise RemoteAway(f"{self.address}: the connection was aborted")
         with repo.git.custom_environment(**ENVIRONMENT):
-            guard = repo.git.execute(  # kept: it ends the process when it goes
+            guard = repo.git.execute(  # keep a reference: it ends the process when it is collected
                 [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
                 as_process=True,
                 start_new_session=True,
@@ -198,7 +205,7 @@ class RemoteRepository(StateRepository):
         process = guard.proc
         assert process is not None  # noqa: S101 - it was started just now
         self._process = process
-        if self._aborted:  # between the first look and now
+        if self._aborted:  # since the first check
             self.abort()
         try:
             out, err = _wait_for(process, urgent)
@@ -209,7 +216,7 @@ class RemoteRepository(StateRepository):
         return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
 
     def abort(self) -> None:
-        """End what git is waiting for, and start nothing more."""
+        """End the running git command and start no more."""
         self._aborted = True
         process = self._process
         if process is not None:
@@ -217,14 +224,14 @@ class RemoteRepository(StateRepository):
                 os.killpg(process.pid, signal.SIGTERM)
 
     def _push_error(self, text: str) -> StateRepoError:
-        """Tell a push that can be tried again from one that is denied."""
+        """Return ``PushDenied`` if the remote rejected the push, else ``RemoteAway``."""
         refused = _REFUSED.search(text)
         if refused and not _PASSING.search(refused[1]):
-            said = " ".join(line.strip(" '") for line in _REMOTE_SAYS.findall(text)).strip()
-            reason = f"{refused[1]}: {said}" if said else refused[1]
-            return PushDenied(f"{self.address} takes no push: {reason}")
+            message = " ".join(line.strip(" '") for line in _REMOTE_SAYS.findall(text)).strip()
+            reason = f"{refused[1]}: {message}" if message else refused[1]
+            return PushDenied(f"{self.address} rejects the push: {reason}")
         if _NO_RIGHT.search(text):
-            return PushDenied(f"{self.address} takes no push: {_last_line(text)}")
+            return PushDenied(f"{self.address} rejects the push: {_last_line(text)}")
         reason = refused[1] if refused else _last_line(text)
         return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
 
@@ -235,7 +242,7 @@ class RemoteRepository(StateRepository):
 
 
 def _wait_for(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:
-    """Return what git says; end it where it takes too long, or something urgent comes."""
+    """Return git's output; end git if it takes too long or something is urgent."""
     end = time.monotonic() + TIMEOUT_S
     while True:
         try:
@@ -244,14 +251,14 @@ def _wait_for(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> t
             hurry = urgent()
             if not hurry and time.monotonic() < end:
                 continue
-            heard = _terminate(process)
+            output = _terminate(process)
             if hurry:
-                raise FetchInterrupted("a look at the remote was ended for a demand") from None
-            return heard
+                raise FetchInterrupted("the fetch was interrupted by a demand") from None
+            return output
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
-    """End git and all that it started; kindly first, so that it takes its locks with it."""
+    """End git and its child processes; SIGTERM first, so that git removes its locks."""
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -261,7 +268,7 @@ def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
 
 
 def _last_line(text: str) -> str:
-    text = text.replace("stderr: '", "")  # GitPython's, in front of what git said
+    text = text.replace("stderr: '", "")  # GitPython's prefix
     lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
     fatal = [line for line in lines if line.startswith(("fatal:", "error:", "remote:", "!"))]
     return (fatal or lines or ["git gave no reason"])[-1]

@@ -1,6 +1,7 @@
-"""Whose commits a follow commit carries out, so that history names the person for what followed.
+"""Who is behind a change: the commits by people, and who runs this program.
 
-Reads commits only. People are everybody but the generator, whichever machine it runs on.
+A follow commit renders what people committed; it names their commits and has them as author.
+A commit is by a person if no generator made it, on any machine.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _EMAIL = re.compile(r"[^\s<>\x00-\x1f\x7f]+")
 
 @dataclass(frozen=True, slots=True)
 class PersonCommit:
-    """A person's commit that was taken in."""
+    """A commit by a person: its id, author and time."""
 
     commit: str
     name: str
@@ -44,9 +45,9 @@ class PersonCommit:
 
 
 def person_commits_since(repo: Repository, known: Oid, to: Oid) -> tuple[PersonCommit, ...]:
-    """Return people's commits up to ``to`` that ``known`` does not have, newest first.
+    """Return the commits by people up to ``to`` that ``known`` does not include, newest first.
 
-    Those that touch nothing the generator goes by (a README) caused nothing and are left out.
+    Leaves out commits that change nothing the generator reads (a README).
     """
     return tuple(
         person_commit_of(commit)
@@ -56,21 +57,21 @@ def person_commits_since(repo: Repository, known: Oid, to: Oid) -> tuple[PersonC
 
 
 class FaultOrigins:
-    """Finds which of people's commits since ``known`` a path is as it is by."""
+    """Finds the commit by a person since ``known`` that last changed a path."""
 
     def __init__(self, repo: Repository, known: Oid, to: Oid) -> None:
-        self._world = (repo, known, to)
+        self._range = (repo, known, to)
         self._commits: list[Commit] | None = None
 
     def __call__(self, path: str) -> tuple[str, str] | None:
-        """Return commit and author of the newest that touches ``path``, else of the newest."""
-        if self._commits is None:  # most reports stand already, and then nobody asks
-            self._commits = list(_person_commits(*self._world))
+        """Return commit and author of the last change to ``path``, else of any change."""
+        if self._commits is None:  # read late: most reports exist already and need no commits
+            self._commits = list(_person_commits(*self._range))
         for paths in ((path,) if path else (), _ROOTS):
             for commit in self._commits:
                 if _touches(commit, paths):
-                    cause = person_commit_of(commit)
-                    return cause.commit, cause.who
+                    found = person_commit_of(commit)
+                    return found.commit, found.who
         return None
 
 
@@ -91,28 +92,28 @@ def _entry_id(tree: Tree | None, path: str) -> Oid | None:
 
 
 def person_commit_of(commit: Commit) -> PersonCommit:
-    """Return a commit and its author, in characters that a trailer and a signature can carry."""
+    """Return a commit and its author, without characters that trailers and signatures forbid."""
     name = _UNFIT.sub("", commit.author.name).strip(" .,:;\"'\\") or "unnamed"
     email = commit.author.email if _EMAIL.fullmatch(commit.author.email or "") else ""
-    moment = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
+    time = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
     return PersonCommit(
-        str(commit.id), name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL, moment
+        str(commit.id), name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL, time
     )
 
 
 def caused_by_trailers(causes: tuple[PersonCommit, ...]) -> list[tuple[str, str]]:
-    """Return ``Caused-By: <commit> <name> <email>`` for each, the oldest first.
+    """Return ``Caused-By: <commit> <name> <email>`` for each commit, oldest first.
 
-    A bounded number: where there are more, the newest are named, and ``Since`` tells the rest.
+    Only the newest are named if there are many; the trailer ``Since`` bounds the others.
     """
     return [("Caused-By", f"{one.commit} {one.who}") for one in reversed(causes[:_MOST_NAMED])]
 
 
 def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Signature:
-    """Return who a follow commit is of: the people whose commits it carries out.
+    """Return the author of a follow commit: the people whose commits it renders.
 
-    A sole person stands there as in their own commits, so that ``git log --author`` finds both;
-    of several the names, with the generator's address, for a commit has one only.
+    One person keeps name and address, so that ``git log --author`` finds both commits. Several
+    people are named with the generator's address, because a commit has only one.
     """
     if not causes:
         return commit_message.generator_signature(now)
@@ -125,11 +126,11 @@ def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Sig
 
 
 def operator() -> str:
-    """Return who runs this program as git would name them, or nothing where git does not know."""
+    """Return ``name <email>`` of who runs this program, or an empty text if git does not know."""
     try:
-        told = git.Git().execute(
+        ident = git.Git().execute(
             ["git", "-c", "user.useConfigOnly=true", "var", "GIT_AUTHOR_IDENT"]
         )
     except git.GitCommandError:
         return ""
-    return str(told).rsplit("> ", 1)[0] + ">"
+    return str(ident).rsplit("> ", 1)[0] + ">"

@@ -1,8 +1,8 @@
-"""What the generator goes by while something of people's is not valid, record in its commits.
+"""The trailers that record which configuration is in effect while some file is not valid.
 
-``In-Force`` names the newest commit where all was valid, ``Configuration`` the one whose
-configuration is in force, ``Stands-In`` each file of it that is in force in another version, as
-path and blob. So a restart and a proof find again what was in force, without guessing.
+``In-Force`` names the newest commit where all files were valid. ``Configuration`` names the commit
+whose configuration is in effect. Each ``Stands-In`` names a file that is in effect in another
+version, as path and blob. A restart and ``demandops verify`` read the state in effect from them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _NONE = "none"
 
 
 def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
-    """Return the trailers that say what is in force, where it is not all that stands there."""
+    """Return the trailers; none if all files of the commit are in effect."""
     if not snapshot.problems or snapshot.last_valid_commit is None:
         return []
     source = snapshot.config_source
@@ -41,13 +41,13 @@ def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
 
 
 def snapshot_at(repo: Repository, commit: Commit, record: LogEntry) -> Snapshot:
-    """Return what the generator went by at a commit, or goes by since.
+    """Return the snapshot that was in effect at a commit.
 
     Args:
-        record: its own newest commit up to that one.
+        record: the generator's newest commit up to that one, which has the trailers.
 
     Raises:
-        InvalidInput, StateRepoError: where something of that is not valid.
+        InvalidInput, StateRepoError: the recorded state is not valid.
     """
     if not record.first("In-Force"):
         return snapshots.load(repo, commit.id)
@@ -66,8 +66,8 @@ def snapshot_at(repo: Repository, commit: Commit, record: LogEntry) -> Snapshot:
         advance.subjects,
         lambda path: None,
     )
-    # what is wrong is found anew when the commits behind this one are taken in
-    problems = snapshot.problems or (Fault("invalid", "", "is to be looked at again"),)
+    # placeholder: advancing to later commits finds the real problems again
+    problems = snapshot.problems or (Fault("invalid", "", "is to be checked again"),)
     return replace(
         snapshot,
         other_config_source=source,

@@ -1,8 +1,8 @@
-"""People's configuration at a commit, and what of it is in force where it is not valid.
+"""The configuration at a commit, and its last valid version if a file is not valid.
 
-A broken file holds back itself and what came with it: the other files of the commits that touched
-it, for half of a commit is not what anybody merged, and the rest of its application definition. All
-else that people merge is taken in. Where that gives nothing valid, nothing is taken in.
+An invalid file is replaced by its last valid version. So are the other files of the commits that
+changed it, because half a commit is not what was merged, and the other files of its application
+definition. All other changes apply. If the result is not valid either, no change applies.
 """
 
 from __future__ import annotations
@@ -23,37 +23,37 @@ from demandops.settings import RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 
 NO_STATE_REPO = (
-    "this is no state repo, for it has no demandops.yaml; `demandops init DIR` makes one"
+    "this is not a state repo, because it has no demandops.yaml; `demandops init DIR` makes one"
 )
 
 Replacements = Mapping[str, Oid | None]
-"""Path → the blob that is in force in its place; nothing where no such file is."""
+"""Path → the blob in effect instead of the commit's; None if no such file is in effect."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigSource:
-    """Where the configuration in force is: the files of a commit, some in another version."""
+    """Where the configuration in effect is: the files of a commit, some in another version."""
 
     commit: Oid
     replacements: Replacements = field(default_factory=dict)
 
     def blobs(self, repo: Repository) -> dict[str, Oid]:
-        """Return path → blob of every file in force."""
-        found = dict(_blobs(repo, self.commit))
+        """Return path → blob of every file in effect."""
+        blobs = dict(_blobs(repo, self.commit))
         for path, blob in self.replacements.items():
-            found.pop(path, None)
+            blobs.pop(path, None)
             if blob is not None:
-                found[path] = blob
-        return found
+                blobs[path] = blob
+        return blobs
 
     def texts(self, repo: Repository) -> dict[str, str]:
-        """Return path → text of every file in force."""
+        """Return path → text of every file in effect."""
         return {path: _text(repo, blob) for path, blob in self.blobs(repo).items()}
 
 
 @dataclass(frozen=True, slots=True)
 class LastValidConfig:
-    """What of a commit's configuration can be in force; no configuration where nothing can."""
+    """The part of a commit's configuration that is valid; ``config`` is None if no part is."""
 
     config: Config | None
     source: ConfigSource
@@ -64,8 +64,8 @@ def config_at(tree: Tree) -> Config:
     """Return the configuration of one tree.
 
     Raises:
-        StateRepoError: where it is no state repo.
-        InvalidInput: with every fault of every file.
+        StateRepoError: the tree is not a state repo.
+        InvalidInput: every fault of every file.
     """
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
@@ -74,15 +74,15 @@ def config_at(tree: Tree) -> Config:
 
 
 def end_markers_at(tree: Tree) -> dict[str, str]:
-    """Return path → text of the files that say which overrides ended."""
+    """Return path → text of the markers of ended overrides."""
     return trees.texts(tree, (ended_override_file.MARKERS_ROOT,))
 
 
 def refuse_other_render_version(tree: Tree) -> None:
-    """Raise where a generator of another version writes the repo: two would undo each other's work.
+    """Raise if the repo has another render version, because two versions undo each other's work.
 
     Raises:
-        StateRepoError: saying which version it is and what to do.
+        StateRepoError: names the version and the remedy.
     """
     try:
         data = strict_yaml.load(trees.read_text(tree, ROOT_FILE) or "")
@@ -93,7 +93,7 @@ def refuse_other_render_version(tree: Tree) -> None:
         return
     remedy = "update the generator"
     if version < RENDER_VERSION:
-        remedy = "stop older generators, then have all rendered anew by `demandops upgrade`"
+        remedy = "stop older generators, then run `demandops upgrade` to render everything again"
     raise StateRepoError(
         f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
         f"{RENDER_VERSION}; {remedy}"
@@ -101,10 +101,10 @@ def refuse_other_render_version(tree: Tree) -> None:
 
 
 def newest_valid_config(commit: Commit, fault: InvalidInput) -> Config:
-    """Return the configuration of the newest commit before one that is not valid, and was.
+    """Return the configuration of the newest ancestor where it was valid.
 
     Raises:
-        InvalidInput: ``fault``, where there never was one.
+        InvalidInput: ``fault``, if there is no such ancestor.
     """
     seen = {_config_ids(commit.tree)}
     while commit.parents:
@@ -125,18 +125,20 @@ def _config_ids(tree: Tree) -> tuple[str, ...]:
 
 def load_last_valid_config(
     repo: Repository,
-    before: tuple[ConfigSource, Oid | None],
+    before: ConfigSource,
+    last_valid_commit: Oid | None,
     to: Oid,
     load: Callable[[Mapping[str, str]], Config],
 ) -> LastValidConfig:
-    """Return the configuration of a commit, with stand-ins for what is not valid.
+    """Return the configuration of a commit, with last valid versions of what is not valid.
 
     Args:
-        before: what was in force, and the newest commit where all was valid.
+        before: what was in effect before.
+        last_valid_commit: the newest commit where all files were valid.
         to: the commit.
-        load: makes a configuration of texts, or raises ``InvalidInput``.
+        load: makes a configuration from texts, or raises ``InvalidInput``.
     """
-    known, last_valid_commit = before[0].blobs(repo), before[1]
+    known = before.blobs(repo)
     blobs = dict(_blobs(repo, to))
     merged = {path for path in {*known, *blobs} if known.get(path) != blobs.get(path)}
     replacements: dict[str, Oid | None] = {}
@@ -148,7 +150,7 @@ def load_last_valid_config(
             faults += error.faults
             broken = {one.file for one in error.faults} & (merged - set(replacements))
             if not broken:
-                return LastValidConfig(None, before[0], tuple(dict.fromkeys(faults)))
+                return LastValidConfig(None, before, tuple(dict.fromkeys(faults)))
             for path in merged & _with_files_merged_together(repo, broken, last_valid_commit, to):
                 replacements[path] = known.get(path)
                 blobs.pop(path, None)
@@ -163,7 +165,7 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid | None, to: Oid
 ) -> set[str]:
-    """Return files and what came with them: in the same commit, or in the same definition."""
+    """Return files and those merged in the same commits or of the same definition."""
     together = set(broken)
     merges = list(_merges(repo, last_valid_commit, to))
     known = {
@@ -183,7 +185,7 @@ def _with_files_merged_together(
 
 
 def _merges(repo: Repository, last_valid_commit: Oid | None, to: Oid) -> Iterator[set[str]]:
-    """Yield the files that each commit changed; a merge counts as one change."""
+    """Yield the files that each commit changed; a merge changes all files of its branch."""
     walker = repo.walk(to, SortMode.TOPOLOGICAL)
     if last_valid_commit is not None:
         walker.hide(last_valid_commit)
@@ -208,5 +210,5 @@ def _blobs(repo: Repository, commit: Oid) -> Iterator[tuple[str, Oid]]:
 
 
 def _text(repo: Repository, blob: Oid) -> str:
-    found = repo[blob]
-    return found.data.decode("utf-8", "replace") if isinstance(found, Blob) else ""
+    content = repo[blob]
+    return content.data.decode("utf-8", "replace") if isinstance(content, Blob) else ""

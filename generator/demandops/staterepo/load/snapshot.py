@@ -1,7 +1,7 @@
-"""What a commit of the state repo says: configuration and ledger, loaded whole or brought forward.
+"""A commit's configuration and ledger, loaded whole or advanced from an earlier commit.
 
-Loading costs what is there, :func:`advance` what changed. A file that a person broke keeps its
-last valid version in force and is reported; nothing else stops for it.
+:func:`load` reads all files, :func:`advance` only those that changed. If a file is not valid, its
+last valid version stays in effect and the file is reported.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A commit and what it says.
+    """A commit and its state: configuration and ledger.
 
     ``keys``: the claim of each ledger file, so that the claim of a removed file is known.
     ``problems``: what is not valid; the last valid versions are in effect instead.
@@ -52,11 +52,11 @@ class Snapshot:
 
     @property
     def config_source(self) -> ConfigSource:
-        """Where the configuration in force is."""
+        """Where the configuration in effect is."""
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
-        """Return the snapshot of a commit of our own, whose state is known already."""
+        """Return the snapshot of a new commit by this program, whose state is known."""
         keys = self.keys
         for key in changes:
             path = ledger_format.path_of(key)
@@ -72,14 +72,14 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Advance:
-    """A snapshot brought forward: what people or other writers changed on the way."""
+    """A later snapshot, and the subjects that changed on the way to it."""
 
     snapshot: Snapshot
     subjects: tuple[Subject, ...]
     config_changed: bool
 
     def followed_by(self, further: Advance) -> Advance:
-        """Return both steps as one: ``further`` starts where this one ends."""
+        """Return both steps as one; ``further`` starts where this one ends."""
         return Advance(
             further.snapshot,
             tuple(dict.fromkeys((*self.subjects, *further.subjects))),
@@ -93,11 +93,11 @@ def load(
     """Load a commit whole.
 
     Args:
-        progress: told (files read, files in all) while the ledger is read.
+        progress: called with (files read, all files) while the ledger is read.
 
     Raises:
-        InvalidInput: with every fault of every file.
-        StateRepoError: where the commit holds no state repo.
+        InvalidInput: every fault of every file.
+        StateRepoError: the commit is not a state repo.
     """
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
@@ -110,10 +110,10 @@ def load(
 def load_last_valid(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Load a commit; of what is not valid there, the last version before it that was.
+    """Load a commit, with last valid versions of the files that are not valid.
 
     Raises:
-        InvalidInput, StateRepoError: where there never was a valid configuration.
+        InvalidInput, StateRepoError: there never was a valid configuration.
     """
     commit = trees.commit_of(repo, revision)
     problems: list[Fault] = []
@@ -132,9 +132,9 @@ def load_last_valid(
             ledger, keys = ledger.replace(claim.key, claim), keys.insert(path, claim.key)
     problems += faults
     last_valid_commit = None if problems else commit.id
-    held = tuple(dict.fromkeys(found.file for found in faults))
+    quarantined = tuple(dict.fromkeys(fault.file for fault in faults))
     return Snapshot(
-        commit.id, State.of(config, ledger), keys, tuple(problems), last_valid_commit, held
+        commit.id, State.of(config, ledger), keys, tuple(problems), last_valid_commit, quarantined
     )
 
 
@@ -152,7 +152,7 @@ def _last_valid_claim(commit: Commit, path: str) -> Claim | None:
 
 
 def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Tell whether a commit that is not the generator's changed generated files on the way."""
+    """Return whether a person changed generated files between two commits."""
     walker = repo.walk(to, SortMode.TOPOLOGICAL)
     walker.hide(before)
     for commit in walker:
@@ -194,9 +194,9 @@ def _text(repo: Repository, blob: Oid) -> str:
 
 
 def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
-    """Bring a snapshot forward to another commit, reading only what differs.
+    """Advance a snapshot to another commit, reading only what differs.
 
-    What is not valid there is left as it was before, and told in the new snapshot's problems.
+    What is not valid stays as it was and is listed in the new snapshot's problems.
     """
     before, after = trees.commit_of(repo, snapshot.commit).tree, trees.commit_of(repo, to).tree
     last_valid_config.refuse_other_render_version(after)
@@ -206,7 +206,8 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     if snapshot.problems or _differ(before, after, CONFIG_ROOTS):
         now = last_valid_config.load_last_valid_config(
             repo,
-            (snapshot.config_source, snapshot.last_valid_commit),
+            snapshot.config_source,
+            snapshot.last_valid_commit,
             to,
             lambda files: _load_and_rehearse(files, state),
         )
@@ -220,7 +221,7 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     if ended != state.config.ended:
         state = replace(state, config=state.config.with_ended(ended))
         config_changed = True
-    ledger, keys, subjects, held = state.ledger, snapshot.keys, list[Subject](), list[str]()
+    ledger, keys, subjects, invalid = state.ledger, snapshot.keys, list[Subject](), list[str]()
     changed = dict(
         trees.differences(repo, _subtree(before, "ledger"), _subtree(after, "ledger"), "ledger/")
     )
@@ -239,18 +240,16 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             claim = ledger_format.read(_text(repo, blob), path)
         except InvalidInput as error:
             problems += error.faults
-            held.append(path)
+            invalid.append(path)
             continue
         if ledger.get(claim.key) != claim:
             ledger = ledger.replace(claim.key, claim)
             subjects.append(claim.subject)
         keys = keys.insert(path, claim.key)
-    state, last_valid_commit = (
-        replace(state, ledger=ledger),
-        snapshot.last_valid_commit if problems else to,
-    )
+    state = replace(state, ledger=ledger)
+    last_valid_commit = snapshot.last_valid_commit if problems else to
     return Advance(
-        Snapshot(to, state, keys, tuple(problems), last_valid_commit, tuple(held), source),
+        Snapshot(to, state, keys, tuple(problems), last_valid_commit, tuple(invalid), source),
         tuple(dict.fromkeys(subjects)),
         config_changed,
     )
@@ -261,7 +260,7 @@ def _differ(one: Tree, other: Tree, roots: Iterable[str]) -> bool:
 
 
 def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
-    """Return the configuration of a commit, tried on invented demands if it changed."""
+    """Return the configuration of these files; if it changed, render sample demands with it."""
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config = load_config(files)
@@ -276,9 +275,9 @@ def _subtree(tree: Tree, name: str) -> Tree | None:
 
 
 class ReadAhead:
-    """What was read behind the published snapshot, and could not be built on yet.
+    """Remembers what was read after the published snapshot until a commit is published on it.
 
-    With writers that are faster, each try would read more than the one before, and be too late.
+    If other writers are faster, each attempt would otherwise read more and again be too late.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
-"""The writer: a line of commits on top of a snapshot, published together or laid anew.
+"""The commits of one batch, made on top of a snapshot and published together.
 
-Each demand is one commit with its ledger and rendered files. :class:`Line` holds what is committed
-here and not yet published; when the remote has moved it is dropped and the demands are judged
-again on the new tip.
+Each demand is one commit with its ledger and rendered files. :class:`CommitBatch` holds the commits
+until they are published. If the remote has moved, the batch is dropped and its demands are
+evaluated again on the new tip.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _PAUSE_S = 0.02
 
 
 class CommitBatch:
-    """Commits made on top of one published tip, in the order of the demands."""
+    """Commits on top of one published tip, in the order of the demands."""
 
     def __init__(self, repository: StateRepository, start: Snapshot) -> None:
         self._repository = repository
@@ -57,7 +57,7 @@ class CommitBatch:
         self.head = start
 
     def read(self, path: str) -> str | None:
-        """Return a file as it is at the head of the line."""
+        """Return a file's text at the newest commit of the batch, or None."""
         return trees.read_text(self._tree, path)
 
     def commit(
@@ -68,10 +68,10 @@ class CommitBatch:
         now: datetime,
         proposal: str = "",
     ) -> str:
-        """Commit one demand on top of the line and return the commit's id.
+        """Commit one demand and return the commit's id.
 
         Args:
-            proposal: the branch that it awaits approval on; nothing where it needs none.
+            proposal: the branch that it awaits approval on; empty if it needs no approval.
         """
         more = [*self._settled, *in_force_trailers.trailers_of(self.head)]
         if proposal:
@@ -92,30 +92,30 @@ class CommitBatch:
         now: datetime,
         keys: Iterable[ClaimKey] = (),
     ) -> str:
-        """Commit what a person had done by a command.
+        """Commit files and return the commit's id.
 
-        ``state`` is what the files give then, ``keys`` the claims that changed with them.
+        ``state`` is the state after the commit, ``keys`` are the claims that it changes.
         """
         made = self._write(files, text, author, now)
         self.head = self.head.with_commit(made, state, keys)
         return str(made)
 
     def note_settled(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
-        """Have the next commit name a demand that changed nothing, if there is a next one.
+        """Have the next commit, if any, name a demand that changed nothing.
 
-        Should the process die before it answers, that demand must not be judged again behind a
-        release that came after it.
+        If the process dies before it answers, a restart must not evaluate that demand again after
+        a later release.
         """
         self._settled.append((f"{outcome}-Operation-Id", operation))
 
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
-        """Commit what people's changes ask of the rendered files, if anything.
+        """Render what people changed and commit the files that differ, if any.
 
-        What cannot be planned or rendered (a node that is in use is gone from the inventory) is
-        left as it was before, and told in the head's problems.
+        What cannot be planned or rendered (a claim's node was removed from the inventory) stays
+        as it was and is listed in the head's problems.
         """
-        snapshot, good, found = self._quarantine(advance.snapshot, before, advance.subjects)
-        state, problems = snapshot.state, [*snapshot.problems, *found]
+        snapshot, good, faults = self._quarantine(advance.snapshot, before, advance.subjects)
+        state, problems = snapshot.state, [*snapshot.problems, *faults]
         change = Changeset({}, ())
         keys: tuple[ClaimKey, ...] = ()
         whole = advance.config_changed
@@ -126,21 +126,22 @@ class CommitBatch:
                 problems += error.faults
                 config = before.state.config.with_ended(state.config.ended)
                 state = replace(before.state, ledger=state.ledger, config=config)
-                snapshot, good, found = self._quarantine(
+                snapshot, good, faults = self._quarantine(
                     replace(snapshot, state=state), before, good
                 )
                 state, whole = snapshot.state, False
                 snapshot = replace(snapshot, other_config_source=before.config_source)
-                problems += found
+                problems += faults
         if not whole:
-            state, change, keys = self._render_subjects(state, before, good, (problems, now))
-        state, begun = _start_leases(state, now)
-        change = replace(change, files={**change.files, **begun})
+            state, change, keys = self._render_subjects(state, before, good, problems, now)
+        state, started = _start_leases(state, now)
+        change = replace(change, files={**change.files, **started})
         last_valid_commit = before.last_valid_commit if problems else snapshot.commit
         self.head = replace(
             snapshot, state=state, problems=tuple(problems), last_valid_commit=last_valid_commit
         )
-        files = {**change.files, **self._report(problems, before)}
+        report = self._report(problems, before)
+        files = {**change.files, **report}
         if files:
             overrides = [*differing(before.state.config, state.config), *change.overrides]
             overrides += commit_message.keep_override_paths(keys)
@@ -157,6 +158,7 @@ class CommitBatch:
                     *authorship.caused_by_trailers(causes),
                     *in_force_trailers.trailers_of(self.head),
                 ],
+                reports=bool(report),
             )
             made = self._write(files, text, authorship.follow_author(causes, now), now)
             self.head = self.head.with_commit(made, state, keys)
@@ -167,81 +169,86 @@ class CommitBatch:
         return quarantine.quarantine_invalid(self._objects, snapshot, before, subjects, self.read)
 
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
-        """Return the report on what is not valid, where it is not what stands there already."""
-        standing = self.read(problem_report.PATH)
+        """Return the problem report, if it changed."""
+        current = self.read(problem_report.PATH)
         origin = authorship.FaultOrigins(
             self._objects, before.last_valid_commit or before.commit, self.start.commit
         )
         wanted = problem_report.write(
-            problem_report.with_origins(problems, problem_report.read(standing), origin)
+            problem_report.with_origins(problems, problem_report.read(current), origin)
         )
-        return {} if wanted == standing else {problem_report.PATH: wanted}
+        return {} if wanted == current else {problem_report.PATH: wanted}
 
     def _render_for_new_config(
         self, state: State, before: Snapshot, subjects: Iterable[Subject], now: datetime
     ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
-        """Render everything for a configuration that changed."""
+        """Render everything for a changed configuration."""
         marked = last_valid_config.end_markers_at(self._tree)
-        taken = taken_in(_books(before.state), _books(state), subjects, marked, now)
-        state = _with(state, taken)
-        return state, self.render_all(state, taken.files), taken.keys
+        applied = taken_in(
+            _ledger_and_config(before.state), _ledger_and_config(state), subjects, marked, now
+        )
+        state = _with_ledger_and_config(state, applied)
+        return state, self.render_all(state, applied.files), applied.keys
 
     def end_override(self, override: Override, now: datetime) -> None:
-        """Commit that an override's time is over, and what follows.
+        """Commit the end of an expired override, and what it changes.
 
         Raises:
-            Refused, InvalidInput: where what is left cannot be planned or rendered.
+            Refused, InvalidInput: the state without the override cannot be planned or rendered.
         """
         state = self.head.state
-        taken = ended(_books(state), override, now)
-        state = _with(state, taken)
-        change = self.render_all(state, taken.files)
+        applied = ended(_ledger_and_config(state), override, now)
+        state = _with_ledger_and_config(state, applied)
+        change = self.render_all(state, applied.files)
         more = in_force_trailers.trailers_of(self.head)
-        text = commit_message.of_override_end(override, change.releases, taken.keys, more)
+        text = commit_message.of_override_end(override, change.releases, applied.keys, more)
         made = self._write(change.files, text, commit_message.generator_signature(now), now)
-        self.head = self.head.with_commit(made, state, taken.keys)
+        self.head = self.head.with_commit(made, state, applied.keys)
 
     def _render_subjects(
         self,
         state: State,
         before: Snapshot,
         subjects: Iterable[Subject],
-        noted: tuple[list[Fault], datetime],
+        problems: list[Fault],
+        now: datetime,
     ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
-        """Plan and render the subjects that people changed; one that fails stays as it was."""
-        problems, now = noted
+        """Plan and render the subjects that people changed; one that fails stays as it was.
+
+        Adds the faults of those that fail to ``problems``.
+        """
         good, keys = list[Subject](), list[ClaimKey]()
-        books = before.state.ledger
+        old = before.state.ledger
         files: dict[str, str | None] = {}
         for subject in subjects:
-            ledger, own = kept_claims.kept(books, state.ledger, [subject], (state.config, now))
+            ledger, changed = kept_claims.kept(old, state.ledger, [subject], (state.config, now))
             tried = replace(state, ledger=ledger)
             try:
-                consequence(tried, books, [subject], self.read)
+                consequence(tried, old, [subject], self.read)
             except InvalidInput as error:
                 problems += error.faults
-                state = replace(state, ledger=state.ledger.restored(subject, books))
+                state = replace(state, ledger=state.ledger.restored(subject, old))
                 continue
-            files |= files_of(state.ledger, ledger, own)
+            files |= files_of(state.ledger, ledger, changed)
             state = tried
             good.append(subject)
-            keys += own
-        change = consequence(state, books, good, self.read)
+            keys += changed
+        change = consequence(state, old, good, self.read)
         return state, replace(change, files={**files, **change.files}), tuple(keys)
 
     def render_all(
         self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
     ) -> Changeset:
-        """Return all generated files that differ from what stands, with ``more`` of the ledger.
+        """Return all generated files that differ from the current ones, and the files of ``more``.
 
         Raises:
-            Refused, InvalidInput: where a release cannot be planned or rendered.
+            Refused, InvalidInput: a release cannot be planned or rendered.
         """
         generated = trees.texts(self._tree, GENERATED_ROOTS)
         files: dict[str, str | None] = dict(rendered(state, generated))
         changes = []
-        standing = {path for path in generated if path.endswith(".yaml")}
-        for path in standing - set(files):
+        current = {path for path in generated if path.endswith(".yaml")}
+        for path in current - set(files):
             files[path] = None
         for path in sorted(files):
             old = self.read(path)
@@ -273,18 +280,18 @@ class CommitBatch:
             except signing.SigningFailed:
                 raise
             except (OSError, pygit2.GitError, KeyError, StateRepoError):
-                # git's housekeeping removes a folder of loose objects just as one is put there,
-                # or moves one into a pack just as it is looked for
+                # a concurrent `git gc` may remove the folder of a new loose object, or pack an
+                # object while it is read
                 if attempt == _ATTEMPTS:
                     raise
                 time.sleep(_PAUSE_S * attempt)
         return made
 
     def publish(self) -> bool:
-        """Publish the line; false where the state repo has moved meanwhile.
+        """Publish the commits; return false if the state repo has moved.
 
         Raises:
-            RemoteAway, PushDenied: where it could not be published for another reason.
+            RemoteAway, PushDenied: they could not be published for another reason.
         """
         if self.head.commit == self.start.commit:
             return True
@@ -292,43 +299,42 @@ class CommitBatch:
 
 
 def _start_leases(state: State, now: datetime) -> tuple[State, dict[str, str]]:
-    """Start the leases of claims that a person approved; return their files as well.
+    """Start the leases of claims that a person approved; return state and changed files.
 
-    A lease that counted from the demand could be over before anybody has approved it.
+    They start at approval because a lease could otherwise end before the demand is approved.
     """
     ledger, files = state.ledger, {}
     for claim in ledger.unstarted():
-        assert claim.lease is not None  # noqa: S101 - that is what was looked for
-        begun = replace(claim, lease=claim.lease.begun(now))
-        ledger = ledger.replace(claim.key, begun)
-        files[ledger_format.path_of(claim.key)] = ledger_format.write(begun)
+        assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
+        started = replace(claim, lease=claim.lease.begun(now))
+        ledger = ledger.replace(claim.key, started)
+        files[ledger_format.path_of(claim.key)] = ledger_format.write(started)
     return replace(state, ledger=ledger), files
 
 
-def _books(state: State) -> tuple[Ledger, Config]:
+def _ledger_and_config(state: State) -> tuple[Ledger, Config]:
     return state.ledger, state.config
 
 
-def _with(state: State, taken: TakenIn) -> State:
-    return replace(state, ledger=taken.ledger, config=taken.config)
+def _with_ledger_and_config(state: State, applied: TakenIn) -> State:
+    return replace(state, ledger=applied.ledger, config=applied.config)
 
 
 def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
-    """Load the books at the generator's last commit.
+    """Return the snapshot of the generator's last commit.
 
-    What people changed since then is taken in by :func:`demandops.staterepo.load.snapshot.advance`,
-    as it would have been had the generator been running.
+    :func:`demandops.staterepo.load.snapshot.advance` then applies what people changed since.
 
     Raises:
-        InvalidInput: with every fault, where that commit is not valid.
-        StateRepoError: where this is no state repo.
+        InvalidInput: that commit never had a valid configuration.
+        StateRepoError: it is not a state repo.
     """
     tip = repository.tip()
     last_valid_config.refuse_other_render_version(trees.commit_of(repository.objects, tip).tree)
     base = commit_log.last_generator_commit(repository.objects, tip)
     base = base or tip
     made = trees.commit_of(repository.objects, base)
-    told = commit_log.entry_of(made)
-    if told.first("In-Force"):
-        return in_force_trailers.snapshot_at(repository.objects, made, told)
+    record = commit_log.entry_of(made)
+    if record.first("In-Force"):
+        return in_force_trailers.snapshot_at(repository.objects, made, record)
     return snapshots.load_last_valid(repository.objects, base, progress)
