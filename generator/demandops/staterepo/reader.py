@@ -21,7 +21,7 @@ from demandops.staterepo.git import connect
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.address import is_url
 from demandops.staterepo.git.repository import StateRepository
-from demandops.staterepo.history import commit_log, path_history, revisions
+from demandops.staterepo.history import authorship, commit_log, path_history, revisions
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.history.path_history import PathHistory
 from demandops.staterepo.load import (
@@ -265,7 +265,7 @@ class Reader:
 
     def git_user(self) -> tuple[str, str]:
         """Return name and e-mail address of who runs this program."""
-        return rollback_target.person(self._repository.objects)
+        return authorship.git_user(self._repository.objects)
 
 
 @contextmanager

@@ -34,12 +34,14 @@ from demandops.staterepo.git.repository import (
 )
 
 _REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
-_BEHIND = re.compile(r"\[rejected\]")
-_REMOTE_SAYS = re.compile(r"remote: ?(.*)")
-_REFUSED = re.compile(r"\[remote rejected\] \((.*)\)")
-_PASSING = re.compile(r"lock|failed to update ref|incorrect old value")
+_REMOTE_MOVED = re.compile(r"\[rejected\]")
+_REMOTE_MESSAGE = re.compile(r"remote: ?(.*)")
+_REMOTE_REJECTED = re.compile(r"\[remote rejected\] \((.*)\)")
+_TEMPORARY = re.compile(r"lock|failed to update ref|incorrect old value")
 _POLL_S = 0.02
-_NO_RIGHT = re.compile(r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE)
+_NO_PERMISSION = re.compile(
+    r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
+)
 
 Notify = Callable[[str], None]
 
@@ -55,9 +57,7 @@ class RemoteRepository(StateRepository):
         self._folder = folder
         self._aborted = False
         self._process: subprocess.Popen[bytes] | None = None
-        for lock in folder.rglob(
-            "*.lock"
-        ):  # only this process uses the folder: a killed one left it
+        for lock in folder.rglob("*.lock"):  # of a killed process: no other uses the folder
             lock.unlink(missing_ok=True)
         if not self._is_usable():
             self._clone(notify)
@@ -131,7 +131,7 @@ class RemoteRepository(StateRepository):
             self._run_git(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
         except git.GitCommandError as error:
             text = without_secrets(f"{error.stdout}\n{error.stderr}")
-            if _BEHIND.search(text):  # git compared with the remote first: nothing was sent
+            if _REMOTE_MOVED.search(text):  # git compared with the remote first: nothing was sent
                 return False
             tip = self.refresh()
             if tip == commit or self.objects.descendant_of(tip, commit):
@@ -225,14 +225,14 @@ class RemoteRepository(StateRepository):
 
     def _push_error(self, text: str) -> StateRepoError:
         """Return ``PushDenied`` if the remote rejected the push, else ``RemoteAway``."""
-        refused = _REFUSED.search(text)
-        if refused and not _PASSING.search(refused[1]):
-            message = " ".join(line.strip(" '") for line in _REMOTE_SAYS.findall(text)).strip()
-            reason = f"{refused[1]}: {message}" if message else refused[1]
+        rejected = _REMOTE_REJECTED.search(text)
+        if rejected and not _TEMPORARY.search(rejected[1]):
+            message = " ".join(line.strip(" '") for line in _REMOTE_MESSAGE.findall(text)).strip()
+            reason = f"{rejected[1]}: {message}" if message else rejected[1]
             return PushDenied(f"{self.address} rejects the push: {reason}")
-        if _NO_RIGHT.search(text):
+        if _NO_PERMISSION.search(text):
             return PushDenied(f"{self.address} rejects the push: {_last_line(text)}")
-        reason = refused[1] if refused else _last_line(text)
+        reason = rejected[1] if rejected else _last_line(text)
         return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
 
     @property

@@ -6,6 +6,7 @@ A commit is by a person if no generator made it, on any machine.
 
 from __future__ import annotations
 
+import getpass
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from datetime import datetime, timezone
 import git
 import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
+from pygit2 import Config as GitConfig
 from pygit2.enums import SortMode
 
 from demandops.config.config import CONFIG_ROOTS
@@ -134,3 +136,21 @@ def operator() -> str:
     except git.GitCommandError:
         return ""
     return str(ident).rsplit("> ", 1)[0] + ">"
+
+
+def git_user(repo: Repository) -> tuple[str, str]:
+    """Return name and e-mail address of who runs this program, from git or else the login."""
+    settings = repo.config.snapshot()
+    try:
+        login = getpass.getuser()
+    except (KeyError, OSError):  # a container's user has no passwd entry
+        login = "unknown"
+    name = _setting(settings, "user.name") or login
+    return name, _setting(settings, "user.email") or f"{login}@demandops.invalid"
+
+
+def _setting(settings: GitConfig, key: str) -> str:
+    try:
+        return settings[key] or ""
+    except KeyError:
+        return ""

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import getpass
 from datetime import datetime, timezone
 
-from pygit2 import Config as GitConfig
 from pygit2 import Oid, Repository
 
 from demandops.config.config import CONFIG_ROOTS
@@ -56,21 +54,3 @@ def config_files_changed_since(repo: Repository, commit: str | Oid, tip: str | O
     before, after = commit_of(repo, commit).tree, commit_of(repo, tip).tree
     changed = trees.differences(repo, before, after, "")
     return sorted(path for path, _ in changed if path.split("/")[0] in CONFIG_ROOTS)
-
-
-def person(repo: Repository) -> tuple[str, str]:
-    """Return name and e-mail address of who runs this program, from git or else the login."""
-    settings = repo.config.snapshot()
-    try:
-        login = getpass.getuser()
-    except (KeyError, OSError):  # a container's user has no passwd entry
-        login = "unknown"
-    name = _configured(settings, "user.name") or login
-    return name, _configured(settings, "user.email") or f"{login}@demandops.invalid"
-
-
-def _configured(settings: GitConfig, key: str) -> str:
-    try:
-        return settings[key] or ""
-    except KeyError:
-        return ""

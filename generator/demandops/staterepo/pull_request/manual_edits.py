@@ -28,11 +28,11 @@ def changed_paths(files: Mapping[str, str], before: Mapping[str, str]) -> list[s
     return [
         path
         for path in sorted({*files, *before})
-        if files.get(path) != before.get(path) and _is_generators(path)
+        if files.get(path) != before.get(path) and _is_written_by_generator(path)
     ]
 
 
-def _is_generators(path: str) -> bool:
+def _is_written_by_generator(path: str) -> bool:
     root = path.split("/", maxsplit=1)[0]
     if trees.is_readme(path):
         return False
