@@ -204,17 +204,17 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
     config_changed = _has_manual_edit(repo, snapshot.commit, to)
     source = snapshot.other_config_source
     if snapshot.problems or _differ(before, after, CONFIG_ROOTS):
-        now = last_valid_config.load_last_valid_config(
+        valid = last_valid_config.load_last_valid_config(
             repo,
             snapshot.config_source,
             snapshot.last_valid_commit,
             to,
             lambda files: _load_and_rehearse(files, state),
         )
-        problems += now.faults
-        source = now.source if problems else None
-        if now.config is not None:
-            config = now.config.with_ended(state.config.ended)
+        problems += valid.faults
+        source = valid.source if problems else None
+        if valid.config is not None:
+            config = valid.config.with_ended(state.config.ended)
             config_changed = config_changed or config != state.config
             state = State(config, State.of(config, state.ledger).engine, state.ledger)
     ended = ended_override_file.read(last_valid_config.end_markers_at(after))
