@@ -59,12 +59,12 @@ def measure(repo: Path) -> None:
     with reader.opened(str(repo)) as opened:
         tip = opened.commit()
         timed("loading the newest commit", lambda: len(opened.snapshot().state.ledger))
-        old = opened.path_called("od-edge00001-v00001x0", tip)
-        often = opened.path_called(f"of-{fleet.edge_id(0)}-fusion", tip) or _fusion(opened, tip)
+        old = opened.release_path("od-edge00001-v00001x0", tip)
+        often = opened.release_path(f"of-{fleet.edge_id(0)}-fusion", tip) or _fusion(opened, tip)
         timed("history of a file that is as it was at first", lambda: _told(opened, old, tip))
         timed("history of a file that changed often", lambda: _told(opened, often, tip))
         gone = f"od-{fleet.edge_id(0)}-{fleet.SPARE}00000"
-        timed("history of a release that stopped", lambda: opened.path_called(gone, tip))
+        timed("history of a release that stopped", lambda: opened.release_path(gone, tip))
         first = f"{[*opened.log()][-1].time:%Y-%m-%dT%H:%M:%S}"
         timed("a time at the far end", lambda: opened.commit(first)[:10])
         timed("log of one requester", lambda: sum(1 for e in opened.log() if gone in e.summary))
@@ -74,7 +74,7 @@ def measure(repo: Path) -> None:
 
 
 def _fusion(opened: reader.Reader, tip: str) -> str:
-    files = opened.differing(opened.commit("main~2"), tip, "clusters")
+    files = opened.changed_files(opened.commit("main~2"), tip, "clusters")
     return next(iter(files), "clusters")
 
 

@@ -327,7 +327,9 @@ class TestTimes:
     def test_before_the_first_commit(self, demandops: Run, played: Any) -> None:
         ran = demandops("bookkeeping", "--at", "2020-01-01", "--state-repo", played.path)
         assert (ran.code, ran.out) == (1, "")
-        assert ran.err.startswith("error: at 2020-01-01 23:59:59 UTC there was no state repo yet; ")
+        assert ran.err.startswith(
+            "error: at 2020-01-01 23:59:59 UTC the state repo did not exist yet; "
+        )
 
     def test_diff_by_time(self, ask: Run, played: Any) -> None:
         found = ask("diff", "2026-01-31", "main")

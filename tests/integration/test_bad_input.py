@@ -88,7 +88,7 @@ class TestDefectsOfTheReference:
     """Facts §5, by number."""
 
     def test_01_a_goal_that_cannot_be_honoured_fails(self, demandops: Send, state: Any) -> None:
-        """Here the remote takes no push: no success that hides it in a text."""
+        """Here the remote rejects every push: no success that hides it in a text."""
         hook = state.path / "hooks" / "pre-receive"
         hook.parent.mkdir(exist_ok=True)
         hook.write_text("#!/bin/sh\necho 'closed for today' >&2\nexit 1\n")
@@ -98,7 +98,7 @@ class TestDefectsOfTheReference:
         ran = demandops("request", "-", "--state-repo", url, "--output", "json", stdin=given)
         ((field, message),) = refused(ran)
         assert (field, state.tip) == ("", before)
-        assert message.startswith(f"{url} takes no push: ")
+        assert message.startswith(f"{url} rejects the push: ")
 
     def test_02_several_brokers_and_none_that_matches_is_a_message(
         self, request_json: Send, state: Any

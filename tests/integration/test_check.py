@@ -84,7 +84,7 @@ def test_a_chart_that_changed_without_a_new_version_is_caught(checkout: Path, ch
     assert code == 1
     assert errors == (
         f"error: {CHART}/Chart.yaml: version: is still 0.1.0, but values.yaml changed; raise it "
-        "here and at charts.object-fusion in registry/charts.yaml, or no cluster takes it\n"
+        "here and at charts.object-fusion in registry/charts.yaml, or no cluster applies it\n"
     )
 
 
@@ -127,8 +127,8 @@ def test_a_generated_file_edited_by_hand_is_told(checkout: Path, check: Check) -
     code, _, errors = check()
     assert code == 1
     assert errors == (
-        "error: bootstrap/c-its.yaml: is generated, and an edit by hand is lost; take it back, and "
-        "change demandops.yaml, inventory/ or policy/access-domains.yaml that it follows from\n"
+        "error: bootstrap/c-its.yaml: is generated, so a manual edit is lost; revert it, and "
+        "change demandops.yaml, inventory/ or policy/access-domains.yaml instead\n"
     )
 
 
@@ -150,7 +150,7 @@ def test_a_folder_that_is_no_git_checkout_is_checked_all_the_same(
     edit(checkout / "inventory" / "nodes.yaml", "cluster: c-its", "cluster: c-itz")
     assert check()[0] == 1
     code, _, errors = check("--base", "HEAD")
-    assert (code, errors) == (1, f"error: {checkout} is no Git checkout; leave out --base\n")
+    assert (code, errors) == (1, f"error: {checkout} is not a Git checkout; leave out --base\n")
 
 
 def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None:
@@ -179,7 +179,7 @@ def test_the_generators_notes_are_not_edited_by_hand(checkout: Path, check: Chec
     report.unlink()
     code, _, err = check()
     assert code == 1
-    assert err.startswith("error: .demandops/reports/problems.yaml: is the generator's own")
+    assert err.startswith("error: .demandops/reports/problems.yaml: is written by the generator")
 
 
 def test_an_application_definition_that_is_in_use_cannot_be_deleted(

@@ -466,7 +466,7 @@ class TestLog:
         assert [(row[0], row[2], row[3], row[4]) for row in rows] == [
             (joined.tip[:10], "by hand", "A person", "By hand"),
             (rows[1][0], "join", "vehicle00", f"Join {APP}, vehicle00/edge"),
-            (rows[2][0], "init", "DemandOps generator", "Lay down the state repo"),
+            (rows[2][0], "init", "DemandOps generator", "Create the state repo"),
         ]
 
     def test_as_many_and_from_where_one_says(
@@ -636,8 +636,8 @@ class TestCheck:
         ran = demandops("check", tmp_path)
         assert (ran.code, ran.out) == (1, "")
         assert ran.err == (
-            f"error: {tmp_path} is no state repo, for it has no demandops.yaml; `demandops init` "
-            "makes one\n"
+            f"error: {tmp_path} is not a state repo, because it has no demandops.yaml; `demandops "
+            "init` makes one\n"
         )
 
 
@@ -675,7 +675,7 @@ class TestStateRepo:
         ran = demandops(*command, "--state-repo", folder, stdin=text(perception()))
         assert (ran.code, ran.out) == (1, "")
         assert ran.err == (
-            f"error: {folder} has 'main' checked out, and its files would fall behind the commits; "
+            f"error: {folder} has 'main' checked out, so its files would become outdated; "
             f"use a bare clone: git clone --bare {folder} {folder}.git\n"
         )
 
@@ -708,7 +708,8 @@ class TestStateRepo:
         ran = demandops("bookkeeping", "--state-repo", f"{scheme}sh")
         assert (ran.code, ran.out) == (1, "")
         assert ran.err == (
-            f"error: '{scheme}' is no way to reach a state repo; use https, ssh, git or file\n"
+            f"error: a state repo's address cannot start with '{scheme}'; use https, ssh, git or "
+            "file\n"
         )
 
     def test_what_is_no_state_repo_is_told_with_the_remedy(
@@ -725,7 +726,7 @@ class TestStateRepo:
             ),
             (
                 folder,
-                f"{folder} is no Git repository; make one with `demandops init {folder} --bare`",
+                f"{folder} is not a Git repository; make one with `demandops init {folder} --bare`",
             ),
             (
                 empty,
@@ -745,8 +746,8 @@ class TestStateRepo:
             ran = demandops(*command, "--state-repo", folder, stdin=text(perception()))
             assert (ran.code, ran.out) == (1, "")
             assert ran.err == (
-                "error: this is no state repo, for it has no demandops.yaml; `demandops init DIR` "
-                "makes one\n"
+                "error: this is not a state repo, because it has no demandops.yaml; `demandops "
+                "init DIR` makes one\n"
             )
 
     def test_a_newer_generators_state_repo_is_refused(self, demandops: Run, state: Any) -> None:

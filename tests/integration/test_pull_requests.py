@@ -21,7 +21,7 @@ EDGE = "clusters/c-its/perception/edge"
 FUSION = f"{EDGE}/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"
 CLIENT = "clusters/c-its/perception/vehicle00/mqtt-vehicle00-edge-source-d3ca91c2df6c.yaml"
-LOST = "is generated, and an edit by hand is lost; take it back"
+LOST = "is generated, so a manual edit is lost; revert it"
 
 Check = Callable[..., tuple[int, str, str]]
 
@@ -182,8 +182,7 @@ def test_other_edits_become_the_effect_that_is_made_for_them(
 
 def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, check: Check) -> None:
     edit(branch / DETECTION, ("interval: 10m", "interval: 1m"))
-    assert check()[2] == f"error: {DETECTION}: {LOST}, and change the configuration that it " \
-        "follows from\n"  # fmt: skip
+    assert check()[2] == f"error: {DETECTION}: {LOST}, and change the configuration instead\n"
     (branch / DETECTION).write_text("kind: [\n")
     assert check()[0] == 1
 
@@ -213,18 +212,16 @@ def test_what_is_deleted_added_or_the_generators_own_is_refused_with_what_to_do(
     (branch / ".demandops" / "report.yaml").write_text("all: well\n")
     code, out, errors = check()
     assert code == 1
-    stopped = (
-        "; to have it stopped, merge overrides/{} as shown, or delete the claims in ledger/ that "
-        "it follows from"
-    )
+    stopped = "; to stop the release, merge overrides/{} as shown, or delete its claims in ledger/"
     assert errors.splitlines() == [
-        "error: .demandops/report.yaml: is the generator's own, and written anew by it; take the "
-        "edit back",
-        f"error: {EDGE}/extra.yaml: is generated, and what no demand asks for is removed; take it "
-        "away, and demand it: demandops request",
+        "error: .demandops/report.yaml: is written by the generator, which undoes the edit; "
+        "revert it",
+        f"error: {EDGE}/extra.yaml: is in a generated folder, where files without a demand are "
+        "removed; delete it and use `demandops request`",
         f"error: {DETECTION}: {LOST}{stopped.format('od-edge-station00.yaml')}",
         f"error: {CLIENT}: {LOST}{stopped.format(Path(CLIENT).name)}",
-        "error: ledger/notes.yaml: is no claim's place, and the generator removes it; take it away",
+        "error: ledger/notes.yaml: is not the path of a claim, so the generator removes it; "
+        "delete it",
     ]
     assert "select:\n- connections:\n  - vehicle00/edge\ndeny: true\n" in out
     assert out.count("deny: true") == 2
@@ -357,7 +354,7 @@ def test_a_symbolic_link_is_not_followed(
     assert {
         "file": "inventory/brokers.yaml",
         "field": "",
-        "message": "is a symbolic link, which is not followed; put a file there",
+        "message": "is a symbolic link, which is not followed; replace it by a file",
     } in data["faults"]
     assert "hunter2" not in json.dumps(data)
 
@@ -368,8 +365,8 @@ def test_the_check_of_another_render_version_says_so(
     monkeypatch.setattr(checking, "RENDER_VERSION", 2)
     assert check()[2] == (
         "error: demandops.yaml: renderVersion: is 1, but this program renders version 2; check "
-        "with the program that the generator runs, or have all rendered anew by `demandops "
-        "upgrade`\n"
+        "with the generator's version of the program, or run `demandops upgrade` to render "
+        "everything again\n"
     )
 
 
@@ -419,8 +416,8 @@ def test_without_a_remote_main_is_compared_with(
 
 
 SHALLOW = (
-    "this clone is shallow and does not hold the commit that the edit started from; fetch all of "
-    "it: git fetch --unshallow origin (in a pipeline fetch-depth: 0, or GIT_DEPTH: 0)"
+    "this clone is shallow and lacks the commit that the edit started from; fetch all commits: "
+    "git fetch --unshallow origin (in a pipeline fetch-depth: 0, or GIT_DEPTH: 0)"
 )
 
 
@@ -452,12 +449,12 @@ def test_a_shallow_clone_is_told_how_to_become_whole(
 def test_a_base_that_is_none_is_told(branch: Path, check: Check) -> None:
     code, out, errors = check("--base", "nowhere")
     assert (code, out) == (1, "")
-    assert errors.startswith("error: 'nowhere' is no commit")
+    assert errors.startswith("error: 'nowhere' is not a commit")
     git(branch, "checkout", "--quiet", "--orphan", "alone")
     commit(branch)
     assert check()[2] == (
-        "error: HEAD and refs/remotes/origin/main have no commit in common; name with --base what "
-        "the edit is to be merged into\n"
+        "error: HEAD and refs/remotes/origin/main have no commit in common; name the merge "
+        "target with --base\n"
     )
 
 

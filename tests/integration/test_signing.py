@@ -218,8 +218,8 @@ class TestKeysThatCannotSign:
     def test_none(self, book: Run, state: Any, tmp_path: Path) -> None:
         key = tmp_path / "nothing"
         assert self.told(book, state, key) == (
-            f"error: signing key {key} is no file; make one with `ssh-keygen -t ed25519 -f {key}`, "
-            "or name the one you have\n"
+            f"error: signing key {key} is not a file; make one with `ssh-keygen -t ed25519 -f "
+            f"{key}`, or name an existing one\n"
         )
 
     def test_a_passphrase(self, book: Run, state: Any, tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ class TestKeysThatCannotSign:
         key = tmp_path / "key"
         key.write_text("hello\n")
         key.chmod(stat.S_IRUSR)
-        assert self.told(book, state, key).startswith(f"error: signing key {key} does not sign: ")
+        assert self.told(book, state, key).startswith(f"error: signing key {key} cannot sign: ")
 
     def test_an_agent_that_does_not_hold_it(
         self, book: Run, state: Any, agent: None, tmp_path: Path
@@ -279,7 +279,7 @@ def test_a_key_that_is_gone_later_is_told_to_the_requester(
 
 def test_ssh_keygen_is_missing(key: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(SigningFailed, match="ssh-keygen is missing"):
+    with pytest.raises(SigningFailed, match="ssh-keygen, which signs the commits, is missing"):
         Signer(key)
 
 
@@ -318,7 +318,7 @@ class TestVerify:
         rows = {row["commit"]: row for row in self.rows(demandops, state, first, 1)}
         assert rows[good]["holds"]
         assert rows[unsigned]["signature"] == (
-            "is not signed, and policy/allowed-signers asks for it"
+            "is not signed, but policy/allowed-signers requires it"
         )
         assert rows[state.tip]["signature"] == (
             "is signed, but not by a key that policy/allowed-signers lists"
@@ -334,7 +334,7 @@ class TestVerify:
         state.commit({SIGNERS: listed(keygen(tmp_path / "forger"))}, forged)
         (row,) = self.rows(demandops, state, since, 1)
         assert row["touched"] == [SIGNERS]
-        assert row["signature"] == "is not signed, and policy/allowed-signers asks for it"
+        assert row["signature"] == "is not signed, but policy/allowed-signers requires it"
 
     def test_a_signature_of_another_commit(
         self, demandops: Run, book: Run, state: Any, key: Path
@@ -353,7 +353,7 @@ class TestVerify:
         made = repo.create_commit_with_signature(text, signature.decode(), "gpgsig")
         repo.references["refs/heads/main"].set_target(made)
         (row,) = self.rows(demandops, state, since, 1)
-        assert row["signature"] == "has a signature that is not of this commit"
+        assert row["signature"] == "has a signature of another commit"
 
     def test_keys_may_change(
         self, demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path

@@ -23,7 +23,7 @@ from asking import perception
 from demandops.errors import StateRepoError
 from demandops.service import Generator
 from demandops.staterepo import upgrade
-from demandops.staterepo.git import clone
+from demandops.staterepo.git import remote_repository
 
 Run = Callable[..., Any]
 StateRepo = Any
@@ -43,7 +43,7 @@ ROOT_FILE = "demandops.yaml"
 URL = "https://git.example/fleet/state-repo.git"
 OLDER = (
     "demandops.yaml: renderVersion: is 1, but this generator renders version 2; stop older "
-    "generators, then have all rendered anew by `demandops upgrade`"
+    "generators, then run `demandops upgrade` to render everything again"
 )
 NEWER = (
     "demandops.yaml: renderVersion: is 2, but this generator renders version 1; update the "
@@ -143,9 +143,10 @@ def test_all_goes_over_in_one_commit_and_back_and_verifies(
 def test_the_commit_says_what_it_did(state: StateRepo, upgraded: Callable[..., Ran]) -> None:
     assert upgraded("--gitops", "argocd").code == 0
     assert state.commits()[0] == (
-        "Render everything anew, for Argo CD\n"
+        "Render everything again, for Argo CD\n"
         "\n"
-        "Why: `demandops upgrade` renders all by render version 1, and from Flux to Argo CD.\n"
+        "Why: `demandops upgrade` renders everything with render version 1, for Argo CD "
+        "instead of Flux.\n"
         "\n"
         "Files written or removed:\n"
         "  1 in bootstrap/c-its.yaml\n"
@@ -328,20 +329,20 @@ def test_a_url_is_pushed_to_and_tried_again_when_somebody_was_first(
     demandops: Run, state: StateRepo, book: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert book().code == 0
-    push, others = clone.ClonedRepository.publish, []
+    push, others = remote_repository.RemoteRepository.publish, []
 
     def after_somebody_else(self: Any, expected: Any, commit: Any) -> bool:
         if not others:
             others.append(state.commit({"README.md": "Ours.\n"}))
         return push(self, expected, commit)
 
-    monkeypatch.setattr(clone.ClonedRepository, "publish", after_somebody_else)
+    monkeypatch.setattr(remote_repository.RemoteRepository, "publish", after_somebody_else)
     url = f"file://{state.path}"
     ran = demandops("upgrade", "--state-repo", url, "--gitops", "argocd", "--output", "json")
     assert ran.json()["commit"] == state.tip
     assert state.files()["README.md"] == "Ours.\n"
     summaries = [text.split("\n")[0] for text in state.commits()]
-    assert summaries[:2] == ["Render everything anew, for Argo CD", "By hand"]
+    assert summaries[:2] == ["Render everything again, for Argo CD", "By hand"]
     assert verified(demandops, state) == [None]
 
 
@@ -349,7 +350,7 @@ def test_a_state_repo_that_never_stands_still_is_told(
     state: StateRepo, monkeypatch: pytest.MonkeyPatch, upgraded: Callable[..., Ran]
 ) -> None:
     monkeypatch.setattr(upgrade, "_PAUSE_S", 0)
-    monkeypatch.setattr(upgrade.CommitLine, "publish", lambda self: False)
+    monkeypatch.setattr(upgrade.CommitBatch, "publish", lambda self: False)
     before = state.tip
     ran = upgraded("--gitops", "argocd")
     assert (ran.code, state.tip) == (1, before)

@@ -40,4 +40,4 @@ def test_what_a_goal_asks_is_a_signed_commit(serve: Serve, client: Client, tmp_p
 def test_a_key_that_cannot_sign_is_told_at_the_start(serve: Serve, tmp_path: Path) -> None:
     served = serve(str(new_state_repo(tmp_path / "state.git")), "--signing-key", "/no/such/key")
     assert served.process.wait(30) == 1
-    assert "signing key /no/such/key is no file" in served.log.read_text()
+    assert "signing key /no/such/key is not a file" in served.log.read_text()

@@ -158,7 +158,7 @@ class DemandQueue:
                 self._mark(ticket, TAKEN_BACK)
                 return True
             ticket.state = "withdrawn"
-            self._outbox.done([operation], durably=True)  # nor may a restart take it up
+            self._outbox.mark_done([operation], durably=True)  # nor may a restart take it up
             self._woken = True
             self._changed.notify()  # it is answered although nothing gets on
         return True
@@ -205,7 +205,7 @@ class DemandQueue:
         """Tell each what came of it; the outbox forgets them."""
         results = list(results)
         with self._changed:
-            self._outbox.done(ticket.operation for ticket, _ in results)
+            self._outbox.mark_done(ticket.operation for ticket, _ in results)
         for ticket, result in results:
             self._forget(ticket)
             if isinstance(result, Receipt):
@@ -219,7 +219,7 @@ class DemandQueue:
         batch = list(batch)
         if not keep:
             with self._changed, suppress(OSError):  # a full disk must not withhold the answer
-                self._outbox.done(ticket.operation for ticket in batch)
+                self._outbox.mark_done(ticket.operation for ticket in batch)
         for ticket in batch:
             self._forget(ticket)
             ticket.future.set_exception(error)

@@ -24,7 +24,7 @@ from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_line
+from demandops.staterepo.write import commit_batch
 
 log = logging.getLogger("demandops")
 
@@ -47,9 +47,9 @@ class Evaluator:
 
     def __call__(
         self,
-        line: commit_line.CommitLine,
+        line: commit_batch.CommitBatch,
         ticket: Ticket,
-        arrived: dict[str, commit_log.Arrival],
+        arrived: dict[str, commit_log.RecordedOutcome],
         earlier: list[Result],
     ) -> Receipt | DemandOpsError | Deferred:
         """Decide a demand on top of the line and commit it there.
@@ -91,9 +91,9 @@ class Evaluator:
             return replace(_commit(line, ticket, decision), targets=targets)
         except InvalidInput as error:
             if self._approvals.released(ticket):  # what was proposed, and nothing else
-                line.note(ticket.operation, "Unchanged")
+                line.note_settled(ticket.operation, "Unchanged")
                 return _released(ticket, str(line.head.commit))
-            line.note(ticket.operation, "Refused")
+            line.note_settled(ticket.operation, "Refused")
             return error
         except SigningFailed as error:
             return error
@@ -101,25 +101,27 @@ class Evaluator:
             log.exception("a fault of the generator, at demand %s", ticket.operation)
             return StateRepoError(f"a fault of the generator: {error!r}; its log says more")
 
-    def arrived(self, start: Snapshot, batch: list[Ticket]) -> dict[str, commit_log.Arrival]:
+    def arrived(
+        self, start: Snapshot, batch: list[Ticket]
+    ) -> dict[str, commit_log.RecordedOutcome]:
         """Return operation id → arrival of demands that were published although nobody was told.
 
         The connection may have been cut, or the process killed, after the remote took the push.
         """
         bases = {ticket.base for ticket in batch if ticket.maybe_published}
-        found: dict[str, commit_log.Arrival] = {}
+        found: dict[str, commit_log.RecordedOutcome] = {}
         for base in bases:
             found |= commit_log.operations_since(self._repository.objects, start.commit, base)
         return found
 
 
-def _commit(line: commit_line.CommitLine, ticket: Ticket, decision: Decision) -> Receipt:
+def _commit(line: commit_batch.CommitBatch, ticket: Ticket, decision: Decision) -> Receipt:
     if decision.files:
         commit = line.commit(decision, ticket.operation, ticket.received, _now())
         ticket.tell("committed", f"committed {commit}")
     else:
         commit = str(line.head.commit)
-        line.note(ticket.operation, "Unchanged")
+        line.note_settled(ticket.operation, "Unchanged")
     return Receipt(
         operation=ticket.operation,
         request_id=decision.request.id,
@@ -132,7 +134,9 @@ def _commit(line: commit_line.CommitLine, ticket: Ticket, decision: Decision) ->
     )
 
 
-def _published_before(ticket: Ticket, arrival: commit_log.Arrival) -> Receipt | DemandOpsError:
+def _published_before(
+    ticket: Ticket, arrival: commit_log.RecordedOutcome
+) -> Receipt | DemandOpsError:
     if arrival.outcome == "refused":
         message = "was refused when the connection was cut; send it again to hear why"
         return Refused([fault("", message, code="refused")])

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from demandops.errors import Fault, StateRepoError
 from demandops.service.demand_queue import DemandQueue
 from demandops.service.timing.polling import Contact, Link, PollTimer
-from demandops.staterepo.git.repository import CutShort, StateRepository
+from demandops.staterepo.git.repository import FetchInterrupted, StateRepository
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_line
+from demandops.staterepo.write import commit_batch
 
 log = logging.getLogger("demandops")
 
@@ -47,8 +47,8 @@ class Follower:
         repository: StateRepository,
         waiting: DemandQueue,
         fetch_interval: float,
-        line: Callable[[], commit_line.CommitLine],
-        taken: Callable[[commit_line.CommitLine], None],
+        line: Callable[[], commit_batch.CommitBatch],
+        taken: Callable[[commit_batch.CommitBatch], None],
     ) -> None:
         """Make it.
 
@@ -92,12 +92,12 @@ class Follower:
         """
         try:
             if self._looks.begin():
-                self._repository.look(lambda: self._waiting.urgent)
+                self._repository.refresh_unless_urgent(lambda: self._waiting.urgent)
             elif not (self._repository.always_current or due):
                 return True
             new = due or self._repository.tip() != known.commit
             self.in_touch(pushed=new and self._take_in())
-        except CutShort:
+        except FetchInterrupted:
             self._looks.again()
         except StateRepoError as error:
             self.out_of_touch(error)

@@ -19,7 +19,7 @@ from demandops.service.worker import Worker
 from demandops.staterepo.git import connect
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.load.snapshot import Progress, Snapshot
-from demandops.staterepo.write import commit_line
+from demandops.staterepo.write import commit_batch
 from demandops.staterepo.write.journal import Slot
 
 log = logging.getLogger("demandops")
@@ -61,9 +61,11 @@ class Generator:
         signer = Signer(signing_key) if signing_key else None
         self._slot = Slot(data or settings.data_home(state_repo))
         try:
-            repository = connect.connect(state_repo, self._slot.folder, log.info, patient=patient)
+            repository = connect.connect(
+                state_repo, self._slot.folder, log.info, allow_offline=patient
+            )
             repository.signer = signer
-            snapshot = commit_line.first_snapshot(repository, progress)
+            snapshot = commit_batch.first_snapshot(repository, progress)
         except BaseException:
             self._slot.close()
             raise
@@ -71,7 +73,7 @@ class Generator:
         self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
-        self._waiting = DemandQueue(self._slot.outbox, queue_limit)
+        self._waiting = DemandQueue(self._slot.journal, queue_limit)
         self._watchers: list[Callable[[Config], None]] = []
         self._approvals = Approvals(
             repository, self._waiting, with_targets, settings.forge_token_file()
@@ -146,7 +148,7 @@ class Generator:
         The paths are None where that other is not known. From any thread.
         """
         commit = str(self.snapshot.commit)
-        return commit, self._repository.changed(since, commit)
+        return commit, self._repository.changed_paths(since, commit)
 
     def withdraw(self, operation: str) -> bool:
         """Take a demand back. False once it is committed, or was never known."""

@@ -23,7 +23,7 @@ from demandops.service.timing.lease_expiry import LONGEST_WAIT_S, Expiries
 from demandops.service.timing.override_expiry import OverrideClock
 from demandops.staterepo.git.repository import PushDenied, RemoteAway, StateRepository
 from demandops.staterepo.load.snapshot import ReadAhead, Snapshot
-from demandops.staterepo.write import commit_line
+from demandops.staterepo.write import commit_batch
 
 log = logging.getLogger("demandops")
 
@@ -67,7 +67,7 @@ class Worker:
         """Stop waiting for a remote that is away; from any thread."""
         self._giving_up.set()
         self.follower.give_up()
-        self._repository.give_up()
+        self._repository.abort()
         self._waiting.wake()
 
     def take_up(self, batch: list[Ticket]) -> None:
@@ -208,7 +208,7 @@ class Worker:
             self._since_tidy = 0
             self._repository.tidy()
 
-    def _publish(self, line: commit_line.CommitLine, results: list[Result]) -> bool:
+    def _publish(self, line: commit_batch.CommitBatch, results: list[Result]) -> bool:
         """Publish a line; what the remote denies becomes the answer of all that is in it."""
         try:
             published = line.publish()
@@ -223,21 +223,21 @@ class Worker:
         self._since_tidy += len(results)
         return True
 
-    def _taken(self, line: commit_line.CommitLine) -> None:
+    def _taken(self, line: commit_batch.CommitBatch) -> None:
         before, self.snapshot = self.snapshot, line.head
         if line.head.commit != before.commit:  # a merge may ask for no commit of our own
             self._on_published(line.head.state.config)
 
-    def _line(self) -> commit_line.CommitLine:
+    def _line(self) -> commit_batch.CommitBatch:
         """Start a line on the newest tip that is known, people's changes taken in."""
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems:
-            line = commit_line.CommitLine(self._repository, before)
+            line = commit_batch.CommitBatch(self._repository, before)
             self._overrides.end(line, _now())
             return line
         advance = self._ahead.advance(self._repository.objects, before, tip)
-        line = commit_line.CommitLine(self._repository, advance.snapshot)
+        line = commit_batch.CommitBatch(self._repository, advance.snapshot)
         line.follow(advance, before, _now())
         self.follower.tell(line.head.problems)
         self._overrides.end(line, _now())

@@ -1,5 +1,5 @@
-"""Stage 7, where it is kept: decisions become commits in the state repo, durably and in order.
+"""Stage 7, the state repo: decisions become commits, durably and in order.
 
-The only folder that knows Git. Trees and commits are written as objects with pygit2, never
-through an index or a work tree; GitPython runs the real git for clone, fetch and push.
+Only this folder uses Git. It writes trees and commits as objects with pygit2, never through an
+index or a work tree. GitPython runs the git program to clone, fetch and push.
 """

@@ -1,4 +1,4 @@
-"""``demandops init``: a new state repo from the skeleton, with everything rendered once."""
+"""``demandops init``: a new state repo from the skeleton, rendered once."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import commit_message
 
 PIPELINES = (".github/workflows/demandops.yml", ".gitlab-ci.yml")
-"""What checks pull requests on GitHub and GitLab, by the version that laid the repo down."""
+"""Pipelines that check pull requests on GitHub and GitLab with this program's version."""
 
 
 def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
-    """Return every file of a new state repo by path: skeleton, appdefs and what they render to.
+    """Return path → text of a new state repo: skeleton, appdefs and their rendered files.
 
     Raises:
-        InvalidInput: where ``url`` is none that a cluster can fetch from.
+        InvalidInput: clusters cannot fetch from ``url``.
     """
-    found = _read(data_folder("skeleton"), "")
-    found |= _read(data_folder("appdefs"), "appdefs/")
-    roots = {"flux": found.pop(ROOT_FILE), "argocd": found.pop("demandops.argocd.yaml")}
+    contents = _read(data_folder("skeleton"), "")
+    contents |= _read(data_folder("appdefs"), "appdefs/")
+    roots = {"flux": contents.pop(ROOT_FILE), "argocd": contents.pop("demandops.argocd.yaml")}
     root = strict_yaml.edited(roots[gitops], "renderVersion", RENDER_VERSION)
     if url:
         root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {strict_yaml.scalar(url)}", root)
-    found[ROOT_FILE] = root
+    contents[ROOT_FILE] = root
     for path in PIPELINES:
-        found[path] = re.sub(r"demandops==\S+", f"demandops=={__version__}", found[path])
-    config = load({p: text for p, text in found.items() if p.split("/")[0] in CONFIG_ROOTS})
-    return found | rendered_files(State.of(config, Ledger()))
+        contents[path] = re.sub(r"demandops==\S+", f"demandops=={__version__}", contents[path])
+    config = load({p: text for p, text in contents.items() if p.split("/")[0] in CONFIG_ROOTS})
+    return contents | rendered_files(State.of(config, Ledger()))
 
 
 def _read(folder: Path, prefix: str) -> dict[str, str]:
@@ -68,13 +68,13 @@ def init(
     Args:
         target: a folder that does not exist or is empty.
         now: the time of the commit.
-        bare: whether to make a bare repository, which the generator can use in place.
-        gitops: which controller reads it.
+        bare: make a bare repository, which the generator can use in place.
+        gitops: the GitOps controller, ``flux`` or ``argocd``.
         signer: signs the commit, if given.
-        url: where the clusters will find it; the skeleton's example where left out.
+        url: the URL that the clusters fetch from; by default the skeleton's example.
 
     Raises:
-        StateRepoError: where the folder is in use. Nothing is written then.
+        StateRepoError: the folder is not empty; nothing is written.
     """
     target = target.resolve()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -103,10 +103,10 @@ def _write(
     folder: Path, content: Mapping[str, str], now: datetime, bare: bool, signer: Signer | None
 ) -> str:
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
-    repo.config["core.fsync"] = "committed"  # what is pushed here is on the disk when told so
+    repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
     tree = trees.write(repo, None, content)
     text = (
-        "Lay down the state repo\n\n"
+        "Create the state repo\n\n"
         "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
         "\n\n"
         f"Operation: init\nRender-Version: {RENDER_VERSION}\n"

@@ -1,4 +1,4 @@
-"""Looking into a state repo without writing: for the command line's views, a dry run and checks."""
+"""Reading a state repo: its commits, snapshots, history and proposals, for the command line."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from demandops.staterepo.git import connect
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.address import is_url
 from demandops.staterepo.git.repository import StateRepository
-from demandops.staterepo.history import commit_log, path_history, revisions
+from demandops.staterepo.history import authorship, commit_log, path_history, revisions
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.history.path_history import PathHistory
 from demandops.staterepo.load import (
-    effective_config,
+    in_force_trailers,
     last_valid_config,
     problem_report,
-    rollback_source,
+    rollback_target,
 )
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.write.journal import Slot
-from demandops.staterepo.write.proposal_branch import PendingProposal, waiting
+from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
 
 
 class Reader:
     """An open state repo, at its newest commit."""
 
     def __init__(self, address: str) -> None:
-        """Open the state repo; of a URL a clone is kept, and fetched.
+        """Open the state repo; if it is a URL, fetch into a clone that is kept.
 
         Raises:
-            StateRepoError: where it cannot be read.
+            StateRepoError: it cannot be read.
         """
         self._slot: Slot | None = None
         folder = Path()
@@ -58,7 +58,7 @@ class Reader:
             raise
 
     def close(self) -> None:
-        """Give the clone back."""
+        """Release the clone."""
         if self._slot is not None:
             self._slot.close()
 
@@ -67,20 +67,20 @@ class Reader:
         """The state repo itself, for a command that writes to it."""
         return self._repository
 
-    def refuse_other_rendering(self) -> None:
-        """Raise where a generator of another version writes this repo, as a generator does.
+    def refuse_other_render_version(self) -> None:
+        """Raise if the repo has another render version.
 
         Raises:
-            StateRepoError: saying which version it is and what to do.
+            StateRepoError: names the version and the remedy.
         """
         tip = trees.commit_of(self._repository.objects, self._tip)
-        last_valid_config.refuse_other_rendering(tip.tree)
+        last_valid_config.refuse_other_render_version(tip.tree)
 
     def commit(self, revision: str | None = None) -> str:
-        """Return the id of a commit, by a revision or a time; the newest where none is given.
+        """Return the commit id of a revision or a time; by default the newest commit.
 
         Raises:
-            StateRepoError: where it is neither, or a time before the first commit.
+            StateRepoError: it is neither, or a time before the first commit.
         """
         if not revision:
             return str(self._tip)
@@ -88,52 +88,54 @@ class Reader:
         return str(revisions.resolve(self._repository.objects, self._tip, revision, now).id)
 
     def includes(self, commit: str, other: str) -> bool:
-        """Tell whether ``commit`` is ``other`` or comes after it."""
+        """Return whether ``commit`` is ``other`` or a descendant."""
         return self._repository.includes(commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Tell whether two commits hold the same under ``path``."""
+        """Return whether ``path`` is equal in two commits."""
         return self._repository.unchanged(commit, other, path)
 
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Load the books and the configuration that are in force at a commit.
+        """Load the ledger and the configuration that are in effect at a commit.
 
-        Where the generator reported that people broke a file, these are its last valid versions.
+        If the generator quarantined a file, its last valid version is in effect.
 
         Raises:
-            InvalidInput, StateRepoError: where it holds no valid state repo.
+            InvalidInput, StateRepoError: the commit is not a valid state repo.
         """
         commit = trees.commit_of(self._repository.objects, self.commit(revision))
-        told = self._told_at(commit)
-        if told is not None and told.one("In-Force"):
-            return effective_config.at(self._repository.objects, commit, told)
+        record = self._generator_record(commit)
+        if record is not None and record.first("In-Force"):
+            return in_force_trailers.snapshot_at(self._repository.objects, commit, record)
         return snapshots.load(self._repository.objects, commit.id, progress)
 
-    def _told_at(self, commit: Commit) -> LogEntry | None:
-        """Return the generator's newest commit up to one: it says what is in force."""
-        base = commit_log.last_generated(self._repository.objects, commit.id)
+    def _generator_record(self, commit: Commit) -> LogEntry | None:
+        """Return the generator's newest commit up to this one, which records what is in effect."""
+        base = commit_log.last_generator_commit(self._repository.objects, commit.id)
         if base is None:
             return None
         return commit_log.entry_of(trees.commit_of(self._repository.objects, base))
 
     def problems(self) -> tuple[problem_report.Problem, ...]:
-        """Return what the generator reports not to be valid at the newest commit."""
+        """Return the problems that the generator reports at the newest commit."""
         return problem_report.read(self.file_reader()(problem_report.PATH))
 
     def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
-        """Return what is not valid at a commit, as reported there or else as it was found."""
-        told = self.file_reader(str(snapshot.commit))(problem_report.PATH)
-        return problem_report.read(told) or snapshot.problems
+        """Return the problems reported at a commit, else those found when it was loaded."""
+        report = self.file_reader(str(snapshot.commit))(problem_report.PATH)
+        return problem_report.read(report) or snapshot.problems
 
-    def last_valid(self, revision: str, progress: Progress = lambda done, total: None) -> Snapshot:
-        """Load what is in force at a commit, whether or not the generator has been there since.
+    def last_valid_snapshot(
+        self, revision: str, progress: Progress = lambda done, total: None
+    ) -> Snapshot:
+        """Load a commit, with last valid versions of files that are not valid.
 
-        Of what is not valid there it is the last version that was; the problems are told.
+        Unlike :meth:`snapshot` it does so even if the generator has not quarantined them yet.
 
         Raises:
-            InvalidInput, StateRepoError: where there never was a valid configuration.
+            InvalidInput, StateRepoError: there never was a valid configuration.
         """
         try:
             return self.snapshot(revision, progress)
@@ -141,7 +143,7 @@ class Reader:
             return snapshots.load_last_valid(self._repository.objects, revision, progress)
 
     def file_reader(self, revision: str | None = None) -> FileReader:
-        """Return a function that gives the text of a file at a commit."""
+        """Return a function that returns the text of a file at a commit."""
         tree = trees.commit_of(self._repository.objects, self.commit(revision)).tree
         return lambda path: trees.read_text(tree, path)
 
@@ -149,7 +151,7 @@ class Reader:
         """Return the configuration at the newest commit.
 
         Raises:
-            InvalidInput, StateRepoError: where it holds no valid one.
+            InvalidInput, StateRepoError: it is not valid.
         """
         return last_valid_config.config_at(
             trees.commit_of(self._repository.objects, self._tip).tree
@@ -159,29 +161,29 @@ class Reader:
         """Return the demands that await approval, by branch.
 
         Raises:
-            RemoteAway: where the remote does not answer.
+            RemoteAway: the remote cannot be reached.
         """
-        return list(waiting(self._repository))
+        return list(pending_proposals(self._repository))
 
     def log(self, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
         since, until = self._sides(spec or "")
         yield from commit_log.walk(self._repository.objects, until, since)
 
-    def touching(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
-        """Yield those commits that changed a file or folder."""
+    def commits_changing(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
+        """Yield the commits of :meth:`log` that changed a file or folder."""
         since, until = self._sides(spec or "")
         objects = self._repository.objects
         known = {one.commit for one in commit_log.walk(objects, until, since)} if since else None
-        for touch in path_history.touching(objects, until, path):
-            if known is None or touch.entry.commit in known:
-                yield touch.entry
+        for change in path_history.changes_to(objects, until, path):
+            if known is None or change.entry.commit in known:
+                yield change.entry
 
     def revisions(self, spec: str | None) -> list[str]:
         """Return the commits that ``REV`` or ``A..B`` names, oldest first.
 
         Raises:
-            StateRepoError: where a side is neither revision nor time.
+            StateRepoError: a side is neither a revision nor a time.
         """
         since, until = self._sides(spec or "")
         if since is None:
@@ -190,7 +192,7 @@ class Reader:
         return [entry.commit for entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
-        """Return the commits that ``A..B`` names; of ``REV`` the second alone."""
+        """Return the commits A and B of ``A..B``, or None and REV of ``REV``."""
         first, dots, last = spec.partition("..")
         if not dots:
             return None, self.commit(first)
@@ -205,68 +207,70 @@ class Reader:
         whole: bool = False,
         progress: Progress = lambda done, total: None,
     ) -> list[Verdict]:
-        """Return a verdict on each commit: rendered again and compared byte by byte, and signed?
+        """Return a verdict on each commit: its files, compared byte by byte, and its signature.
 
         Args:
             commits: oldest first.
-            whole: whether to load every commit from nothing, rather than by what differs.
-            progress: told (commits done, commits in all).
+            whole: load every commit whole, rather than what differs from the one before.
+            progress: called with (commits done, all commits).
         """
         objects, verdicts = self._repository.objects, list[Verdict]()
         for verdict in verification.verify(objects, commits, whole=whole):
             verdicts.append(verdict)
             progress(len(verdicts), len(commits))
-        return commit_signatures.checked(objects, verdicts)
+        return commit_signatures.with_signatures(objects, verdicts)
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
-        """Return how a file or folder came to what it is at a commit."""
-        return path_history.of_path(self._repository.objects, revision, path, most)
+        """Return the history of a file or folder up to a commit."""
+        return path_history.history_of(self._repository.objects, revision, path, most)
 
-    def path_called(self, name: str, revision: str) -> str | None:
-        """Return the path of a release, or of the last one of that name, which was stopped."""
+    def release_path(self, name: str, revision: str) -> str | None:
+        """Return the path of a release, or of the last stopped one of that name."""
         objects = self._repository.objects
-        standing = path_history.called(objects, revision, name)
-        return standing or path_history.once_called(objects, revision, name)
+        current = path_history.release_path(objects, revision, name)
+        return current or path_history.stopped_release_path(objects, revision, name)
 
-    def ever_stopped(self, revision: str) -> set[str]:
-        """Return the names of all releases that were stopped at some time."""
-        return path_history.ever_stopped(self._repository.objects, revision)
+    def stopped_release_names(self, revision: str) -> set[str]:
+        """Return the names of all releases that were ever stopped."""
+        return path_history.stopped_release_names(self._repository.objects, revision)
 
-    def differing(self, before: str, after: str, root: str) -> dict[str, bool]:
-        """Return the files below a folder that differ between two commits, and which are left."""
+    def changed_files(self, before: str, after: str, root: str) -> dict[str, bool]:
+        """Return the files of a folder that differ between two commits: path → exists after."""
         objects = self._repository.objects
         sides = [trees.commit_of(objects, revision).tree for revision in (before, after)]
-        found = trees.below_root(objects, sides[0], sides[1], root)
-        return {path: blob is not None for path, blob in found}
+        changed = trees.differences_below(objects, sides[0], sides[1], root)
+        return {path: blob is not None for path, blob in changed}
 
-    def concerns(self, commit: str, node: str) -> bool:
-        """Tell whether a commit changed what runs on a node, or a claim that names it."""
-        return path_history.concerns(self._repository.objects, commit, node)
+    def changes_node(self, commit: str, node: str) -> bool:
+        """Return whether a commit changed what runs on a node, or a claim that names it."""
+        return path_history.changes_node(self._repository.objects, commit, node)
 
-    def behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
-        """Return the commits of people that a commit carries out, newest first."""
-        since, follows = entry.one("Since"), entry.one("Follows")
+    def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
+        """Return the commits by people that a follow commit renders, newest first."""
+        since, follows = entry.first("Since"), entry.first("Follows")
         if not (since and follows):
             return []
         walked = commit_log.walk(self._repository.objects, follows, since)
         return list(islice((one for one in walked if not one.by_generator), most))
 
     def restoration(self, to: str, **more: object) -> Restoration:
-        """Return the request to go back to a commit."""
-        return rollback_source.restoration(self._repository.objects, to, **more)
+        """Return the request to roll back to a commit."""
+        return rollback_target.restoration(self._repository.objects, to, **more)
 
-    def configured_since(self, commit: str) -> list[str]:
-        """Return the files of people that are not what they were at a commit."""
-        return rollback_source.configured_since(self._repository.objects, commit, self._tip)
+    def config_files_changed_since(self, commit: str) -> list[str]:
+        """Return the configuration files that changed since a commit."""
+        return rollback_target.config_files_changed_since(
+            self._repository.objects, commit, self._tip
+        )
 
-    def person(self) -> tuple[str, str]:
-        """Return name and e-mail address of who runs this."""
-        return rollback_source.person(self._repository.objects)
+    def git_user(self) -> tuple[str, str]:
+        """Return name and e-mail address of who runs this program."""
+        return authorship.git_user(self._repository.objects)
 
 
 @contextmanager
 def opened(address: str) -> Iterator[Reader]:
-    """Open a state repo for reading and close it again."""
+    """Open a state repo for reading, and close it at the end."""
     reader = Reader(address)
     try:
         yield reader

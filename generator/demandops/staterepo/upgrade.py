@@ -1,8 +1,8 @@
-"""``demandops upgrade``: everything rendered anew in one commit, by this program's version.
+"""``demandops upgrade``: one commit that renders everything again with this program's version.
 
-So a state repo goes over to another render version or another GitOps controller at once, and two
-versions never undo each other's files in turn. Published like every other commit: on top of what is
-there, judged anew where that moved, never forced.
+The state repo changes to another render version or GitOps controller at once, so two versions never
+undo each other's files. The commit is published like any other: on top of the current tip, made
+again if the tip moves, and never forced.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from demandops.staterepo.history import commit_log, commit_message
 from demandops.staterepo.load import last_valid_config
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
-from demandops.staterepo.write.commit_line import CommitLine
+from demandops.staterepo.write.commit_batch import CommitBatch
 
 _ATTEMPTS = 10
 _PAUSE_S = 0.1
 _FOLDER_DEPTH = 3
-"""``clusters/<cluster>/<access domain>``, which the commit's message counts files by."""
+"""``clusters/<cluster>/<access domain>``: the commit's message counts files per such folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
-    """What a person asked for: a controller and its URL, or nothing but the newest rendering."""
+    """The GitOps controller to change to and its URL; None keeps them."""
 
     gitops: str | None = None
     url: str | None = None
@@ -55,7 +55,7 @@ class UpgradeRequest:
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """What an upgrade changes. ``commit`` is the newest one; no file: there was nothing to do."""
+    """What an upgrade changes: no files if nothing changed. ``commit`` is the newest commit."""
 
     commit: str
     old: Config
@@ -69,49 +69,54 @@ class Upgrade:
 
 
 def plan(
-    address: str, wish: UpgradeRequest, now: datetime, progress: Progress = lambda done, total: None
+    address: str,
+    request: UpgradeRequest,
+    now: datetime,
+    progress: Progress = lambda done, total: None,
 ) -> Upgrade:
-    """Return what an upgrade would change; nothing is written.
+    """Return what an upgrade would change, without writing.
 
     Raises:
-        InvalidInput: where the state repo is not valid or the wish cannot be fulfilled.
-        StateRepoError: where it cannot be read.
+        InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
+        StateRepoError: the state repo cannot be read.
     """
     with reader.opened(address) as repo:
-        return _planned(repo.repository, wish, now, progress)[0]
+        return _plan_upgrade(repo.repository, request, now, progress)[0]
 
 
 def upgrade(
     address: str,
-    wish: UpgradeRequest,
+    request: UpgradeRequest,
     now: datetime,
     progress: Progress = lambda done, total: None,
     signer: Signer | None = None,
 ) -> Upgrade:
-    """Render everything anew and publish it as one commit; nothing where nothing would change.
+    """Render everything again and publish it as one commit, if any file differs.
 
     Args:
         address: a folder with a bare repository, or a URL that git clones.
-        wish: which controller the state repo is for.
+        request: the GitOps controller to change to, if any.
         now: the time of the commit.
-        progress: told (files read, files in all) while the ledger is read.
+        progress: called with (files read, all files) while the ledger is read.
         signer: signs the commit, if given.
 
     Raises:
-        InvalidInput: where the state repo is not valid or the wish cannot be fulfilled.
-        StateRepoError: where it cannot be read or written, or never stood still.
+        InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
+        StateRepoError: it cannot be read or written, or other writers moved it each time.
     """
     with reader.opened(address) as repo:
         repository = repo.repository
         repository.signer = signer
         for attempt in range(1, _ATTEMPTS + 1):
-            made, line, taken = _planned(repository, wish, now, progress)
+            made, batch, applied = _plan_upgrade(repository, request, now, progress)
             if not made.files:
                 return made
             author = _person(repository.objects, now)
-            state = replace(line.head.state, ledger=taken.ledger, config=taken.config)
-            commit = line.record(made.files, state, _message(made, taken), author, now, taken.keys)
-            if line.publish():
+            state = replace(batch.head.state, ledger=applied.ledger, config=applied.config)
+            commit = batch.commit_files(
+                made.files, state, _message(made, applied), author, now, applied.keys
+            )
+            if batch.publish():
                 return Upgrade(commit, made.old, made.new, made.files)
             time.sleep(_PAUSE_S * attempt * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
             repository.refresh()
@@ -121,54 +126,54 @@ def upgrade(
     )
 
 
-def _planned(
-    repository: StateRepository, wish: UpgradeRequest, now: datetime, progress: Progress
-) -> tuple[Upgrade, CommitLine, LedgerUpdate]:
+def _plan_upgrade(
+    repository: StateRepository, request: UpgradeRequest, now: datetime, progress: Progress
+) -> tuple[Upgrade, CommitBatch, LedgerUpdate]:
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
-    line, old = CommitLine(repository, snapshot), snapshot.state.config
+    batch, old = CommitBatch(repository, snapshot), snapshot.state.config
     tree = trees.commit_of(objects, tip).tree
     files = trees.texts(tree, CONFIG_ROOTS)
     before = files[ROOT_FILE]
-    files[ROOT_FILE] = _root(before, old, wish)
-    marked = last_valid_config.markers_at(tree)
+    files[ROOT_FILE] = _root(before, old, request)
+    marked = last_valid_config.end_markers_at(tree)
     config = load(files).with_ended(ended_override_file.read(marked))
     state = State.of(config, snapshot.state.ledger)
-    taken = _taken_in(repository, snapshot, state, marked, now)
-    state = replace(state, ledger=taken.ledger, config=taken.config)
+    applied = _with_changes_by_people(repository, snapshot, state, marked, now)
+    state = replace(state, ledger=applied.ledger, config=applied.config)
     if old.repository.gitops != config.repository.gitops:
         _refuse_held(state)
-    found = dict(line.everything(state, taken.files).files)
+    changed = dict(batch.render_all(state, applied.files).files)
     if files[ROOT_FILE] != before:
-        found[ROOT_FILE] = files[ROOT_FILE]
-    return Upgrade(str(tip), old, state.config, dict(sorted(found.items()))), line, taken
+        changed[ROOT_FILE] = files[ROOT_FILE]
+    return Upgrade(str(tip), old, state.config, dict(sorted(changed.items()))), batch, applied
 
 
-def _taken_in(
+def _with_changes_by_people(
     repository: StateRepository,
     tip: Snapshot,
     state: State,
     marked: Mapping[str, str],
     now: datetime,
 ) -> LedgerUpdate:
-    """Return the books with what people changed since the generator's last commit taken in."""
+    """Return the state with what people changed since the generator's last commit."""
     objects = repository.objects
-    last = commit_log.last_generated(objects, tip.commit)
+    last = commit_log.last_generator_commit(objects, tip.commit)
     before = tip.state if last is None else snapshots.load_last_valid(objects, last).state
     after = state.ledger
-    keys = {claim.key for books in (before.ledger, after) for claim in books}
+    keys = {claim.key for ledger in (before.ledger, after) for claim in ledger}
     subjects = {key.subject for key in keys if before.ledger.get(key) != after.get(key)}
-    books = (before.ledger, before.config)
-    return update_ledger(books, (after, state.config), sorted(subjects, key=str), marked, now)
+    old = (before.ledger, before.config)
+    return update_ledger(old, (after, state.config), sorted(subjects, key=str), marked, now)
 
 
 def _refuse_held(state: State) -> None:
-    """Raise where an override holds a file that is made for the other controller."""
+    """Raise if an override holds a file that is rendered for the other controller."""
     faults = [
         fault(
             "hold",
-            f"keeps {release.name} as it is rendered for the other controller; remove it, and "
-            "hold the release again afterwards",
+            f"holds {release.name} as rendered for the other controller; remove the hold, and add "
+            "it again after the upgrade",
         ).within(override.path)
         for release in planned_releases(state.ledger, state.config).values()
         if isinstance(release, ServiceRelease) and release.shaping.held
@@ -179,10 +184,10 @@ def _refuse_held(state: State) -> None:
         raise InvalidInput(faults)
 
 
-def _root(text: str, config: Config, wish: UpgradeRequest) -> str:
-    """Return ``demandops.yaml`` as wished, with whatever else a person wrote in it."""
+def _root(text: str, config: Config, request: UpgradeRequest) -> str:
+    """Return ``demandops.yaml`` with the requested changes; keep all else in it."""
     repository = config.repository
-    gitops = wish.gitops or repository.gitops
+    gitops = request.gitops or repository.gitops
     try:
         if repository.render_version != RENDER_VERSION:
             text = strict_yaml.edited(text, "renderVersion", RENDER_VERSION)
@@ -190,19 +195,19 @@ def _root(text: str, config: Config, wish: UpgradeRequest) -> str:
             text = strict_yaml.edited(text, "gitops", gitops)
         section = getattr(repository, gitops)
         if section is None:
-            # both fetch the same repo, so the one that stands says from where
+            # both controllers fetch the same repo, so the configured one names its URL
             known = getattr(repository, repository.gitops)
-            text = strict_yaml.edited(text, gitops, {"url": wish.url or known.url})
-        elif wish.url not in (None, section.url):
-            told = f"is {section.url} already; change it there, or leave out --url"
-            raise InvalidInput([fault(f"{gitops}.url", told)])
+            text = strict_yaml.edited(text, gitops, {"url": request.url or known.url})
+        elif request.url not in (None, section.url):
+            message = f"is {section.url} already; change it there, or leave out --url"
+            raise InvalidInput([fault(f"{gitops}.url", message)])
     except InvalidInput as error:
         raise InvalidInput(strict_yaml.faults_in(error, ROOT_FILE)) from None
     return text
 
 
 def _person(objects: Repository, now: datetime) -> Signature:
-    """Return who runs the command, as their Git knows them; the generator where it does not."""
+    """Return who runs the command, from git's configuration; else the generator."""
     try:
         who = objects.default_signature
     except (KeyError, ValueError, pygit2.GitError):
@@ -210,32 +215,35 @@ def _person(objects: Repository, now: datetime) -> Signature:
     return Signature(who.name, who.email, int(now.timestamp()), 0)
 
 
-def _message(made: Upgrade, taken: LedgerUpdate) -> str:
+def _message(made: Upgrade, applied: LedgerUpdate) -> str:
     old, new = made.old.repository, made.new.repository
-    moved = old.gitops != new.gitops
-    title = "Render everything anew"
-    if moved:
+    switched = old.gitops != new.gitops
+    title = "Render everything again"
+    if switched:
         title += f", for {_NAMES[new.gitops]}"
-    why = f"from render version {old.render_version} to {new.render_version}"
-    if old.render_version == new.render_version:
-        why = f"by render version {new.render_version}"
+    why = f"with render version {new.render_version}"
+    if old.render_version != new.render_version:
+        why += f" instead of {old.render_version}"
+    if switched:
+        why += f", for {_NAMES[new.gitops]} instead of {_NAMES[old.gitops]}"
     counts = Counter("/".join(path.split("/")[:_FOLDER_DEPTH]) for path in made.files)
     lines = [
         title,
         "",
-        f"Why: `demandops upgrade` renders all {why}"
-        + (f", and from {_NAMES[old.gitops]} to {_NAMES[new.gitops]}." if moved else "."),
+        f"Why: `demandops upgrade` renders everything {why}.",
         "",
         "Files written or removed:",
         *(f"  {count} in {folder}" for folder, count in sorted(counts.items())),
         "",
         "Operation: upgrade",
         f"From-Render-Version: {old.render_version}",
-        *([f"From-Gitops: {old.gitops}"] if moved else []),
+        *([f"From-Gitops: {old.gitops}"] if switched else []),
         f"Gitops: {new.gitops}",
         *(
             f"{key}: {path}"
-            for key, path in commit_message.of_overrides(commit_message.keeping(taken.keys))
+            for key, path in commit_message.override_trailers(
+                commit_message.keep_override_paths(applied.keys)
+            )
         ),
         f"Render-Version: {new.render_version}",
     ]

@@ -20,11 +20,11 @@ from concurrent.futures import Future
 from typing import Any
 
 from demandops.service import Generator, Receipt
-from demandops.staterepo.git.bare import BareRepository
-from demandops.staterepo.git.clone import ClonedRepository
-from demandops.staterepo.write.commit_line import CommitLine
+from demandops.staterepo.git.local_repository import LocalRepository
+from demandops.staterepo.git.remote_repository import RemoteRepository
+from demandops.staterepo.write.commit_batch import CommitBatch
 from demandops.staterepo.write.journal import Journal
-from demandops.staterepo.write.proposal_branch import Branches
+from demandops.staterepo.write.proposal_branch import ProposalBranches
 
 Demand = dict[str, Any]
 
@@ -78,21 +78,21 @@ def arm(where: str) -> None:
     if point == "journaled":
         _after(Journal, "append", at)
     elif point == "committed":
-        _after(CommitLine, "commit", at)
+        _after(CommitBatch, "commit", at)
     elif point == "publishing":
-        _before(ClonedRepository, "publish", at)
-        _before(BareRepository, "publish", at)
+        _before(RemoteRepository, "publish", at)
+        _before(LocalRepository, "publish", at)
     elif point == "published":
-        _after(ClonedRepository, "publish", at)
-        _after(BareRepository, "publish", at)
+        _after(RemoteRepository, "publish", at)
+        _after(LocalRepository, "publish", at)
     elif point == "unanswered":
-        _after(Journal, "done", at)
+        _after(Journal, "mark_done", at)
     elif point == "proposing":
-        _before(Branches, "put", at)
+        _before(ProposalBranches, "put", at)
     elif point == "proposed":
-        _after(Branches, "put", at)
+        _after(ProposalBranches, "put", at)
     elif point == "retracting":
-        _before(Branches, "remove", at)
+        _before(ProposalBranches, "remove", at)
     elif point == "withdrawn":
         Lanes.withdrawn = staticmethod(at)  # type: ignore[method-assign]
     elif point:

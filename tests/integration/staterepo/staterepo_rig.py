@@ -263,7 +263,7 @@ class Drivers:
             [sys.executable, str(_DRIVER)],
             stdin=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONPATH": str(_CHECKOUT)},
+            env={**os.environ, "PYTHONPATH": f"{_CHECKOUT}/generator"},
         )
 
     def start(

@@ -454,7 +454,7 @@ def test_a_server_that_refuses_the_branch_is_told_to_the_requester(
     hook.parent.mkdir(exist_ok=True)
     hook.write_text("#!/bin/sh\necho 'no branches here' >&2\nexit 1\n")
     hook.chmod(0o755)
-    refused = pytest.raises(StateRepoError, match=r"takes no push: .*no branches here")
+    refused = pytest.raises(StateRepoError, match=r"rejects the push: .*no branches here")
     with rig.running(url) as generator, refused:
         rig.receipt(generator.submit(goal(1)))
     assert branches(bare) == []

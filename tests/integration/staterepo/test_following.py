@@ -307,8 +307,8 @@ def test_a_look_that_hangs_holds_up_no_demand(http: str, server: Server, bare: P
         rig.book(generator, goal(1))
         hang = server.faults.hang = threading.Event()
         follower = generator._settler.follower
-        rig.wait_until(lambda: generator._repository._talking, "a look is under way and hangs")  # type: ignore[attr-defined]
-        talking = generator._repository._talking  # type: ignore[attr-defined]
+        rig.wait_until(lambda: generator._repository._process, "a look is under way and hangs")  # type: ignore[attr-defined]
+        talking = generator._repository._process  # type: ignore[attr-defined]
         stages = Stages()
         ticket = generator.submit(goal(2), listener=stages)
         rig.wait_until(lambda: "committed" in stages.names, "it is judged although the look hangs")
@@ -324,7 +324,7 @@ def test_stopping_does_not_wait_for_a_look_that_hangs(http: str, server: Server)
     generator = Generator(http, fetch_interval=SOON_S)
     hang = server.faults.hang = threading.Event()
     try:
-        rig.wait_until(lambda: generator._repository._talking, "a look is under way and hangs")  # type: ignore[attr-defined]
+        rig.wait_until(lambda: generator._repository._process, "a look is under way and hangs")  # type: ignore[attr-defined]
         assert generator.stop(timeout=60).result(10) is True
     finally:
         server.faults.hang = None
@@ -467,7 +467,7 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
         followed(bare, made)
     problem = (
         f"{NODES}: nodes[0].cluster: 'c-itz' is not in clusters.yaml; "
-        f"did you mean 'c-its'? (since {made[:10]} of Petra Platform <petra@example.org>)"
+        f"did you mean 'c-its'? (since {made[:10]} by Petra Platform <petra@example.org>)"
     )
     capsys.readouterr()
     assert run(["status", "--state-repo", str(bare)]) == 0

@@ -43,7 +43,7 @@ def test_a_folder_is_unchanged_where_its_content_is(bare: Path, line: list[str])
 
 def test_the_paths_that_differ_are_told(bare: Path, tmp_path: Path, line: list[str]) -> None:
     repository = connect.connect(str(bare), tmp_path / "data")
-    assert repository.changed(line[0], line[2]) == [f"{CHART}/notes.txt", "notes.txt"]
-    assert repository.changed(line[2], line[2]) == []
-    assert repository.changed("", line[2]) is None
-    assert repository.changed("f" * 40, line[2]) is None
+    assert repository.changed_paths(line[0], line[2]) == [f"{CHART}/notes.txt", "notes.txt"]
+    assert repository.changed_paths(line[2], line[2]) == []
+    assert repository.changed_paths("", line[2]) is None
+    assert repository.changed_paths("f" * 40, line[2]) is None

@@ -112,7 +112,9 @@ def ends(generator: Generator, demand: str) -> datetime:
 def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:
     """Have a demand wait that a generator took in and could not settle before it was killed."""
     slot = journal.Slot(settings.data_home(str(repo)))
-    slot.outbox.append([journal.JournalEntry(operation, goal, received.isoformat(), rig.tip(repo))])
+    slot.journal.append(
+        [journal.JournalEntry(operation, goal, received.isoformat(), rig.tip(repo))]
+    )
     slot.close()
 
 

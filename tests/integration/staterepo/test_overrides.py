@@ -298,7 +298,7 @@ def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
     (commit,) = [c for c in rig.commits(bare) if c.one("Operation") == "expire-override"]
     assert commit.summary == "End override brief"
     assert values(commit, "Override") == ["overrides/brief.yaml"]
-    assert "overrides/brief.yaml of petra (a field test) expired at" in rig.git(
+    assert "overrides/brief.yaml by petra (a field test) expired at" in rig.git(
         bare, "log", "-1", "--format=%b", commit.id
     )
     assert parsed(bare, "overrides/brief.yaml")["expires"] == short, "the person's file stays"

@@ -34,7 +34,6 @@ select: [{services: [object-detection], nodes: [edge]}]
 replicas: 2
 """
 BROKEN = OVERRIDE.replace("replicas: 2", "replicas: many").replace("detection]", "fusion]")
-FOLLOWED = "Carry out changes made in the state repo"
 REPORT = ".demandops/reports/problems.yaml"
 
 
@@ -91,7 +90,7 @@ def story(bare: Path, engineer: Engineer) -> str:
     engineer.sees(
         "a deleted claim",
         {claim: None},
-        lambda: not text(bare, claim) and rig.git(bare, "log", "-1", "--format=%s") == FOLLOWED,
+        lambda: not text(bare, claim) and rig.commits(bare)[-1].one("Operation") == "follow",
     )
     assert not text(bare, FUSION_2)
     engineer.kept["a deleted claim"] = lambda: not text(bare, claim)

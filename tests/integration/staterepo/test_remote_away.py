@@ -84,7 +84,7 @@ def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
         with pytest.raises(StateRepoError, match="cannot be fetched"):
             Generator(url, patient=False)
         generator = Generator(url)
-        assert "going on from what was fetched last" in caplog.text
+        assert "continuing with what was fetched last" in caplog.text
         fresh = generator.submit(goal(2), "op-2")
         rig.wait_until(lambda: "trying again" in caplog.text, "it goes on trying")
         assert not fresh.future.done()
@@ -202,7 +202,7 @@ def test_a_declined_push_is_told_to_all_of_its_batch_but_not_to_those_refused_be
         refused = generator.submit(rig.impossible())
         gate.open.set()
         for ticket in tickets:
-            with pytest.raises(StateRepoError, match="takes no push"):
+            with pytest.raises(StateRepoError, match="rejects the push"):
                 rig.receipt(ticket)
         with pytest.raises(Refused, match="nowhere"):
             rig.receipt(refused)
@@ -216,7 +216,7 @@ def test_a_declined_release_leaves_what_is_held(url: str, bare: Path) -> None:
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         hook = _hook(bare, "pre-receive", "exit 1")
-        with pytest.raises(StateRepoError, match="takes no push"):
+        with pytest.raises(StateRepoError, match="rejects the push"):
             rig.book(generator, leave(1))
         assert len(rig.claims(bare, "user1")) == 2
         hook.unlink()

@@ -141,7 +141,7 @@ def test_a_server_that_forbids_the_push_is_told_and_not_asked_for_ever(
 ) -> None:
     with rig.running(http) as generator:
         server.faults.no_pushes, server.faults.status = 1000, 403
-        with pytest.raises(StateRepoError, match="takes no push"):
+        with pytest.raises(StateRepoError, match="rejects the push"):
             rig.receipt(generator.submit(goal(1)), timeout=6)
         server.faults.no_pushes = 0
         assert rig.book(generator, goal(2))[0].outcome == "booked"

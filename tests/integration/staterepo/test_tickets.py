@@ -276,7 +276,7 @@ def test_a_journal_that_cannot_be_written_fails_the_demand_and_works_again_later
     bare: Path,
 ) -> None:
     with rig.running(bare) as generator:
-        outbox = generator._slot.outbox
+        outbox = generator._slot.journal
         journal, outbox._file = outbox._file, Path("/dev/full").open("a")  # noqa: SIM115
         ticket = generator.submit(goal(1))
         with pytest.raises(DemandOpsError):

@@ -69,7 +69,7 @@ def test_other_schemes_are_refused_by_name(tmp_path: Path, address: str, scheme:
     with pytest.raises(StateRepoError) as error:
         connect(address, tmp_path)
     assert str(error.value) == (
-        f"'{scheme}://' is no way to reach a state repo; use https, ssh, git or file"
+        f"a state repo's address cannot start with '{scheme}://'; use https, ssh, git or file"
     )
 
 
@@ -78,7 +78,7 @@ def test_other_schemes_are_refused_by_name(tmp_path: Path, address: str, scheme:
     ["ext::sh -c touch% evil", "ext::sh -c touch% evil% ://", "testgit::x:y"],
 )
 def test_a_remote_helper_that_runs_commands_is_never_asked(tmp_path: Path, address: str) -> None:
-    with pytest.raises(StateRepoError, match="is no way to reach a state repo"):
+    with pytest.raises(StateRepoError, match="a state repo's address cannot start with"):
         connect(address, tmp_path / "data")
     assert not (tmp_path / "data").exists(), "refused before anything is made"
 
@@ -90,8 +90,8 @@ def test_an_address_that_looks_like_an_option_is_refused(tmp_path: Path, address
 
 
 HIDDEN = (
-    "the state repo's address holds a password, which process lists would show; leave it out and "
-    "give it to git by a credential helper, ~/.netrc or an SSH key"
+    "the state repo's address holds a password, which process lists would show; remove it and "
+    "use a credential helper, ~/.netrc or an SSH key"
 )
 
 
@@ -182,7 +182,7 @@ def test_a_folder_that_is_no_repository_is_told_with_the_remedy(tmp_path: Path) 
     with pytest.raises(StateRepoError) as error:
         connect(str(tmp_path), tmp_path / "data")
     assert str(error.value) == (
-        f"{tmp_path} is no Git repository; make one with `demandops init {tmp_path} --bare`"
+        f"{tmp_path} is not a Git repository; make one with `demandops init {tmp_path} --bare`"
     )
 
 
@@ -210,7 +210,7 @@ def test_a_checked_out_main_is_refused_with_the_remedy(tmp_path: Path) -> None:
     with pytest.raises(StateRepoError) as error:
         connect(str(work), tmp_path / "data")
     assert str(error.value) == (
-        f"{work} has 'main' checked out, and its files would fall behind the commits; use a bare "
+        f"{work} has 'main' checked out, so its files would become outdated; use a bare "
         f"clone: git clone --bare {work} {work}.git"
     )
 

@@ -36,8 +36,8 @@ def at(text: str) -> datetime:
     ],
 )
 def test_a_time_begins_and_ends(text: str, begins: str, ends: str) -> None:
-    assert revisions.moment(text, NOW) == at(begins)
-    assert revisions.moment(text, NOW, end=True) == at(ends)
+    assert revisions.parse_time(text, NOW) == at(begins)
+    assert revisions.parse_time(text, NOW, end=True) == at(ends)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_a_time_begins_and_ends(text: str, begins: str, ends: str) -> None:
     ),
 )
 def test_what_is_no_time(text: str) -> None:
-    assert revisions.moment(text, NOW) is None
+    assert revisions.parse_time(text, NOW) is None
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_before_the_first_commit(repo: pygit2.Repository) -> None:
     with pytest.raises(StateRepoError) as told:
         resolved(repo, "9:59:59")
     assert str(told.value) == (
-        "at 2026-01-31 09:59:59 UTC there was no state repo yet; its first commit is of "
+        "at 2026-01-31 09:59:59 UTC the state repo did not exist yet; its first commit is of "
         "2026-01-31 10:00:00 UTC"
     )
 

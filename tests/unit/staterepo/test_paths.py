@@ -47,7 +47,7 @@ class History:
         return set(said.split())
 
     def ours(self, path: str) -> list[str]:
-        return [t.entry.commit for t in path_history.touching(self.repo, self.made[-1], path)]
+        return [t.entry.commit for t in path_history.changes_to(self.repo, self.made[-1], path)]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -78,16 +78,16 @@ def test_the_last_time_that_something_stood_there(tmp_path: Path) -> None:
     first = history.commit("c", 2)
     second = history.commit("d", 3)
     tip = history.commit("d", 4)
-    found = path_history.of_path(history.repo, tip, PATH, 1)
+    found = path_history.history_of(history.repo, tip, PATH, 1)
     assert found.started and found.started.commit == str(started)
     assert ([one.commit for one in found.newest], found.more) == ([str(second)], 1)
     assert found.stopped is None
     stopped = history.commit(None, 5)
-    gone = path_history.of_path(history.repo, stopped, PATH, 9)
+    gone = path_history.history_of(history.repo, stopped, PATH, 9)
     assert gone.stopped and gone.stopped.commit == str(stopped)
     assert [one.commit for one in gone.newest] == [str(second), str(first)]
     assert gone.started == found.started
-    never = path_history.of_path(history.repo, stopped, "nothing/there", 9)
+    never = path_history.history_of(history.repo, stopped, "nothing/there", 9)
     assert never == path_history.PathHistory(None, (), 0, None)
 
 
@@ -95,9 +95,9 @@ def test_where_a_release_is_or_once_was(tmp_path: Path) -> None:
     history = History(tmp_path / "r.git")
     there = history.commit("a")
     gone = history.commit(None, 0)
-    assert path_history.called(history.repo, there, "r") == PATH
-    assert path_history.called(history.repo, gone, "r") is None
-    assert path_history.once_called(history.repo, gone, "r") == PATH
-    assert path_history.once_called(history.repo, gone, "q") is None
-    assert path_history.once_called(history.repo, gone, "*") is None
-    assert path_history.ever_stopped(history.repo, gone) == {"r"}
+    assert path_history.release_path(history.repo, there, "r") == PATH
+    assert path_history.release_path(history.repo, gone, "r") is None
+    assert path_history.stopped_release_path(history.repo, gone, "r") == PATH
+    assert path_history.stopped_release_path(history.repo, gone, "q") is None
+    assert path_history.stopped_release_path(history.repo, gone, "*") is None
+    assert path_history.stopped_release_names(history.repo, gone) == {"r"}

@@ -121,7 +121,7 @@ def test_the_newest_commit_of_the_generator_is_found_behind_those_of_people(
 ) -> None:
     first = _commit(repo, "op-1")
     person = _commit(repo, "", first)
-    assert commit_log.last_generated(repo, _commit(repo, "", person)) == first
+    assert commit_log.last_generator_commit(repo, _commit(repo, "", person)) == first
     merge = _commit(repo, "", person, _commit(repo, "op-2", first))
-    assert commit_log.last_generated(repo, merge) == first, "along the first parents"
-    assert commit_log.last_generated(repo, _commit(repo, "")) is None
+    assert commit_log.last_generator_commit(repo, merge) == first, "along the first parents"
+    assert commit_log.last_generator_commit(repo, _commit(repo, "")) is None

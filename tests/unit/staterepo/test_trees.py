@@ -72,7 +72,7 @@ def scratch() -> Iterator[pygit2.Repository]:
 def read(repo: pygit2.Repository, tree: pygit2.Oid) -> Files:
     found = repo[tree]
     assert isinstance(found, pygit2.Tree)
-    return {path: _text(repo, blob) for path, blob in trees.entries(found)}
+    return {path: _text(repo, blob) for path, blob in trees.files_below(found)}
 
 
 def _text(repo: pygit2.Repository, blob: pygit2.Oid) -> str:

@@ -214,7 +214,7 @@ def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[d
     """Decide each request after the one before it, in memory only."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
-        repo.refuse_other_rendering()
+        repo.refuse_other_render_version()
         state = repo.snapshot(progress=report).state
         committed, written = repo.file_reader(), dict[str, str | None]()
 

@@ -71,11 +71,11 @@ def rollback(  # noqa: PLR0913, PLR0917 - one for each option
     if not (dry_run or (reason and reason.strip())):
         raise click.UsageError("give the reason: -m TEXT")
     with reader.opened(state_repo) as repo:
-        target = _Target(repo.commit(revision), drop_newer, reason or "", repo.person())
+        target = _Target(repo.commit(revision), drop_newer, reason or "", repo.git_user())
         base = repo.commit()
         result: dict[str, Any] = {"to": target.to, "outcome": "refused", "commit": None}
         result |= _consequences(None)
-        result |= {"configuration_since": repo.configured_since(target.to), "errors": []}
+        result |= {"configuration_since": repo.config_files_changed_since(target.to), "errors": []}
         try:
             result |= _dry_run(repo, target, base)
         except InvalidInput as error:
@@ -93,7 +93,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - one for each option
 def _dry_run(repo: Reader, target: _Target, base: str) -> dict[str, Any]:
     """Decide the rollback on a commit, in memory only."""
     with progress("reading the ledger") as report:
-        state = repo.last_valid(base, report).state
+        state = repo.last_valid_snapshot(base, report).state
     request = repo.restoration(target.to, drop_newer=target.drop_newer)
     decision = decide(state, request, datetime.now(timezone.utc), repo.file_reader(base))
     return {"outcome": decision.outcome, **_consequences(decision)}

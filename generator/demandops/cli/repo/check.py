@@ -14,7 +14,7 @@ from demandops.plan.views.bookkeeping_diff import EntryChange
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.changes.merge_preview import FileChange
 from demandops.staterepo.pull_request import merge_check
-from demandops.staterepo.pull_request.merge_check import Checked
+from demandops.staterepo.pull_request.merge_check import CheckResult
 
 _MOST_DIFF_LINES = 400
 _MOST_DIFF_LINES_JSON = 20_000
@@ -68,8 +68,8 @@ def check(directory: Path, base: str | None, output: str) -> None:
         click.get_current_context().exit(1)
 
 
-def _data(checked: Checked) -> dict[str, Any]:
-    consequence = checked.consequence
+def _data(checked: CheckResult) -> dict[str, Any]:
+    consequence = checked.preview
     diffs, left = _bounded(consequence.files if consequence else (), _MOST_DIFF_LINES_JSON)
     return {
         "faults": [
@@ -88,7 +88,7 @@ def _data(checked: Checked) -> dict[str, Any]:
             for each in checked.suggestions
         ],
         "base": checked.base,
-        "base_valid": checked.base_in_force,
+        "base_valid": checked.base_valid,
         "releases": [_release_data(each) for each in consequence.releases] if consequence else None,
         "files": [
             {
@@ -106,8 +106,8 @@ def _data(checked: Checked) -> dict[str, Any]:
         else None,
         "outdated": [each.path for each in consequence.files] if consequence else [],
         "diff_lines_left_out": left,
-        "bookkeeping": [_entry_data(each) for each in checked.books]
-        if checked.books is not None
+        "bookkeeping": [_entry_data(each) for each in checked.bookkeeping]
+        if checked.bookkeeping is not None
         else None,
     }
 
@@ -146,7 +146,7 @@ def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], 
     return shown, left
 
 
-def _print(directory: Path, checked: Checked) -> None:
+def _print(directory: Path, checked: CheckResult) -> None:
     out = console()
     for each in checked.faults:
         errors.print(f"error: {each}")
@@ -167,31 +167,31 @@ def _visible(line: str) -> str:
     return "".join(char if char.isprintable() or char in "\n\t" else "�" for char in line)
 
 
-def _lines(checked: Checked) -> Iterator[str]:
+def _lines(checked: CheckResult) -> Iterator[str]:
     for each in checked.suggestions:
         yield f"\ninstead of editing {each.path}, {each.name}:\n"
         yield from each.text.splitlines()
         if each.other_releases:
             yield f"\n(it also applies to {', '.join(each.other_releases)})"
-    consequence = checked.consequence
+    consequence = checked.preview
     if consequence is None:
         if not checked.suggestions:
             return
         yield "\nmend the errors to see what merging would do"
         return
-    if consequence.files or checked.books:
+    if consequence.files or checked.bookkeeping:
         since = f" since {checked.base[:10]}" if checked.base else ""
         yield f"\nwhat merging would do{since}:"
-    if checked.base and not checked.base_in_force:
+    if checked.base and not checked.base_valid:
         yield "(its own files are not valid; compared with its last valid files)"
     if consequence.releases:
         yield "\ndesired state:"
         for release in consequence.releases:
             yield f"  {_SIGNS[release.change]} {release.name} ({release.description})"
             yield from (f"      {detail}" for detail in release.details)
-    if checked.books:
+    if checked.bookkeeping:
         yield "\nbookkeeping:"
-        for entry in checked.books:
+        for entry in checked.bookkeeping:
             yield f"  {_SIGNS[entry.change]} {entry.kind} {entry.name}{_for(entry)}"
             yield from (f"      - {fact}" for fact in entry.lost)
             yield from (f"      + {fact}" for fact in entry.gained)

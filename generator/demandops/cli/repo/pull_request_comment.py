@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from demandops.plan.views.bookkeeping_diff import EntryChange
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.changes.merge_preview import FileChange
-from demandops.staterepo.pull_request.merge_check import Checked
+from demandops.staterepo.pull_request.merge_check import CheckResult
 
 MARK = "<!-- demandops check -->"
 """The first line of every report, by which a pipeline finds its own comment."""
@@ -27,7 +27,7 @@ _VERBS = {"start": "starts", "change": "changes", "stop": "stops"}
 _ENTRY_VERBS = {"added": "new", "changed": "changed", "removed": "removed"}
 
 
-def report(checked: Checked, longest: int = LONGEST) -> str:
+def report(checked: CheckResult, longest: int = LONGEST) -> str:
     """Return the report, of at most ``longest`` characters."""
     parts = [f"{MARK}\n", *_head(checked)]
     parts += _faults(checked)
@@ -61,7 +61,7 @@ def _longer_than_any(text: str, least: int) -> str:
     return "`" * max(least, longest + 1)
 
 
-def _head(checked: Checked) -> Iterator[str]:
+def _head(checked: CheckResult) -> Iterator[str]:
     if checked.faults:
         many = "1 error" if len(checked.faults) == 1 else f"{len(checked.faults)} errors"
         yield f"## DemandOps: {many}\n"
@@ -70,13 +70,13 @@ def _head(checked: Checked) -> Iterator[str]:
     if checked.base:
         since = (
             ""
-            if checked.base_in_force
+            if checked.base_valid
             else ", with its last valid files because its own are not valid"
         )
         yield f"\nCompared with {code(checked.base[:10])}{since}.\n"
 
 
-def _faults(checked: Checked) -> Iterator[str]:
+def _faults(checked: CheckResult) -> Iterator[str]:
     for fault in checked.faults:
         places = [code(place) for place in (fault.file, fault.field) if place]
         yield f"\n- {': '.join([*places, code(fault.message)])}"
@@ -84,14 +84,14 @@ def _faults(checked: Checked) -> Iterator[str]:
         yield "\n"
 
 
-def _warnings(checked: Checked) -> Iterator[str]:
+def _warnings(checked: CheckResult) -> Iterator[str]:
     for warning in checked.warnings:
         yield f"\n- warning: {code(warning.file)}: {code(warning.message)}"
     if checked.warnings:
         yield "\n"
 
 
-def _suggestions(checked: Checked) -> Iterator[str]:
+def _suggestions(checked: CheckResult) -> Iterator[str]:
     for suggestion in checked.suggestions:
         body = f"Merge this as {code(suggestion.name)}:\n\n{fence(suggestion.text, 'yaml')}"
         if suggestion.not_covered:
@@ -101,12 +101,12 @@ def _suggestions(checked: Checked) -> Iterator[str]:
         yield _folded(f"Instead of editing {_plain(suggestion.path)}", body)
 
 
-def _consequence(checked: Checked) -> Iterator[str]:
-    consequence = checked.consequence
+def _consequence(checked: CheckResult) -> Iterator[str]:
+    consequence = checked.preview
     if consequence is None:
         yield "\nMend the errors to see what merging would do.\n"
         return
-    if not consequence.files and not checked.books:
+    if not consequence.files and not checked.bookkeeping:
         yield "\nMerging changes no release and no demand.\n"
         return
     yield "\n### Desired state\n"
@@ -117,11 +117,11 @@ def _consequence(checked: Checked) -> Iterator[str]:
     yield from map(_release, consequence.releases)
     yield "\n"
     yield "\n### Bookkeeping\n"
-    if checked.books is None:
+    if checked.bookkeeping is None:
         yield "\nNot compared, because the base has no valid files.\n"
-    elif not checked.books:
+    elif not checked.bookkeeping:
         yield "\nUnchanged.\n"
-    yield from map(_entry, checked.books or ())
+    yield from map(_entry, checked.bookkeeping or ())
     yield "\n"
     if consequence.files:
         yield f"\n### Files that the generator writes or removes: {len(consequence.files)}\n"

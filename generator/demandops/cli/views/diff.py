@@ -72,7 +72,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 
 def _loaded(repo: Reader, revision: str) -> Snapshot:
     with progress("reading the ledger") as report:
-        snapshot = repo.last_valid(repo.commit(revision), report)
+        snapshot = repo.last_valid_snapshot(repo.commit(revision), report)
     warn_of(repo.problems_of(snapshot))
     return snapshot
 
@@ -81,7 +81,7 @@ def _releases(
     repo: Reader, old: Snapshot, new: Snapshot
 ) -> tuple[list[ReleaseDifference], list[str]]:
     before, after = repo.file_reader(str(old.commit)), repo.file_reader(str(new.commit))
-    differing = repo.differing(str(old.commit), str(new.commit), CLUSTERS_ROOT)
+    differing = repo.changed_files(str(old.commit), str(new.commit), CLUSTERS_ROOT)
     files = {path: (before(path), after(path)) for path in differing}
     sides = [(each.state.ledger, each.state.config) for each in (old, new)]
     return compare(sides[0], sides[1], files)

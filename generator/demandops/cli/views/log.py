@@ -36,7 +36,7 @@ class _Filters:
 
 
 class _Time(click.ParamType):  # type: ignore[type-arg]
-    """A time, as :func:`demandops.staterepo.history.revisions.moment` parses it."""
+    """A time, as :func:`demandops.staterepo.history.revisions.parse_time` parses it."""
 
     name = "time"
 
@@ -47,7 +47,7 @@ class _Time(click.ParamType):  # type: ignore[type-arg]
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> datetime:
         """Parse a time."""
-        time = revisions.moment(str(value), datetime.now(timezone.utc), end=self._end)
+        time = revisions.parse_time(str(value), datetime.now(timezone.utc), end=self._end)
         if time is None:
             self.fail(f"'{value}' is not a time; write it like {revisions.TIMES}", param, ctx)
         return time
@@ -121,12 +121,12 @@ def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iter
     tip = repo.commit(
         (commit_range or "").partition("..")[2] or (commit_range or "").partition("..")[0]
     )
-    path = release if "/" in release else repo.path_called(release, tip)
+    path = release if "/" in release else repo.release_path(release, tip)
     if path is None:
         raise StateRepoError(
             f"there was never a release '{release}'; `demandops bookkeeping` lists what runs"
         )
-    return repo.touching(path, commit_range)
+    return repo.commits_changing(path, commit_range)
 
 
 def _matching(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Iterable[LogEntry]:
@@ -141,14 +141,14 @@ def _matching(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Ite
     def matches(entry: LogEntry) -> bool:
         if any(value not in entry.trailers.get(key, ()) for key, value in wanted):
             return False
-        operation = entry.one("Operation") or _BY_HAND
+        operation = entry.first("Operation") or _BY_HAND
         if given.operation is not None and operation != given.operation:
             return False
         if given.since is not None and entry.time < given.since:
             return False
         if given.until is not None and entry.time > given.until:
             return False
-        return given.node is None or repo.concerns(entry.commit, given.node)
+        return given.node is None or repo.changes_node(entry.commit, given.node)
 
     return filter(matches, entries)
 
@@ -157,12 +157,12 @@ def _table(entries: Iterable[LogEntry]) -> Table:
     table = Table("Commit", "Time (UTC)", "Operation", "Requesters", "What")
     for entry in entries:
         requesters = ", ".join(entry.trailers.get("Requester", ()))
-        if entry.one("Operation") == "rollback":
+        if entry.first("Operation") == "rollback":
             requesters = f"{entry.author}, for {requesters}"
         table.add_row(
             entry.commit[:10],
             entry.time.strftime("%Y-%m-%d %H:%M:%S"),
-            entry.one("Operation") or "by hand",
+            entry.first("Operation") or "by hand",
             requesters or entry.author,
             entry.summary,
         )
@@ -175,12 +175,12 @@ def _row(entry: LogEntry) -> dict[str, Any]:
         "time": entry.time.isoformat(),
         "author": entry.author,
         "summary": entry.summary,
-        "operation": entry.one("Operation") or None,
-        "operation_id": entry.one("Operation-Id") or None,
-        "request_id": entry.one("Request-Id") or None,
+        "operation": entry.first("Operation") or None,
+        "operation_id": entry.first("Operation-Id") or None,
+        "request_id": entry.first("Request-Id") or None,
         "demand_ids": entry.trailers.get("Demand-Id", []),
         "requesters": entry.trailers.get("Requester", []),
         "applications": entry.trailers.get("Application", []),
         "connections": entry.trailers.get("Connection", []),
-        "render_version": entry.one("Render-Version") or None,
+        "render_version": entry.first("Render-Version") or None,
     }

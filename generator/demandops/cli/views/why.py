@@ -71,7 +71,7 @@ def why(
     """
     with reader.opened(state_repo) as repo:
         with progress("reading the ledger") as report:
-            snapshot = repo.last_valid(repo.commit(at), report)
+            snapshot = repo.last_valid_snapshot(repo.commit(at), report)
         warn_of(repo.problems_of(snapshot))
         match = _match(repo, snapshot, name, kind)
         commit = str(snapshot.commit)
@@ -110,7 +110,10 @@ def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Ma
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     ledger, config = snapshot.state.ledger, snapshot.state.config
-    known = {*explanation.release_names(ledger, config), *repo.ever_stopped(str(snapshot.commit))}
+    known = {
+        *explanation.release_names(ledger, config),
+        *repo.stopped_release_names(str(snapshot.commit)),
+    }
     known |= {id for each in SubjectKind for id in ledger.subjects(each)}
     raise StateRepoError(f"nothing called {shown(name)} runs or ever ran{near(name, known)}")
 
@@ -119,7 +122,7 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Match]:
     ledger, config = snapshot.state.ledger, snapshot.state.config
     matches = []
     release = explanation.release_named(ledger, config, name)
-    path = path_of(release) if release else repo.path_called(name, str(snapshot.commit))
+    path = path_of(release) if release else repo.release_path(name, str(snapshot.commit))
     if path is None:  # a release that an override denies may never have run
         stopped = explanation.denied_release_named(ledger, config, name)
         path = path_of(stopped[0]) if stopped else None

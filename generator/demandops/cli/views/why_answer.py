@@ -120,13 +120,13 @@ def _commit(repo: Reader, entry: LogEntry | None) -> dict[str, Any] | None:
         "commit": entry.commit,
         "time": entry.time.isoformat(),
         "author": entry.author,
-        "operation": entry.one("Operation") or None,
+        "operation": entry.first("Operation") or None,
         "requesters": entry.trailers.get("Requester", []),
         "summary": entry.summary,
         "why": entry.why or None,
         "carries_out": [
             {"commit": each.commit, "author": each.author, "summary": each.summary}
-            for each in repo.behind(entry, _MOST_CARRIED_OUT)
+            for each in repo.person_commits_behind(entry, _MOST_CARRIED_OUT)
         ],
     }
 

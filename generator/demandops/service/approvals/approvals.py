@@ -32,10 +32,10 @@ from demandops.service.ticket import Receipt, Record, Ticket
 from demandops.staterepo.git.repository import PushDenied, StateRepository
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
-from demandops.staterepo.history.commit_log import Arrival
+from demandops.staterepo.history.commit_log import RecordedOutcome
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_line
-from demandops.staterepo.write.proposal_branch import BranchMoved, Heads, branch_of
+from demandops.staterepo.write import commit_batch
+from demandops.staterepo.write.proposal_branch import BranchHeads, BranchMoved, branch_name
 
 log = logging.getLogger("demandops")
 
@@ -150,7 +150,7 @@ class Approvals:
             self._waiting.answer([(ticket, Refused([fault("demand", message, code="not-yours")]))])
             return
         if proposal is None:
-            branch = branch_of(request.demand or request.id, ticket.operation)
+            branch = branch_name(request.demand or request.id, ticket.operation)
             proposal = Proposal(key, Record(branch), seen=ticket.base)
         elif request.operation is Operation.PUT and request not in proposal.requests:
             replaced, proposal.tickets, proposal.requests = proposal.tickets, [], []
@@ -191,13 +191,13 @@ class Approvals:
             return longest
         return min(longest, max(self._next - time.monotonic(), 0.05))
 
-    def heads(self) -> Heads:
+    def heads(self) -> BranchHeads:
         """Ask where the branches are; the next look is due after a while, whatever comes."""
         self._began = time.monotonic()
         self._next, self._looked = self._began + self._every, _IN_TROUBLE
         return self._keeper.heads()
 
-    def look(self, snapshot: Snapshot, heads: Heads) -> None:
+    def look(self, snapshot: Snapshot, heads: BranchHeads) -> None:
         """Look at each proposal: is it decided, does it go, does it still fit main?
 
         Args:
@@ -233,7 +233,7 @@ class Approvals:
         self._waiting.answer([(ticket, error) for ticket in proposal.tickets])
         self._forget(proposal, close=True)
 
-    def _look_at(self, proposal: Proposal, snapshot: Snapshot, heads: Heads) -> None:
+    def _look_at(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
         objects = self._repository.objects
         arrived = commit_log.operations_since(objects, snapshot.commit, proposal.seen)
         proposal.seen = str(snapshot.commit)
@@ -265,14 +265,14 @@ class Approvals:
             self._changed.append(proposal.branch)
 
     def _verdict(
-        self, ticket: Ticket, snapshot: Snapshot, arrived: dict[str, Arrival]
+        self, ticket: Ticket, snapshot: Snapshot, arrived: dict[str, RecordedOutcome]
     ) -> Receipt | DemandOpsError | Decision:
         """Return what became of a demand: booked, refused, taken back, or how it still stands.
 
         It is booked where main's history has its operation, or main's books hold what it asks: a
         squash may lose the trailer, and never the claims.
         """
-        read = commit_line.CommitLine(self._repository, snapshot).read
+        read = commit_batch.CommitBatch(self._repository, snapshot).read
         decision: Decision | DemandOpsError
         try:
             decision = decide(snapshot.state, ticket.goal, ticket.received, read)

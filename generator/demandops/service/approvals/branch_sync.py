@@ -21,8 +21,8 @@ from demandops.service.demand_queue import DemandQueue
 from demandops.service.ticket import Record, Ticket
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_line
-from demandops.staterepo.write.proposal_branch import Branches, Heads, gitlab_options
+from demandops.staterepo.write import commit_batch
+from demandops.staterepo.write.proposal_branch import BranchHeads, ProposalBranches, gitlab_options
 
 log = logging.getLogger("demandops")
 
@@ -39,10 +39,10 @@ class BranchSync:
     ) -> None:
         self._repository = repository
         self._waiting = waiting
-        self._branches = Branches(repository)
+        self._branches = ProposalBranches(repository)
         self._desk = ForgeWorker(token_file, on_news)
 
-    def heads(self) -> Heads:
+    def heads(self) -> BranchHeads:
         """Ask where the branches are.
 
         Raises:
@@ -50,7 +50,7 @@ class BranchSync:
         """
         return self._branches.heads()
 
-    def turned_down(self, proposal: Proposal, heads: Heads) -> str:
+    def turned_down(self, proposal: Proposal, heads: BranchHeads) -> str:
         """Return how a person turned a proposal down that is not on main; empty where none did."""
         request = self._desk.request(proposal.branch)
         if proposal.record.pushed and proposal.branch not in heads.branches:
@@ -59,7 +59,9 @@ class BranchSync:
             return f"was turned down: {request.link} was closed"
         return ""
 
-    def take_away(self, proposal: Proposal, heads: Heads, *, if_unchanged: bool = False) -> None:
+    def take_away(
+        self, proposal: Proposal, heads: BranchHeads, *, if_unchanged: bool = False
+    ) -> None:
         """Delete the branch; ``if_unchanged``: not where somebody else has worked on it.
 
         Raises:
@@ -106,7 +108,7 @@ class BranchSync:
                 return False
             files = {path: text for _, d in steps for path, text in d.files.items()}
             made = self._branches.tree(snapshot.commit, files)
-            stands = head and self._branches.is_fresh(snapshot.commit, head, record.base, made)
+            stands = head and self._branches.is_up_to_date(snapshot.commit, head, record.base, made)
             if not stands and not self._lay(proposal, steps, snapshot, head):
                 return False
         forge = snapshot.state.config.repository.proposals
@@ -135,7 +137,7 @@ class BranchSync:
         self, left: list[tuple[Ticket, Decision]], snapshot: Snapshot
     ) -> tuple[list[tuple[Ticket, Decision]], list[tuple[Ticket, DemandOpsError]]]:
         """Judge what is left one after the other, with leases that count from the approval."""
-        line = commit_line.CommitLine(self._repository, snapshot)
+        line = commit_batch.CommitBatch(self._repository, snapshot)
         state, written = snapshot.state, dict[str, str | None]()
         steps, faulty = list[tuple[Ticket, Decision]](), list[tuple[Ticket, DemandOpsError]]()
 
@@ -163,7 +165,7 @@ class BranchSync:
         head: str,
     ) -> bool:
         """Commit the demands on main as it is and put the branch there; false where one goes."""
-        line = commit_line.CommitLine(self._repository, snapshot)
+        line = commit_batch.CommitBatch(self._repository, snapshot)
         now = datetime.now(timezone.utc)
         for ticket, step in steps:
             if step.files:

@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from demandops.config.config import Config
 from demandops.errors import InvalidInput
 from demandops.plan.overrides.lifecycle import expired_overrides
-from demandops.staterepo.write.commit_line import CommitLine
+from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
@@ -23,14 +23,14 @@ class OverrideClock:
         self._failed: dict[tuple[str, datetime], datetime] = {}
         self._not_before: datetime | None = None
 
-    def end(self, line: CommitLine, now: datetime) -> None:
+    def end(self, line: CommitBatch, now: datetime) -> None:
         """Commit on a line that what is over has ended; what cannot be carried out stays."""
         for override in expired_overrides(line.head.state.config, now):
             tried = self._failed.get((override.name, override.end or now))
             if tried is not None and now < tried + _AGAIN:
                 continue
             try:
-                line.end(override, now)
+                line.end_override(override, now)
                 log.info("%s ended at its time, %s", override.path, override.expires)
             except InvalidInput as error:
                 self._failed[override.name, override.end or now] = now

@@ -1,1 +1,1 @@
-"""Proof: commits are what books and configuration give, and are signed."""
+"""Audit: commits match what ledger and configuration give, and are signed."""

@@ -1,7 +1,7 @@
 """What a commit of the generator may change: generated files, and claims that its message names.
 
-Part of proving a commit (:mod:`demandops.staterepo.audit.verification`); goes by files and
-message alone and knows nothing of what a change means for what runs.
+Part of proving a commit (:mod:`demandops.staterepo.audit.verification`). Reads only files and
+messages; knows nothing of releases.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from demandops.staterepo.history.commit_log import LogEntry
 
 _OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
 _ENDING = ("follow", "upgrade", "expire-override")
-"""Operations that may say, or take back, that an override ended."""
+"""Operations that may add or remove the marker of an ended override."""
 
 
-def not_its_own(repo: Repository, commit: Commit, entry: LogEntry) -> tuple[str, ...]:
-    """Return the files that a commit changed although its message does not account for it.
+def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> tuple[str, ...]:
+    """Return the files that a commit changed although its message does not account for them.
 
-    People's files, and claims of demands that it does not name or that are not written as the
-    generator writes them.
+    These are files that people write, claims of demands that the message does not name, and claims
+    that are not formatted as the generator writes them.
     """
     if not commit.parents:
         return ()
-    return tuple(sorted(_foreign(repo, commit, entry)))
+    return tuple(sorted(_disallowed(repo, commit, entry)))
 
 
-def _foreign(repo: Repository, commit: Commit, entry: LogEntry) -> Iterator[str]:
-    before, operation = commit.parents[0].tree, entry.one("Operation")
+def _disallowed(repo: Repository, commit: Commit, entry: LogEntry) -> Iterator[str]:
+    before, operation = commit.parents[0].tree, entry.first("Operation")
     named = _named(entry)
     for path, blob in trees.differences(repo, before, commit.tree, ""):
         root = path.split("/", 1)[0]
@@ -50,26 +50,26 @@ def _foreign(repo: Repository, commit: Commit, entry: LogEntry) -> Iterator[str]
         elif path.rsplit("/", 1)[-1] in named:
             if blob and not _is_canonical(commit, path):
                 yield path
-        elif operation != "follow" or not _only_begins(commit, path):
+        elif operation != "follow" or not _only_starts_lease(commit, path):
             yield path
 
 
 def _named(entry: LogEntry) -> set[str]:
     """Return the file names of the claims that a commit's message accounts for."""
     demands = {*entry.trailers.get("Demand-Id", ())}
-    for path in entry.trailers.get("Override", ()):  # the claims by which overrides keep something
+    for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
         demands.add(KEPT + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
     return {f"{claim_file.segment(demand)}.yaml" for demand in demands}
 
 
-def _only_begins(commit: Commit, path: str) -> bool:
-    """Tell whether all that changed of a claim is that its lease runs, now that it is approved."""
+def _only_starts_lease(commit: Commit, path: str) -> bool:
+    """Return whether a claim changed only in that its lease started, after approval."""
     before, after = (_claim(one, path) for one in (commit.parents[0], commit))
     if before is None or after is None or before.lease is None or after.lease is None:
         return False
-    begun = not before.lease.has_started and after.lease.has_started
+    started = not before.lease.has_started and after.lease.has_started
     same = replace(before, lease=replace(before.lease, until=after.lease.until)) == after
-    return begun and same and _is_canonical(commit, path)
+    return started and same and _is_canonical(commit, path)
 
 
 def _is_marker(commit: Commit, path: str) -> bool:

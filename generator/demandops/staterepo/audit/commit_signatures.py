@@ -1,8 +1,8 @@
-"""Checking signatures: is every commit of the generator signed by a key that people listed?
+"""Signatures: whether each commit of the generator is signed by an allowed key.
 
-The list is people's, ``policy/allowed-signers`` (ssh-keygen's ALLOWED SIGNERS format), and a commit
-is held to what its parent says there: it cannot vouch for itself. Git does the checking, all
-commits that go by one list in one process.
+People list the keys in ``policy/allowed-signers`` (ssh-keygen's ALLOWED SIGNERS format). The list
+in the commit's parent counts, so that a commit cannot allow its own key. One git process checks
+all commits with the same list.
 """
 
 from __future__ import annotations
@@ -26,52 +26,56 @@ _GOOD = "G"
 _CONFIG = ("-c", "gpg.ssh.program=ssh-keygen", "-c", "gpg.minTrustLevel=undefined")
 
 
-def checked(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Return the verdicts with what is to be said of each commit's signature."""
+def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
+    """Return the verdicts with the result for each commit's signature."""
     verdicts = list(verdicts)
     lists: dict[str, list[str]] = {}
-    armour = {}
+    signatures = {}
     for verdict in verdicts:
         commit = trees.commit_of(repo, verdict.commit)
-        armour[verdict.commit] = (commit.gpg_signature[0] or b"").decode("utf-8", "replace")
+        signatures[verdict.commit] = (commit.gpg_signature[0] or b"").decode("utf-8", "replace")
         allowed = _allowed(commit)
         if allowed is not None and entry_of(commit).by_generator:
             lists.setdefault(allowed, []).append(verdict.commit)
-    found: dict[str, tuple[str, str]] = {}
+    checked: dict[str, tuple[str, str]] = {}
     for allowed, commits in lists.items():
-        found |= _asked(repo, allowed, commits)
-    return [_told(verdict, armour[verdict.commit], found) for verdict in verdicts]
+        checked |= _check_with_git(repo, allowed, commits)
+    return [_with_signature(verdict, signatures[verdict.commit], checked) for verdict in verdicts]
 
 
 def _allowed(commit: Commit) -> str | None:
     return trees.read_text(commit.parents[0].tree, ALLOWED_SIGNERS) if commit.parents else None
 
 
-def _told(verdict: Verdict, armour: str, found: dict[str, tuple[str, str]]) -> Verdict:
-    verdict = replace(verdict, signed=bool(armour))
-    if verdict.commit not in found:
+def _with_signature(
+    verdict: Verdict, signature: str, checked: dict[str, tuple[str, str]]
+) -> Verdict:
+    verdict = replace(verdict, signed=bool(signature))
+    if verdict.commit not in checked:
         return verdict
-    state, signer = found[verdict.commit]
-    if not armour:
-        fault = f"is not signed, and {ALLOWED_SIGNERS} asks for it"
-    elif state != _GOOD or not armour.lstrip().startswith(_SSH):
+    state, signer = checked[verdict.commit]
+    if not signature:
+        fault = f"is not signed, but {ALLOWED_SIGNERS} requires it"
+    elif state != _GOOD or not signature.lstrip().startswith(_SSH):
         fault = f"is signed, but not by a key that {ALLOWED_SIGNERS} lists"
         if state == "B":
-            fault = "has a signature that is not of this commit"
+            fault = "has a signature of another commit"
     else:
         return replace(verdict, signer=signer)
     return replace(verdict, holds=False, signature=fault)
 
 
-def _asked(repo: Repository, allowed: str, commits: list[str]) -> dict[str, tuple[str, str]]:
-    """Return commit → (git's word for its signature, whose it is)."""
+def _check_with_git(
+    repo: Repository, allowed: str, commits: list[str]
+) -> dict[str, tuple[str, str]]:
+    """Return commit → (git's letter for its signature, the signer)."""
     with tempfile.TemporaryDirectory(prefix="demandops-") as folder, git.Repo(repo.path) as opened:
         file = Path(folder) / "allowed-signers"
         file.write_text(allowed)
-        asked = Path(folder) / "commits"
-        asked.write_text("\n".join(commits) + "\n")
-        with asked.open("rb") as lines:
-            said = opened.git.execute(
+        revisions = Path(folder) / "commits"
+        revisions.write_text("\n".join(commits) + "\n")
+        with revisions.open("rb") as lines:
+            output = opened.git.execute(
                 [
                     *(opened.git.GIT_PYTHON_GIT_EXECUTABLE, *_CONFIG),
                     *("-c", f"gpg.ssh.allowedSignersFile={file}"),
@@ -85,5 +89,5 @@ def _asked(repo: Repository, allowed: str, commits: list[str]) -> dict[str, tupl
                 ],
                 istream=lines,
             )
-    rows = (line.split(" ", 2) for line in str(said).splitlines())
+    rows = (line.split(" ", 2) for line in str(output).splitlines())
     return {row[0]: (row[1], row[2] if len(row) > 2 else "") for row in rows}

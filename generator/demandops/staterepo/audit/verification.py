@@ -1,10 +1,10 @@
-"""Proving commits: what the generator committed is what books and configuration give.
+"""Proving commits: the generated files are those that ledger and configuration give.
 
-A commit is proven whole (loaded and rendered from nothing) or by differences from the one proven
-before it. The second trusts object ids, and that planning and rendering are functions; it does not
-trust what the generator thought was affected: every release is planned and rendered again of whose
-plan anything that was read has changed (:mod:`demandops.plan.incremental_plan`), and every file
-that differs in Git is compared. The first and the last commit of a row are proven whole.
+A commit is proven whole (everything is loaded and rendered) or by its differences from the commit
+proven before it. The second way trusts object ids, and that planning and rendering are functions.
+It does not trust which releases the generator considered affected: it plans and renders every
+release again if any input of its plan changed (:mod:`demandops.plan.incremental_plan`), and
+compares every file that differs in Git. The first and the last commit are proven whole.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ from demandops.staterepo.audit import allowed_changes
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import LogEntry, entry_of
 from demandops.staterepo.history.commit_message import PROPOSAL
-from demandops.staterepo.load import effective_config
+from demandops.staterepo.load import in_force_trailers
 
 _CHARTS = "/_charts/"
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether the rendered files of one commit are those that its books and settings give.
+    """Whether the generated files of a commit are those that ledger and configuration give.
 
-    ``touched`` are files that the commit changed and that are not its to write. ``signature`` says
-    what is wrong with it where one is asked for, ``signer`` whose it is.
+    ``holds`` is true if nothing is wrong, or the commit is ``skipped``. ``touched`` are files that
+    the commit changed but may not change. ``signature`` says what is wrong with a required
+    signature, ``signer`` who signed.
     """
 
     commit: str
@@ -59,7 +60,7 @@ class Verdict:
 
 @dataclass(slots=True)
 class _Proof:
-    """A commit that was rendered again, and what of it serves the next."""
+    """A commit that was rendered again, and what the proof of the next one reuses."""
 
     tree: Tree
     state: State
@@ -67,18 +68,18 @@ class _Proof:
     plan: IncrementalPlan
     planned: dict[ReleaseKey, tuple[str, Oid]]
     held: dict[ReleaseKey, Release]
-    """Releases whose files an override holds: they follow from the commit before."""
-    steady: dict[str, Oid]
-    """What stays when nothing is demanded."""
-    standing: dict[str, Oid]
-    """What the commit holds below the generated folders."""
+    """Releases whose files an override holds: they depend on the parent commit."""
+    undemanded: dict[str, Oid]
+    """Files that exist without any demand."""
+    committed: dict[str, Oid]
+    """The commit's files in the generated folders."""
 
-    def take_in(self, state: State, changes: Sequence[ClaimChange], before: Tree | None) -> None:
-        """Plan and render what the changes may have changed.
+    def advance(self, state: State, changes: Sequence[ClaimChange], before: Tree | None) -> None:
+        """Plan and render what the changes affect.
 
         Args:
-            state: books and configuration after the changes.
-            changes: every claim that is not what it was.
+            state: ledger and configuration after the changes.
+            changes: every claim that changed.
             before: the commit's parent, whose files overrides may hold.
         """
         self.state = state
@@ -93,45 +94,45 @@ class _Proof:
             self.planned[key] = _rendered(release, state, before)
 
     def differing(self, before: Tree | None) -> tuple[str, ...]:
-        """Return the files that are not what they should be."""
-        wanted = self.steady | dict(self.planned.values())
+        """Return the files that differ from what was rendered."""
+        wanted = self.undemanded | dict(self.planned.values())
         if before is not None and any(one.hold for one in self.state.config.in_force):
             charts = {
                 path: trees.read_text(before, path) or ""
-                for path, _ in _standing(before)
+                for path, _ in _generated_files(before)
                 if _CHARTS in path and path not in wanted
             }
             kept = release_file.kept_charts({}, charts, self.state.config)
             wanted |= {path: _blob(text) for path, text in kept.items()}
-        return _differing(wanted, self.standing)
+        return _differing(wanted, self.committed)
 
 
 def _rendered(release: Release, state: State, before: Tree | None) -> tuple[str, Oid]:
     path = path_of(release)
-    standing = trees.read_text(before, path) if before is not None else None
-    return path, _blob(release_file.release_text(release, state.config, state.engine, standing))
+    current = trees.read_text(before, path) if before is not None else None
+    return path, _blob(release_file.release_text(release, state.config, state.engine, current))
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
     """Yield a verdict on each commit, oldest first.
 
     Args:
-        whole: whether to load and render every commit from nothing.
+        whole: load and render every commit whole.
     """
-    row = _Row(repo)
+    proofs = _Proofs(repo)
     for place, revision in enumerate(commits, 1):
         commit = trees.commit_of(repo, revision)
         entry = entry_of(commit)
-        verdict = Verdict(entry.commit, entry.summary, True, _why_not(entry))
+        verdict = Verdict(entry.commit, entry.summary, True, _skip_reason(entry))
         if verdict.skipped:
             yield verdict
             continue
-        touched = allowed_changes.not_its_own(repo, commit, entry)
-        alone = whole or place == len(commits) or bool(entry.one("In-Force"))
+        touched = allowed_changes.disallowed_files(repo, commit, entry)
+        whole_commit = whole or place == len(commits) or bool(entry.first("In-Force"))
         try:
-            differing = row.differing(commit, entry, alone=alone)
+            differing = proofs.differing(commit, entry, whole=whole_commit)
         except _Unreadable as error:
-            why = f"a person's file was not valid then: {error}"
+            why = f"a file was not valid then: {error}"
             yield replace(verdict, skipped=why, touched=touched, holds=not touched)
         except InvalidInput as error:  # the generator did render it then, so it must now
             yield replace(verdict, holds=False, fault=str(error.faults[0]), touched=touched)
@@ -141,61 +142,61 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
 
 
 class _Unreadable(Exception):
-    """A commit that cannot be judged, for a file of people in it is not valid."""
+    """Raised when a commit cannot be proven because one of its files is not valid."""
 
 
-class _Row:
-    """Commits that are proven one after the other."""
+class _Proofs:
+    """The proofs of successive commits."""
 
     def __init__(self, repo: Repository) -> None:
         self._repo = repo
         self._proof: _Proof | None = None
 
-    def differing(self, commit: Commit, entry: LogEntry, *, alone: bool) -> tuple[str, ...]:
-        """Return the files of a commit that are not what they should be.
+    def differing(self, commit: Commit, entry: LogEntry, *, whole: bool) -> tuple[str, ...]:
+        """Return the files of a commit that differ from what was rendered.
 
         Args:
-            alone: whether nothing that is known of another commit may serve.
+            whole: reuse nothing from another commit.
 
         Raises:
-            _Unreadable, InvalidInput: where it cannot be read, or not be rendered.
+            _Unreadable, InvalidInput: the commit cannot be read or rendered.
         """
         proof, self._proof = self._proof, None
-        if alone:
+        if whole:
             state = self._loaded(commit, entry)
             files = rendered_files(state, _held_from(commit, state.config))
             wanted = {path: _blob(text) for path, text in files.items()}
-            return _differing(wanted, dict(_standing(commit.tree)))
+            return _differing(wanted, dict(_generated_files(commit.tree)))
         if proof is None or _reconfigured(proof, commit):
-            proof = _from_nothing(self._loaded(commit, entry), commit)
+            proof = _prove_whole(self._loaded(commit, entry), commit)
         else:
             try:
                 changes = _claims_changed(self._repo, proof, commit)
             except InvalidInput as error:
                 raise _Unreadable(error.faults[0]) from None
-            _bring_forward(self._repo, proof, commit, changes)
-        self._proof = proof  # of one that could not be judged nothing serves the next
+            _advance(self._repo, proof, commit, changes)
+        self._proof = proof  # not reached, and so None, if the commit could not be read
         return proof.differing(_parent(commit))
 
     def _loaded(self, commit: Commit, entry: LogEntry) -> State:
         try:
-            return effective_config.at(self._repo, commit, entry).state
+            return in_force_trailers.snapshot_at(self._repo, commit, entry).state
         except InvalidInput as error:
             raise _Unreadable(error.faults[0]) from None
 
 
-def _differing(wanted: Mapping[str, Oid], standing: Mapping[str, Oid]) -> tuple[str, ...]:
+def _differing(wanted: Mapping[str, Oid], committed: Mapping[str, Oid]) -> tuple[str, ...]:
     return tuple(
         path
-        for path in sorted({*wanted, *standing})
-        if wanted.get(path) != standing.get(path) and not trees.is_note(path)
+        for path in sorted({*wanted, *committed})
+        if wanted.get(path) != committed.get(path) and not trees.is_readme(path)
     )
 
 
-def _why_not(entry: LogEntry) -> str:
+def _skip_reason(entry: LogEntry) -> str:
     if not entry.by_generator:
         return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
-    version = entry.one("Render-Version")
+    version = entry.first("Render-Version")
     if version != str(RENDER_VERSION):
         return f"rendered by version {version}, this is version {RENDER_VERSION}"
     return ""
@@ -206,7 +207,7 @@ def _parent(commit: Commit) -> Tree | None:
 
 
 def _held_from(commit: Commit, config: Config) -> dict[str, str]:
-    """Return the files as they were before a commit, where overrides hold some of them."""
+    """Return the files of the commit's parent if overrides hold some of them."""
     before = _parent(commit)
     if before is None or not any(override.hold for override in config.in_force):
         return {}
@@ -214,26 +215,28 @@ def _held_from(commit: Commit, config: Config) -> dict[str, str]:
 
 
 def _reconfigured(proof: _Proof, commit: Commit) -> bool:
-    """Tell whether people's files, which overrides ended, or what is held back is another."""
+    """Return whether configuration, ended overrides or the problem report changed."""
 
     def ids(tree: Tree) -> list[Oid | None]:
-        found = [trees.child(tree, root) for root in (*CONFIG_ROOTS, NOTES_ROOT)]
+        objects = [trees.child(tree, root) for root in (*CONFIG_ROOTS, NOTES_ROOT)]
         ledger = trees.child(tree, claim_file.LEDGER_ROOT)
         if isinstance(ledger, Tree):
-            found.append(trees.child(ledger, ended_override_file.MARKERS_ROOT.rsplit("/", 1)[-1]))
-        return [entry.id if entry else None for entry in found]
+            objects.append(trees.child(ledger, ended_override_file.MARKERS_ROOT.rsplit("/", 1)[-1]))
+        return [entry.id if entry else None for entry in objects]
 
     return ids(proof.tree) != ids(commit.tree)
 
 
 def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[ClaimChange]:
-    """Return the claims that differ from those proven before.
+    """Return the claims that differ from those of the commit proven before.
 
     Raises:
-        InvalidInput: where a claim file is not valid.
+        InvalidInput: a claim file is not valid.
     """
     changes = []
-    for path, blob in trees.below_root(repo, proof.tree, commit.tree, claim_file.LEDGER_ROOT):
+    for path, blob in trees.differences_below(
+        repo, proof.tree, commit.tree, claim_file.LEDGER_ROOT
+    ):
         if claim_file.kind_of(path) is None:
             continue
         known = proof.claims.get(path)
@@ -243,9 +246,9 @@ def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[Cla
     return changes
 
 
-def _from_nothing(state: State, commit: Commit) -> _Proof:
-    """Render a commit whole, so that the next can be proven by what differs."""
-    steady = manifests.base_files(state.config, state.engine)
+def _prove_whole(state: State, commit: Commit) -> _Proof:
+    """Render a commit whole, so that the next can be proven by its differences."""
+    undemanded = manifests.base_files(state.config, state.engine)
     proof = _Proof(
         tree=commit.tree,
         state=state,
@@ -253,17 +256,17 @@ def _from_nothing(state: State, commit: Commit) -> _Proof:
         plan=IncrementalPlan(state.config),
         planned={},
         held={},
-        steady={path: _blob(text) for path, text in steady.items()},
-        standing=dict(_standing(commit.tree)),
+        undemanded={path: _blob(text) for path, text in undemanded.items()},
+        committed=dict(_generated_files(commit.tree)),
     )
-    proof.take_in(state, (), _parent(commit))
+    proof.advance(state, (), _parent(commit))
     return proof
 
 
-def _bring_forward(
+def _advance(
     repo: Repository, proof: _Proof, commit: Commit, changes: Sequence[ClaimChange]
 ) -> None:
-    """Render what a commit changed of its books, and note what it changed of its files."""
+    """Render what a commit changed in the ledger, and record which files it changed."""
     ledger = proof.state.ledger
     for change in changes:
         ledger = ledger.replace(change.key, change.after)
@@ -272,19 +275,19 @@ def _bring_forward(
         if change.after is not None:
             proof.claims[path] = change.after
     for root in GENERATED_ROOTS:
-        for path, blob in trees.below_root(repo, proof.tree, commit.tree, root):
-            proof.standing.pop(path, None)
+        for path, blob in trees.differences_below(repo, proof.tree, commit.tree, root):
+            proof.committed.pop(path, None)
             if blob is not None:
-                proof.standing[path] = blob
+                proof.committed[path] = blob
     proof.tree = commit.tree
-    proof.take_in(replace(proof.state, ledger=ledger), changes, _parent(commit))
+    proof.advance(replace(proof.state, ledger=ledger), changes, _parent(commit))
 
 
-def _standing(tree: Tree) -> Iterator[tuple[str, Oid]]:
+def _generated_files(tree: Tree) -> Iterator[tuple[str, Oid]]:
     for root in GENERATED_ROOTS:
         entry = trees.child(tree, root)
         if isinstance(entry, Tree):
-            yield from trees.entries(entry, f"{root}/")
+            yield from trees.files_below(entry, f"{root}/")
         elif entry is not None:
             yield root, entry.id
 

@@ -1,1 +1,1 @@
-"""Git itself: trees, signed commits, and the repository on this disk or behind a URL."""
+"""Git: trees, signed commits, and the repository on this disk or behind a URL."""

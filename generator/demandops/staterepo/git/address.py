@@ -1,4 +1,4 @@
-"""Where a state repo is said to be: a folder or a URL, and which URLs are taken."""
+"""The address of a state repo: a folder or a URL, and which URLs are allowed."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ _USER = re.compile(r"(://)[^/@\s]*@")
 
 
 def without_secrets(text: str) -> str:
-    """Return ``text`` with the user part of every URL taken out: it may hold a password."""
+    """Return ``text`` without the user part of its URLs, which may hold a password."""
     return _USER.sub(r"\1", _HAS_PASSWORD.sub(r"\1", text))
 
 
 def is_url(address: str) -> bool:
-    """Tell a Git URL (``https://…``, ``ssh://…``, ``user@host:path``) from a folder."""
+    """Return whether this is a Git URL (``https://…``, ``ssh://…``, ``user@host:path``)."""
     return not Path(address).exists() and bool(_SCHEME.match(address) or _SCP.match(address))
 
 
 def check_url(url: str) -> None:
-    """Refuse a URL that git would take and a generator should not.
+    """Refuse a URL that git accepts but a generator should not use.
 
     Raises:
-        StateRepoError: saying how to mend it.
+        StateRepoError: the URL has another scheme or holds a password.
     """
     scheme = _SCHEME.match(url)
     if scheme and (scheme[2] == "::" or scheme[1] not in _ALLOWED):
         raise StateRepoError(
-            f"'{scheme[0]}' is no way to reach a state repo; use https, ssh, git or file"
+            f"a state repo's address cannot start with '{scheme[0]}'; use https, ssh, git or file"
         )
     if _HAS_PASSWORD.search(url):
         raise StateRepoError(
-            "the state repo's address holds a password, which process lists would show; leave "
-            "it out and give it to git by a credential helper, ~/.netrc or an SSH key"
+            "the state repo's address holds a password, which process lists would show; remove "
+            "it and use a credential helper, ~/.netrc or an SSH key"
         )

@@ -1,7 +1,7 @@
-"""Where the state repo is: a bare repository on this disk, or anything that Git can clone.
+"""Opening the state repo: a bare repository on this disk, or a URL that Git can clone.
 
-Both give a pygit2 repository to read and write objects in and one way to publish a commit, which
-succeeds only on top of what was there: never a forced push, never a merge of texts.
+Both give a pygit2 repository to read and write objects, and one way to publish a commit. It
+succeeds only on top of the current tip: no push is forced and no texts are merged.
 """
 
 from __future__ import annotations
@@ -10,31 +10,31 @@ from pathlib import Path
 
 from demandops.errors import StateRepoError
 from demandops.staterepo.git.address import check_url, is_url
-from demandops.staterepo.git.bare import BareRepository
-from demandops.staterepo.git.clone import ClonedRepository, Say
+from demandops.staterepo.git.local_repository import LocalRepository
+from demandops.staterepo.git.remote_repository import Notify, RemoteRepository
 from demandops.staterepo.git.repository import StateRepository
 
 
 def connect(
-    address: str, folder: Path, say: Say = lambda text: None, *, patient: bool = False
+    address: str, folder: Path, notify: Notify = lambda text: None, *, allow_offline: bool = False
 ) -> StateRepository:
     """Open the state repo at ``address``.
 
     Args:
         address: a folder with a bare repository, or any URL that git clones.
         folder: where the clone of a URL is kept.
-        say: told about work that takes a while.
-        patient: whether a clone that is here already will do where its remote is away.
+        notify: called with a text before work that takes a while.
+        allow_offline: use an existing clone if its remote cannot be reached.
 
     Raises:
-        StateRepoError: saying what is wrong with the address and how to mend it.
+        StateRepoError: the address is not usable, or the remote cannot be reached.
     """
     if is_url(address):
         check_url(address)
-        return ClonedRepository(address, folder / "clone.git", say, patient)
+        return RemoteRepository(address, folder / "clone.git", notify, allow_offline)
     path = Path(address).expanduser()
     if not path.is_dir():
         raise StateRepoError(
             f"{address} does not exist; make a state repo with `demandops init {address} --bare`"
         )
-    return BareRepository(path)
+    return LocalRepository(path)

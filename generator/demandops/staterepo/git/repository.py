@@ -1,7 +1,6 @@
-"""A state repo as the writer sees it: objects to read and write, and a tip that moves forward only.
+"""The state repo that a writer uses: Git objects, and a tip that only moves forward.
 
-There are two kinds, one on this disk and one behind a URL; :mod:`demandops.staterepo.git.connect`
-chooses.
+There are two kinds, on this disk and behind a URL; :mod:`demandops.staterepo.git.connect` chooses.
 """
 
 from __future__ import annotations
@@ -24,58 +23,58 @@ ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
 
 
 class RemoteAway(StateRepoError):
-    """The remote did not answer; what is kept in the outbox goes there when it is back."""
+    """The remote cannot be reached; the journal keeps the demands until it is back."""
 
 
-class CutShort(StateRepoError):
-    """A look at the remote was ended because something more urgent came."""
+class FetchInterrupted(StateRepoError):
+    """A fetch was ended because something was more urgent."""
 
 
 class PushDenied(StateRepoError):
-    """The remote answers and takes no push (a hook, a protected branch, missing rights)."""
+    """The remote rejects the push (a hook, a protected branch, missing rights)."""
 
 
 class StateRepository(ABC):
-    """A state repo: objects to read and write, and a tip that moves forward only."""
+    """A state repo: Git objects to read and write, and a tip that only moves forward."""
 
     objects: Repository
     address: str
     signer: Signer | None = None
-    """Signs what is committed here; nothing: commits are not signed."""
+    """Signs the commits made here; None: they are not signed."""
 
     @abstractmethod
     def tip(self) -> Oid:
-        """Return the newest published commit that is known here, without asking anybody."""
+        """Return the newest published commit that is known here; does not ask the remote."""
 
     @abstractmethod
     def refresh(self) -> Oid:
-        """Ask where the state repo is now and return its newest commit.
+        """Fetch and return the newest published commit.
 
         Raises:
-            RemoteAway: where it cannot be reached.
+            RemoteAway: the remote cannot be reached.
         """
 
-    def look(self, urgent: Callable[[], bool]) -> Oid:
-        """As :meth:`refresh`, but ended as soon as ``urgent`` says that something else is to do.
+    def refresh_unless_urgent(self, urgent: Callable[[], bool]) -> Oid:
+        """Fetch like :meth:`refresh`, but stop as soon as ``urgent`` returns true.
 
         Raises:
-            RemoteAway: where it cannot be reached.
-            CutShort: where it was ended.
+            RemoteAway: the remote cannot be reached.
+            FetchInterrupted: it was stopped.
         """
         return self.refresh()
 
     @abstractmethod
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Make ``commit`` the tip if the tip is ``expected``, durably; else return false.
+        """Make ``commit`` the tip, durably, if the tip is ``expected``; else return false.
 
         Raises:
-            RemoteAway, PushDenied: where it could not be published for another reason.
+            RemoteAway, PushDenied: it could not be published for another reason.
         """
 
     def includes(self, commit: str, other: str) -> bool:
-        """Tell whether ``commit`` is ``other`` or comes after it; false for one not known here.
+        """Return whether ``commit`` is ``other`` or a descendant; false if one is not known here.
 
-        May be called from any thread: it opens the objects anew.
+        May be called from any thread: it opens the repository again.
         """
         if commit == other:
             return True
@@ -85,7 +84,7 @@ class StateRepository(ABC):
             return False
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Tell whether two commits hold the same under ``path``; false for one not known here.
+        """Return whether ``path`` is equal in two commits; false if one is not known here.
 
         May be called from any thread.
         """
@@ -93,35 +92,35 @@ class StateRepository(ABC):
         one, two = (_under(objects, name, path) for name in (commit, other))
         return one is not None and one == two
 
-    def changed(self, since: str, commit: str) -> list[str] | None:
-        """Return the paths in which two commits differ; None where one is not known here.
+    def changed_paths(self, since: str, commit: str) -> list[str] | None:
+        """Return the paths in which two commits differ; None if one is not known here.
 
         May be called from any thread.
         """
         objects = Repository(self.objects.path)
         try:
-            found = objects.diff(objects[since].id, objects[commit].id)
+            diff = objects.diff(objects[since].id, objects[commit].id)
         except (pygit2.GitError, KeyError, ValueError):
             return None
-        ends = (end for delta in found.deltas for end in (delta.old_file, delta.new_file))
+        ends = (end for delta in diff.deltas for end in (delta.old_file, delta.new_file))
         return sorted({end.path for end in ends})
 
-    def give_up(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
-        """End what is under way with a remote; nothing where there is none."""
+    def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
+        """End the running transfer with a remote, if any."""
 
     def tidy(self) -> None:
-        """Let git pack loose objects, if there are many; it does so in a process of its own."""
+        """Have git pack loose objects if there are many."""
         with suppress(git.GitCommandError), git.Repo(self.objects.path) as repo:
             _git(repo, "gc", "--auto", "--quiet")
 
     @property
     @abstractmethod
     def always_current(self) -> bool:
-        """Tell whether :meth:`tip` can never be behind (a repository on this disk)."""
+        """Whether :meth:`tip` is never out of date (a repository on this disk)."""
 
 
 def _under(objects: Repository, commit: str, path: str) -> Oid | None:
-    """Return the id of what a commit holds under a path, or None."""
+    """Return the id of the file or folder at a path in a commit, or None."""
     try:
         tree = objects[commit].peel(pygit2.Tree)
         return tree.id if path in ("", ".") else tree[path].id
@@ -130,11 +129,7 @@ def _under(objects: Repository, commit: str, path: str) -> Oid | None:
 
 
 def _git(repo: git.Repo, *command: str) -> None:
-    """Run a git command that talks to the remote.
-
-    In a session of its own: Ctrl-C goes to every process of the terminal, and must not cut off a
-    push that the generator is waiting for.
-    """
+    """Run a git command in a session of its own, so that Ctrl-C does not end it."""
     with repo.git.custom_environment(**ENVIRONMENT):
         repo.git.execute(
             [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],

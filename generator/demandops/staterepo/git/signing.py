@@ -1,8 +1,8 @@
-"""Commits signed by an SSH key, exactly as git signs them.
+"""Commits signed by an SSH key, in the same way as git signs them.
 
-The signature is ``ssh-keygen``'s over the commit's bytes, kept in the header ``gpgsig``, so that
-``git verify-commit`` and every forge accept it. Only the key's path is known here; the key itself
-is read by ``ssh-keygen`` or held by an agent.
+``ssh-keygen`` signs the commit's bytes, and the signature goes into the header ``gpgsig``, so
+``git verify-commit`` and every forge accept it. This module knows only the key's path;
+``ssh-keygen`` reads the key or an agent holds it.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ _PROBE = b"demandops: can this key sign?\n"
 
 
 class SigningFailed(StateRepoError):
-    """A commit that could not be signed, and so was not made."""
+    """Raised when a commit cannot be signed, and so is not made."""
 
 
 class Signer:
-    """Signs with one key: a private key file, or the public one of a key that an agent holds."""
+    """Signs with one key: a private key file, or the public file of a key that an agent holds."""
 
     def __init__(self, key: Path) -> None:
-        """Try the key at once: one that cannot sign is told before any demand is taken.
+        """Try the key at once, so that a key that cannot sign fails before any demand is accepted.
 
         Raises:
-            SigningFailed: saying what is wrong with the key and how to mend it.
+            SigningFailed: the key cannot sign; says why and the remedy.
         """
         self.key = key.expanduser()
         if not self.key.is_file():
             raise SigningFailed(
-                f"signing key {key} is no file; make one with `ssh-keygen -t ed25519 -f {key}`, or "
-                "name the one you have"
+                f"signing key {key} is not a file; make one with `ssh-keygen -t ed25519 -f {key}`, "
+                "or name an existing one"
             )
         self.sign(_PROBE)
 
     def sign(self, data: bytes) -> str:
-        """Return the signature of ``data``, in the armour that git keeps.
+        """Return the armored signature of ``data``.
 
         Raises:
-            SigningFailed: where there is none.
+            SigningFailed: ``ssh-keygen`` did not sign.
         """
         command = ["ssh-keygen", "-Y", "sign", "-n", "git", "-f", str(self.key)]
         environment = dict(os.environ) | {"SSH_ASKPASS_REQUIRE": "never", "LC_ALL": "C"}
@@ -58,41 +58,41 @@ class Signer:
                 timeout=_TIMEOUT_S,
                 check=False,
                 env=environment,
-                start_new_session=True,  # no terminal, so that nobody is asked for a passphrase
+                start_new_session=True,  # no terminal, so that ssh-keygen asks for no passphrase
             )
         except FileNotFoundError:
             raise SigningFailed(
-                "ssh-keygen is missing, and signs the commits; install it (Debian: apt-get install "
-                "openssh-client)"
+                "ssh-keygen, which signs the commits, is missing; install it (Debian: apt-get "
+                "install openssh-client)"
             ) from None
         except subprocess.TimeoutExpired:
             raise SigningFailed(
-                f"signing with {self.key} took more than {_TIMEOUT_S} s; does its agent wait for "
-                "somebody to confirm?"
+                f"signing with {self.key} took more than {_TIMEOUT_S} s; check whether its agent "
+                "waits for a confirmation"
             ) from None
         if done.returncode:
-            raise SigningFailed(_why_not(self.key, done.stderr.decode("utf-8", "replace")))
+            raise SigningFailed(_key_fault(self.key, done.stderr.decode("utf-8", "replace")))
         return done.stdout.decode("ascii").rstrip("\n")
 
 
-def _why_not(key: Path, said: str) -> str:
-    """Return what is wrong with a key, from what ssh-keygen said of it."""
-    if "UNPROTECTED PRIVATE KEY" in said or "bad permissions" in said:
+def _key_fault(key: Path, output: str) -> str:
+    """Return what is wrong with a key and the remedy, from ssh-keygen's output."""
+    if "UNPROTECTED PRIVATE KEY" in output or "bad permissions" in output:
         return f"signing key {key} can be read by others; run: chmod 600 {key}"
-    if "Permission denied" in said:
-        return f"signing key {key} cannot be read; run as its owner, or name another"
-    if "passphrase" in said:
+    if "Permission denied" in output:
+        return f"signing key {key} cannot be read; run as its owner, or name another key"
+    if "passphrase" in output:
         return (
             f"signing key {key} has a passphrase; run `ssh-add {key}` and name {key}.pub, so that "
             "the agent signs"
         )
-    last = next((line for line in reversed(said.strip().splitlines()) if line.strip()), "")
-    if "agent" in said or "No private key found" in said:
+    last = next((line for line in reversed(output.strip().splitlines()) if line.strip()), "")
+    if "agent" in output or "No private key found" in output:
         return (
             f"signing key {key} is public, and no agent signs for it ({last.strip()}); run "
-            "`ssh-add` with the private key, with SSH_AUTH_SOCK set here as well"
+            "`ssh-add` with the private key, and set SSH_AUTH_SOCK here too"
         )
-    return f"signing key {key} does not sign: {last.strip()}; name a private SSH key"
+    return f"signing key {key} cannot sign: {last.strip()}; name a private SSH key"
 
 
 def create_commit(
@@ -103,7 +103,7 @@ def create_commit(
     tree: Oid,
     parents: Sequence[Oid],
 ) -> Oid:
-    """Write a commit by ``people`` (author, committer), signed where there is a signer."""
+    """Write a commit by ``people`` (author, committer), signed if there is a signer."""
     author, committer = people
     if signer is None:
         return repo.create_commit(None, author, committer, text, tree, list(parents))

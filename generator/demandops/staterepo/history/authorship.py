@@ -1,10 +1,12 @@
-"""Whose commits a follow commit carries out, so that history names the person for what followed.
+"""Who is behind a change: the commits by people, and who runs this program.
 
-Reads commits only. People are everybody but the generator, whichever machine it runs on.
+A follow commit renders what people committed; it names their commits and has them as author.
+A commit is by a person if no generator made it, on any machine.
 """
 
 from __future__ import annotations
 
+import getpass
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,6 +15,7 @@ from datetime import datetime, timezone
 import git
 import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
+from pygit2 import Config as GitConfig
 from pygit2.enums import SortMode
 
 from demandops.config.config import CONFIG_ROOTS
@@ -29,8 +32,8 @@ _EMAIL = re.compile(r"[^\s<>\x00-\x1f\x7f]+")
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
-    """A person's commit that was taken in."""
+class PersonCommit:
+    """A commit by a person: its id, author and time."""
 
     commit: str
     name: str
@@ -43,74 +46,76 @@ class Cause:
         return f"{self.name} <{self.email}>"
 
 
-def since(repo: Repository, known: Oid, to: Oid) -> tuple[Cause, ...]:
-    """Return people's commits up to ``to`` that ``known`` does not have, newest first.
+def person_commits_since(repo: Repository, known: Oid, to: Oid) -> tuple[PersonCommit, ...]:
+    """Return the commits by people up to ``to`` that ``known`` does not include, newest first.
 
-    Those that touch nothing the generator goes by (a README) caused nothing and are left out.
+    Leaves out commits that change nothing the generator reads (a README).
     """
     return tuple(
-        cause_of(commit) for commit in _peoples(repo, known, to) if _touches(commit, _ROOTS)
+        person_commit_of(commit)
+        for commit in _person_commits(repo, known, to)
+        if _touches(commit, _ROOTS)
     )
 
 
-class Origins:
-    """Finds which of people's commits since ``known`` a path is as it is by."""
+class FaultOrigins:
+    """Finds the commit by a person since ``known`` that last changed a path."""
 
     def __init__(self, repo: Repository, known: Oid, to: Oid) -> None:
-        self._world = (repo, known, to)
+        self._range = (repo, known, to)
         self._commits: list[Commit] | None = None
 
     def __call__(self, path: str) -> tuple[str, str] | None:
-        """Return commit and author of the newest that touches ``path``, else of the newest."""
-        if self._commits is None:  # most reports stand already, and then nobody asks
-            self._commits = list(_peoples(*self._world))
+        """Return commit and author of the last change to ``path``, else of any change."""
+        if self._commits is None:  # read late: most reports exist already and need no commits
+            self._commits = list(_person_commits(*self._range))
         for paths in ((path,) if path else (), _ROOTS):
             for commit in self._commits:
                 if _touches(commit, paths):
-                    cause = cause_of(commit)
-                    return cause.commit, cause.who
+                    found = person_commit_of(commit)
+                    return found.commit, found.who
         return None
 
 
-def _peoples(repo: Repository, known: Oid, to: Oid) -> Iterable[Commit]:
+def _person_commits(repo: Repository, known: Oid, to: Oid) -> Iterable[Commit]:
     walker = repo.walk(to, SortMode.TOPOLOGICAL)
     walker.hide(known)
-    return (commit for commit in walker if not commit_message.is_generators(commit.message))
+    return (commit for commit in walker if not commit_message.is_by_generator(commit.message))
 
 
 def _touches(commit: Commit, paths: Iterable[str]) -> bool:
     parent = commit.parents[0].tree if commit.parents else None
-    return any(_at(parent, path) != _at(commit.tree, path) for path in paths)
+    return any(_entry_id(parent, path) != _entry_id(commit.tree, path) for path in paths)
 
 
-def _at(tree: Tree | None, path: str) -> Oid | None:
+def _entry_id(tree: Tree | None, path: str) -> Oid | None:
     entry = trees.child(tree, path) if tree is not None else None
     return entry.id if entry is not None else None
 
 
-def cause_of(commit: Commit) -> Cause:
-    """Return a commit and its author, in characters that a trailer and a signature can carry."""
+def person_commit_of(commit: Commit) -> PersonCommit:
+    """Return a commit and its author, without characters that trailers and signatures forbid."""
     name = _UNFIT.sub("", commit.author.name).strip(" .,:;\"'\\") or "unnamed"
     email = commit.author.email if _EMAIL.fullmatch(commit.author.email or "") else ""
-    moment = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
-    return Cause(
-        str(commit.id), name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL, moment
+    time = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
+    return PersonCommit(
+        str(commit.id), name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL, time
     )
 
 
-def trailers(causes: tuple[Cause, ...]) -> list[tuple[str, str]]:
-    """Return ``Caused-By: <commit> <name> <email>`` for each, the oldest first.
+def caused_by_trailers(causes: tuple[PersonCommit, ...]) -> list[tuple[str, str]]:
+    """Return ``Caused-By: <commit> <name> <email>`` for each commit, oldest first.
 
-    A bounded number: where there are more, the newest are named, and ``Since`` tells the rest.
+    Only the newest are named if there are many; the trailer ``Since`` bounds the others.
     """
     return [("Caused-By", f"{one.commit} {one.who}") for one in reversed(causes[:_MOST_NAMED])]
 
 
-def author(causes: tuple[Cause, ...], now: datetime) -> pygit2.Signature:
-    """Return who a follow commit is of: the people whose commits it carries out.
+def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Signature:
+    """Return the author of a follow commit: the people whose commits it renders.
 
-    A sole person stands there as in their own commits, so that ``git log --author`` finds both;
-    of several the names, with the generator's address, for a commit has one only.
+    One person keeps name and address, so that ``git log --author`` finds both commits. Several
+    people are named with the generator's address, because a commit has only one.
     """
     if not causes:
         return commit_message.generator_signature(now)
@@ -123,11 +128,29 @@ def author(causes: tuple[Cause, ...], now: datetime) -> pygit2.Signature:
 
 
 def operator() -> str:
-    """Return who runs this program as git would name them, or nothing where git does not know."""
+    """Return ``name <email>`` of who runs this program, or an empty text if git does not know."""
     try:
-        told = git.Git().execute(
+        ident = git.Git().execute(
             ["git", "-c", "user.useConfigOnly=true", "var", "GIT_AUTHOR_IDENT"]
         )
     except git.GitCommandError:
         return ""
-    return str(told).rsplit("> ", 1)[0] + ">"
+    return str(ident).rsplit("> ", 1)[0] + ">"
+
+
+def git_user(repo: Repository) -> tuple[str, str]:
+    """Return name and e-mail address of who runs this program, from git or else the login."""
+    settings = repo.config.snapshot()
+    try:
+        login = getpass.getuser()
+    except (KeyError, OSError):  # a container's user has no passwd entry
+        login = "unknown"
+    name = _setting(settings, "user.name") or login
+    return name, _setting(settings, "user.email") or f"{login}@demandops.invalid"
+
+
+def _setting(settings: GitConfig, key: str) -> str:
+    try:
+        return settings[key] or ""
+    except KeyError:
+        return ""

@@ -1,6 +1,6 @@
-"""Reading the state repo's history: what the log says, and which commits are the generator's.
+"""The state repo's history: commits with their trailers, and which commits the generator made.
 
-Everything is in commit messages and trailers, so plain git says the same.
+Everything comes from commit messages and trailers, so plain git shows the same.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _WHY = "Why: "
 
 @dataclass(frozen=True, slots=True)
 class LogEntry:
-    """One commit of the state repo, as its message tells it."""
+    """One commit of the state repo, with what its message says."""
 
     commit: str
     time: datetime
@@ -31,32 +31,32 @@ class LogEntry:
     trailers: dict[str, list[str]]
     why: str = ""
 
-    def one(self, key: str) -> str:
-        """Return the first value of a trailer, or nothing."""
+    def first(self, key: str) -> str:
+        """Return the first value of a trailer, or an empty text."""
         return next(iter(self.trailers.get(key, ())), "")
 
     @property
     def by_generator(self) -> bool:
-        """Tell whether the generator made the commit, so that its files fit its books."""
+        """Whether the generator made the commit, so that its files match its ledger."""
         return "Render-Version" in self.trailers and PROPOSAL not in self.trailers
 
 
 def trailers_of(message: str) -> dict[str, list[str]]:
     """Return the trailers of a commit message: the lines ``Key: value`` of its last paragraph."""
-    found: dict[str, list[str]] = {}
+    trailers: dict[str, list[str]] = {}
     paragraph = message.rstrip("\n").rsplit("\n\n", 1)
     if len(paragraph) < 2:
-        return found
+        return trailers
     for line in paragraph[1].split("\n"):
         key, colon, value = line.partition(": ")
         if not colon or " " in key:
             return {}
-        found.setdefault(key, []).append(value)
-    return found
+        trailers.setdefault(key, []).append(value)
+    return trailers
 
 
 def entry_of(commit: Commit) -> LogEntry:
-    """Return what a commit says."""
+    """Return the log entry of a commit."""
     return LogEntry(
         commit=str(commit.id),
         time=datetime.fromtimestamp(commit.commit_time, tz=timezone.utc),
@@ -68,13 +68,13 @@ def entry_of(commit: Commit) -> LogEntry:
 
 
 def _why(message: str) -> str:
-    """Return the sentence in which a commit of the generator says why it was made."""
+    """Return the sentence after ``Why:`` in a generator's commit."""
     lines = (line for line in message.split("\n") if line.startswith(_WHY))
     return next(lines, "").removeprefix(_WHY)
 
 
 def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> Iterator[LogEntry]:
-    """Yield the commits from ``tip`` back, newest first, without those that ``until`` has too."""
+    """Yield the commits that ``tip`` includes and ``until`` does not, newest first."""
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
     if until is not None:
         walker.hide(commit_of(repo, until).id)
@@ -90,17 +90,17 @@ _OUTCOMES: dict[str, Literal["changed", "unchanged", "refused"]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
-    """Where a demand is found in history, and what came of it."""
+class RecordedOutcome:
+    """The commit that records a demand, and the demand's outcome."""
 
     commit: str
     outcome: Literal["changed", "unchanged", "refused"]
 
 
-def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Arrival]:
-    """Return operation id → arrival of every demand that was settled after ``base``.
+def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, RecordedOutcome]:
+    """Return operation id → outcome of every demand that commits after ``base`` record.
 
-    Where ``base`` is not known here (a remote that was laid anew), all of history is read.
+    Reads all of history if ``base`` is not known here (a remote that was made again).
     """
     try:
         known = bool(base) and repo.descendant_of(tip, base)
@@ -109,16 +109,16 @@ def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Arrival
     until = base if known else None
     if str(tip) == base:
         return {}
-    found = {}
+    outcomes = {}
     for entry in walk(repo, tip, until):
         for key, outcome in _OUTCOMES.items():
             for operation in entry.trailers.get(key, ()):
-                found[operation] = Arrival(entry.commit, outcome)
-    return found
+                outcomes[operation] = RecordedOutcome(entry.commit, outcome)
+    return outcomes
 
 
-def last_generated(repo: Repository, tip: Oid) -> Oid | None:
-    """Return the newest commit of the generator on the first-parent line, or nothing."""
+def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
+    """Return the newest commit of the generator along the first parents, or None."""
     commit: Commit | None = commit_of(repo, tip)
     while commit is not None:
         if entry_of(commit).by_generator:

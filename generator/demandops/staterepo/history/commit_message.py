@@ -1,7 +1,8 @@
-"""Commit messages: what changed in the desired state and why, for people and for programs.
+"""Commit messages: what changed in the desired state and why, for people and programs.
 
-The trailers are a contract: an auditor without this program finds everything by
-``git log --format='%(trailers:key=Requester)'``. Ids hold no line breaks, so none can forge one.
+The trailers are a contract: an auditor without this program finds everything with
+``git log --format='%(trailers:key=Requester)'``. Ids hold no line breaks, so none can forge a
+trailer.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ GENERATOR_NAME = "DemandOps generator"
 GENERATOR_EMAIL = "generator@demandops.invalid"
 
 PROPOSAL = "Proposal"
-"""The trailer of a commit that awaits approval, or did: the branch that it was proposed on."""
+"""The trailer of a commit that needs approval: the branch that it was proposed on."""
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
@@ -35,23 +36,23 @@ _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
 
 
-def is_generators(message: str) -> bool:
-    """Tell whether a commit is the generator's, so that its files fit its books.
+def is_by_generator(message: str) -> bool:
+    """Return whether a commit is the generator's, so that its files match its ledger.
 
-    A proposal is merged by a person, perhaps onto others' changes: its files are looked at anew.
+    A proposal does not count: a person merges it, maybe onto other changes, so it is read again.
     """
     return "\nRender-Version: " in message and f"\n{PROPOSAL}: " not in message
 
 
-def generator_signature(moment: datetime) -> pygit2.Signature:
-    """Return the committer of all that the generator commits."""
-    return pygit2.Signature(GENERATOR_NAME, GENERATOR_EMAIL, int(moment.timestamp()), 0)
+def generator_signature(time: datetime) -> pygit2.Signature:
+    """Return the committer of the generator's commits."""
+    return pygit2.Signature(GENERATOR_NAME, GENERATOR_EMAIL, int(time.timestamp()), 0)
 
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
     """Return the requesters as the author, at the time when the demand was received.
 
-    Of a rollback and where something leaves it is the person who asked for it.
+    The author of a rollback or a decommission is the person who ran the command.
     """
     request, leaving = decision.request, decision.request.leaving
     if isinstance(request, Restoration):
@@ -67,13 +68,13 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 
 
 def _name(names: str) -> str:
-    """Return a name as git takes it: without angle brackets, or these characters at its ends."""
+    """Return a name that git accepts: no angle brackets, no punctuation at its ends."""
     plain = _clipped(names.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
     return plain.strip(" .,:;\"'\\") or "unnamed"
 
 
 def _operator(by: str, received: datetime) -> pygit2.Signature:
-    """Return who had the generator do something, the generator itself where nobody is known."""
+    """Return the person who ran a command, or the generator if that is not known."""
     name, _, email = by.removesuffix(">").rpartition(" <")
     try:
         return pygit2.Signature(name, email, int(received.timestamp()), 0)
@@ -84,13 +85,17 @@ def _operator(by: str, received: datetime) -> pygit2.Signature:
 def of_decision(
     decision: Decision, operation: str, received: datetime, settled: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of a demand's commit; ``settled``: demands just before it, as trailers."""
+    """Return the message of a demand's commit; ``settled`` are trailers of demands before it."""
     request = decision.request
     subjects = decision.changes.subjects()
     body = [_clipped(_title(decision), _MAX_SUBJECT), "", _why(decision, received), ""]
     body += _desired_state(decision.releases)
     if decision.changes.not_held:
-        body += ["", "Listed, but not held:", *(f"  {item}" for item in decision.changes.not_held)]
+        body += [
+            "",
+            "Listed, but not held by the requester:",
+            *(f"  {item}" for item in decision.changes.not_held),
+        ]
     if decision.warnings:
         body += ["", "Warnings:", *(f"  {warning}" for warning in decision.warnings)]
     claims = decision.changes.claims
@@ -121,22 +126,22 @@ _VERBS = {
 
 
 def _requesters(decision: Decision) -> tuple[str, ...]:
-    """Return in whose name a demand changed something; of one that ended, in whose it stood."""
+    """Return the requesters of a demand, else those of the claims that it changed."""
     changes = decision.changes.claims
     claims = [change.after or change.before for change in changes]
-    if decision.request.leaving is not None:  # whose name goes is concerned as well
+    if decision.request.leaving is not None:  # the one that leaves is a requester only before
         claims = [change.before for change in changes]
-    stood = sorted({who for claim in claims if claim for who in claim.requesters})
-    return decision.request.requesters() or tuple(stood)
+    found = sorted({who for claim in claims if claim for who in claim.requesters})
+    return decision.request.requesters() or tuple(found)
 
 
 def _leaving(decision: Decision) -> list[tuple[str, str]]:
-    """Return the trailer of a node that is decommissioned; a requester's stands there already."""
+    """Return the trailer of a decommissioned node; a requester has its own trailer."""
     leaving, befores = decision.request.leaving, [c.before for c in decision.changes.claims]
     if leaving is None or "node" not in leaving.kinds:
         return []
-    held = any(needs_node(before, leaving.name) for before in befores if before)
-    return [("Node", leaving.name)] if held else []
+    needed = any(needs_node(before, leaving.name) for before in befores if before)
+    return [("Node", leaving.name)] if needed else []
 
 
 def _title(decision: Decision) -> str:
@@ -154,12 +159,12 @@ def _title(decision: Decision) -> str:
 
 def _why(decision: Decision, received: datetime) -> str:
     request = decision.request
-    moment = received.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
+    time = received.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
     who = ", ".join(_requesters(decision))
     what = _counted(decision)
     if isinstance(request, Restoration):
         return (
-            f"Why: {request.by} rolled the books back to commit {request.to[:12]}, which changes "
+            f"Why: {request.by} rolled the ledger back to commit {request.to[:12]}, which changes "
             f"{what}: {request.reason}"
         )
     if request.operation is Operation.EXPIRE:
@@ -172,7 +177,7 @@ def _why(decision: Decision, received: datetime) -> str:
     if request.leaving is not None:
         by = f" by {request.leaving.by}" if request.leaving.by else ""
         return (
-            f"Why: '{request.leaving.name}' leaves for good, told{by} on {moment}; it held a part "
+            f"Why: '{request.leaving.name}' was decommissioned{by} on {time}; it held a part "
             f"of {what} in the name of {who}."
         )
     verb = _VERBS[request.operation][1]
@@ -180,20 +185,19 @@ def _why(decision: Decision, received: datetime) -> str:
         verb = _VERBS[Operation.RENEW][1]
     named = "" if request.operation.is_reference else f" of demand '{request.demand}'"
     return (
-        f"Why: request '{request.id}'{named}, received {moment}, {verb} {what} in the name of "
-        f"{who}."
+        f"Why: request '{request.id}'{named}, received {time}, {verb} {what} in the name of {who}."
     )
 
 
 def _of_rollback(request: DemandRequest) -> list[tuple[str, str]]:
-    """Return the trailers that only a rollback has: where it went back to, and why."""
+    """Return the trailers that only a rollback has: the commit it returned to, and the reason."""
     if not isinstance(request, Restoration):
         return []
     return [("Restores", request.to), ("Reason", request.reason)]
 
 
 def _only_leases(decision: Decision) -> bool:
-    """Tell whether a demand changed nothing but how long its claims hold."""
+    """Return whether a demand changed only the leases of its claims."""
     return all(
         change.before and change.after and change.before.booked == change.after.booked
         for change in decision.changes.claims
@@ -206,18 +210,19 @@ def of_follow(
     since: str,
     problems: Iterable[Fault],
     more: Iterable[tuple[str, str]] = (),
+    *,
+    reports: bool = True,
 ) -> str:
-    """Return the message of a commit that carries out what people changed in the state repo."""
+    """Return the message of a commit that renders what people changed in the state repo."""
     problems, releases = list(problems), tuple(releases)
-    why = f"Why: commits up to {cause[:12]} changed what is configured or booked."
-    title = "Carry out changes made in the state repo"
-    if not releases:
-        title = "Report what is not valid in the state repo"
-        title = title if problems else "Report that all of the state repo is valid again"
+    why = f"Why: commits up to {cause[:12]} changed configuration, ledger or generated files."
+    title = _follow_title(releases, cause)
+    if not releases and reports:
+        title = "Report invalid files" if problems else "Report that all files are valid"
     body = [title, "", why]
     body += ["", *_desired_state(releases)] if releases else []
     if problems:
-        body += ["", "Not taken in, for it is not valid:", *(f"  {found}" for found in problems)]
+        body += ["", "Not applied, because not valid:", *(f"  {problem}" for problem in problems)]
     trailers = [
         ("Operation", "follow"),
         ("Follows", cause),
@@ -228,46 +233,54 @@ def of_follow(
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
 
 
-def of_ended(
+def _follow_title(releases: tuple[ReleaseChange, ...], cause: str) -> str:
+    names = ", ".join(release.name for release in releases)
+    after = f" after commit {cause[:12]}"
+    if not names:
+        return f"Update ledger{after}"
+    return f"Update {_clipped(names, _MAX_SUBJECT - len(after) - len('Update '))}{after}"
+
+
+def of_override_end(
     override: Override,
     releases: tuple[ReleaseChange, ...],
     kept: Iterable[ClaimKey],
     more: Iterable[tuple[str, str]] = (),
 ) -> str:
-    """Return the message of the commit that ends an override at the time that it names.
+    """Return the message of the commit that ends an expired override.
 
-    ``kept`` are the claims of overrides' own that changed with it.
+    ``kept`` are the claims that changed with it and that ``keep`` overrides add.
     """
     body = [
         f"End override {override.name}",
         "",
-        f"Why: {override.path} of {override.owner} ({override.reason}) expired at "
+        f"Why: {override.path} by {override.owner} ({override.reason}) expired at "
         f"{written(override.end) if override.end else ''}.",
         "",
         *(_desired_state(releases) if releases else ["Desired state: unchanged."]),
     ]
     trailers = [
         ("Operation", "expire-override"),
-        *of_overrides([override.path, *keeping(kept)]),
+        *override_trailers([override.path, *keep_override_paths(kept)]),
         *more,
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
 
 
-def of_overrides(paths: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the trailers that name overrides."""
+def override_trailers(paths: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the trailers that name overrides, by the paths of their files."""
     return [("Override", path) for path in sorted(set(paths))]
 
 
 def _overrides(decision: Decision) -> list[tuple[str, str]]:
-    """Return the trailers that name the overrides that shaped a demand's commit."""
+    """Return the trailers of the overrides that affect a demand's commit."""
     keys = (change.key for change in decision.changes.claims)
-    return of_overrides([*decision.overrides, *keeping(keys)])
+    return override_trailers([*decision.overrides, *keep_override_paths(keys)])
 
 
-def keeping(keys: Iterable[ClaimKey]) -> list[str]:
-    """Return the files of the overrides whose own claims these are."""
+def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
+    """Return the files of the ``keep`` overrides that add these claims."""
     demands = (key.demand for key in keys if key.demand.startswith(KEPT))
     return [f"{OVERRIDES_ROOT}/{demand.removeprefix(KEPT)}.yaml" for demand in demands]
 
@@ -288,7 +301,7 @@ def _counted(decision: Decision) -> str:
 
 def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
     if not releases:
-        return ["Desired state: unchanged; what is asked runs already, or still for others."]
+        return ["Desired state: unchanged; it runs already, or still for other requesters."]
     lines = ["Desired state:"]
     for release in releases:
         lines.append(f"  {_SIGNS[release.change]} {release.name} ({release.description})")

@@ -1,7 +1,7 @@
-"""Points in history as people name them: a revision that Git knows, or a time.
+"""Points in history as people write them: a revision that Git knows, or a time.
 
-At a time the state repo was what the newest commit on the first-parent line said whose committer
-time is not later. A time without a zone is UTC, as all that the program prints.
+A time means the newest commit along the first parents whose committer time is not later. A time
+without a zone is UTC, like all times that the program prints.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 
 TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
-"""Examples of all that :func:`moment` takes."""
+"""Examples of the times that :func:`parse_time` accepts."""
 
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
 _CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2})?")
@@ -25,39 +25,39 @@ _DAY, _MINUTE, _SECOND = timedelta(days=1), timedelta(minutes=1), timedelta(seco
 _MAIN = re.compile(rf"^(?:HEAD|{MAIN_BRANCH})(?=$|[~^@])")
 
 
-def moment(text: str, now: datetime, *, end: bool = False) -> datetime | None:
-    """Return the time that a text names, or nothing where it names none.
+def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | None:
+    """Return the time that a text names, or None.
 
     Args:
         text: a date, a time of the day (the last time the clock showed it), both, or a duration
             before ``now`` (``2h``, ``1h30m``, ``2d``).
         now: with time zone.
-        end: whether a date stands for the end of its day and a time without seconds for the end
-            of its minute, rather than for their beginning.
+        end: a date means the end of its day, and a time without seconds the end of its minute,
+            rather than the beginning.
     """
     text = text.strip()
     try:
         return now - timedelta(seconds=seconds_of(text.removesuffix("ago").rstrip()))
     except ValueError:
         pass
-    whole = _whole(text)
+    precision = _precision(text)
     clock = _CLOCK.fullmatch(text)
     if clock:
         hours, minutes = text.split(":", 1)
         text = f"{now.astimezone(timezone.utc):%Y-%m-%d}T{hours:0>2}:{minutes}"
     try:
-        found = datetime.fromisoformat(re.sub(r"[Zz]$", "+00:00", text))
-        zone = found.tzinfo or timezone.utc
-        found = found.replace(tzinfo=zone).astimezone(timezone.utc)
+        time = datetime.fromisoformat(re.sub(r"[Zz]$", "+00:00", text))
+        zone = time.tzinfo or timezone.utc
+        time = time.replace(tzinfo=zone).astimezone(timezone.utc)
     except (ValueError, OverflowError):
         return None
-    if clock and found > now:
-        found -= _DAY
-    return found + (whole - _SECOND) if end else found
+    if clock and time > now:
+        time -= _DAY
+    return time + (precision - _SECOND) if end else time
 
 
-def _whole(text: str) -> timedelta:
-    """Return how long the time lasts that a text names: a day, a minute or a second."""
+def _precision(text: str) -> timedelta:
+    """Return the precision of a time: a day, a minute or a second."""
     if _DATE.fullmatch(text):
         return _DAY
     clock = re.split(r"[T ]", text)[-1]
@@ -67,17 +67,17 @@ def _whole(text: str) -> timedelta:
 def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     """Return the commit that a revision or a time names.
 
-    The name of a branch or tag comes first, then a time, then all else that Git knows.
+    Tries the name of a branch or tag first, then a time, then any other revision.
 
     Raises:
-        StateRepoError: where it is neither, or a time before the first commit.
+        StateRepoError: it is neither, or a time before the first commit.
     """
     named = _reference(repo, text)
     if named is not None:
         return named
-    at = moment(text, now, end=True)
+    at = parse_time(text, now, end=True)
     if at is not None:
-        return at_time(repo, tip, at)
+        return commit_at_time(repo, tip, at)
     found = _revision(repo, _MAIN.sub(str(tip), text))
     if found is None:
         raise StateRepoError(
@@ -87,11 +87,11 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     return found
 
 
-def at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
-    """Return the newest commit on the first-parent line that was made at ``at`` or before.
+def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
+    """Return the newest commit along the first parents that was made at ``at`` or before.
 
     Raises:
-        StateRepoError: where there was none yet.
+        StateRepoError: there was no commit yet.
     """
     commit = repo[tip].peel(Commit)
     latest = int(at.timestamp())
@@ -99,14 +99,15 @@ def at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
         if not commit.parents:
             first = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
             raise StateRepoError(
-                f"at {shown(at)} there was no state repo yet; its first commit is of {shown(first)}"
+                f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
+                f"{format_time(first)}"
             )
         commit = commit.parents[0]
     return commit
 
 
-def shown(at: datetime) -> str:
-    """Return a time as people read it."""
+def format_time(at: datetime) -> str:
+    """Return a time in the form that people read."""
     return at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 

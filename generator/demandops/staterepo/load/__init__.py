@@ -1,1 +1,1 @@
-"""A commit's configuration and ledger, and what stays in force while a file is not valid."""
+"""Loading a commit: configuration, ledger, and what stays in effect while a file is invalid."""

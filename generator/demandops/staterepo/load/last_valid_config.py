@@ -1,8 +1,8 @@
-"""People's configuration at a commit, and what of it is in force where it is not valid.
+"""The configuration at a commit, and its last valid version if a file is not valid.
 
-A broken file holds back itself and what came with it: the other files of the commits that touched
-it, for half of a commit is not what anybody merged, and the rest of its application definition. All
-else that people merge is taken in. Where that gives nothing valid, nothing is taken in.
+An invalid file is replaced by its last valid version. So are the other files of the commits that
+changed it, because half a commit is not what was merged, and the other files of its application
+definition. All other changes apply. If the result is not valid either, no change applies.
 """
 
 from __future__ import annotations
@@ -23,40 +23,40 @@ from demandops.settings import RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 
 NO_STATE_REPO = (
-    "this is no state repo, for it has no demandops.yaml; `demandops init DIR` makes one"
+    "this is not a state repo, because it has no demandops.yaml; `demandops init DIR` makes one"
 )
 
-StandIns = Mapping[str, Oid | None]
-"""Path → the blob that is in force in its place; nothing where no such file is."""
+Replacements = Mapping[str, Oid | None]
+"""Path → the blob in effect instead of the commit's; None if no such file is in effect."""
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
-    """Where the configuration in force is: the files of a commit, some in another version."""
+class ConfigSource:
+    """Where the configuration in effect is: the files of a commit, some in another version."""
 
     commit: Oid
-    stand_ins: StandIns = field(default_factory=dict)
+    replacements: Replacements = field(default_factory=dict)
 
     def blobs(self, repo: Repository) -> dict[str, Oid]:
-        """Return path → blob of every file in force."""
-        found = dict(_blobs(repo, self.commit))
-        for path, blob in self.stand_ins.items():
-            found.pop(path, None)
+        """Return path → blob of every file in effect."""
+        blobs = dict(_blobs(repo, self.commit))
+        for path, blob in self.replacements.items():
+            blobs.pop(path, None)
             if blob is not None:
-                found[path] = blob
-        return found
+                blobs[path] = blob
+        return blobs
 
     def texts(self, repo: Repository) -> dict[str, str]:
-        """Return path → text of every file in force."""
+        """Return path → text of every file in effect."""
         return {path: _text(repo, blob) for path, blob in self.blobs(repo).items()}
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """What of a commit's configuration can be in force; no configuration where nothing can."""
+class LastValidConfig:
+    """The part of a commit's configuration that is valid; ``config`` is None if no part is."""
 
     config: Config | None
-    source: Source
+    source: ConfigSource
     faults: tuple[Fault, ...]
 
 
@@ -64,25 +64,25 @@ def config_at(tree: Tree) -> Config:
     """Return the configuration of one tree.
 
     Raises:
-        StateRepoError: where it is no state repo.
-        InvalidInput: with every fault of every file.
+        StateRepoError: the tree is not a state repo.
+        InvalidInput: every fault of every file.
     """
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
-    return load_config(files).with_ended(ended_override_file.read(markers_at(tree)))
+    return load_config(files).with_ended(ended_override_file.read(end_markers_at(tree)))
 
 
-def markers_at(tree: Tree) -> dict[str, str]:
-    """Return path → text of the files that say which overrides ended."""
+def end_markers_at(tree: Tree) -> dict[str, str]:
+    """Return path → text of the markers of ended overrides."""
     return trees.texts(tree, (ended_override_file.MARKERS_ROOT,))
 
 
-def refuse_other_rendering(tree: Tree) -> None:
-    """Raise where a generator of another version writes the repo: two would undo each other's work.
+def refuse_other_render_version(tree: Tree) -> None:
+    """Raise if the repo has another render version, because two versions undo each other's work.
 
     Raises:
-        StateRepoError: saying which version it is and what to do.
+        StateRepoError: names the version and the remedy.
     """
     try:
         data = strict_yaml.load(trees.read_text(tree, ROOT_FILE) or "")
@@ -93,18 +93,18 @@ def refuse_other_rendering(tree: Tree) -> None:
         return
     remedy = "update the generator"
     if version < RENDER_VERSION:
-        remedy = "stop older generators, then have all rendered anew by `demandops upgrade`"
+        remedy = "stop older generators, then run `demandops upgrade` to render everything again"
     raise StateRepoError(
         f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
         f"{RENDER_VERSION}; {remedy}"
     )
 
 
-def newest_valid(commit: Commit, fault: InvalidInput) -> Config:
-    """Return the configuration of the newest commit before one that is not valid, and was.
+def newest_valid_config(commit: Commit, fault: InvalidInput) -> Config:
+    """Return the configuration of the newest ancestor where it was valid.
 
     Raises:
-        InvalidInput: ``fault``, where there never was one.
+        InvalidInput: ``fault``, if there is no such ancestor.
     """
     seen = {_config_ids(commit.tree)}
     while commit.parents:
@@ -120,74 +120,82 @@ def newest_valid(commit: Commit, fault: InvalidInput) -> Config:
 
 
 def _config_ids(tree: Tree) -> tuple[str, ...]:
-    return tuple(str(trees.id_of(tree, root)) for root in CONFIG_ROOTS)
+    return tuple(str(trees.entry_id(tree, root)) for root in CONFIG_ROOTS)
 
 
-def found(
+def load_last_valid_config(
     repo: Repository,
-    before: tuple[Source, Oid | None],
+    before: ConfigSource,
+    last_valid_commit: Oid | None,
     to: Oid,
     load: Callable[[Mapping[str, str]], Config],
-) -> Found:
-    """Return the configuration of a commit, with stand-ins for what is not valid.
+) -> LastValidConfig:
+    """Return the configuration of a commit, with last valid versions of what is not valid.
 
     Args:
-        before: what was in force, and the newest commit where all was valid.
+        before: what was in effect before.
+        last_valid_commit: the newest commit where all files were valid.
         to: the commit.
-        load: makes a configuration of texts, or raises ``InvalidInput``.
+        load: makes a configuration from texts, or raises ``InvalidInput``.
     """
-    known, sound = before[0].blobs(repo), before[1]
+    known = before.blobs(repo)
     blobs = dict(_blobs(repo, to))
     merged = {path for path in {*known, *blobs} if known.get(path) != blobs.get(path)}
-    stand_ins: dict[str, Oid | None] = {}
+    replacements: dict[str, Oid | None] = {}
     faults: list[Fault] = []
     while True:
         try:
             config = load({path: _text(repo, blob) for path, blob in blobs.items()})
         except InvalidInput as error:
             faults += error.faults
-            broken = {one.file for one in error.faults} & (merged - set(stand_ins))
+            broken = {one.file for one in error.faults} & (merged - set(replacements))
             if not broken:
-                return Found(None, before[0], tuple(dict.fromkeys(faults)))
-            for path in merged & _with_company(repo, broken, sound, to):
-                stand_ins[path] = known.get(path)
+                return LastValidConfig(None, before, tuple(dict.fromkeys(faults)))
+            for path in merged & _with_files_merged_together(repo, broken, last_valid_commit, to):
+                replacements[path] = known.get(path)
                 blobs.pop(path, None)
                 if path in known:
                     blobs[path] = known[path]
         else:
-            return Found(config, Source(to, stand_ins), tuple(dict.fromkeys(faults)))
+            return LastValidConfig(
+                config, ConfigSource(to, replacements), tuple(dict.fromkeys(faults))
+            )
 
 
-def _with_company(repo: Repository, broken: Iterable[str], sound: Oid | None, to: Oid) -> set[str]:
-    """Return files and what came with them: in the same commit, or in the same definition."""
-    company = set(broken)
-    merges = list(_merges(repo, sound, to))
-    known = {path for commit in (to, sound) if commit for path, _ in _blobs(repo, commit)}
+def _with_files_merged_together(
+    repo: Repository, broken: Iterable[str], last_valid_commit: Oid | None, to: Oid
+) -> set[str]:
+    """Return files and those merged in the same commits or of the same definition."""
+    together = set(broken)
+    merges = list(_merges(repo, last_valid_commit, to))
+    known = {
+        path for commit in (to, last_valid_commit) if commit for path, _ in _blobs(repo, commit)
+    }
     size = 0
-    while size != len(company):
-        size = len(company)
+    while size != len(together):
+        size = len(together)
         for touched in merges:
-            if touched & company:
-                company |= touched
+            if touched & together:
+                together |= touched
         folders = tuple(
-            "/".join(path.split("/")[:2]) + "/" for path in company if path.startswith("appdefs/")
+            "/".join(path.split("/")[:2]) + "/" for path in together if path.startswith("appdefs/")
         )
-        company |= {path for path in known if path.startswith(folders)} if folders else set()
-    return company
+        together |= {path for path in known if path.startswith(folders)} if folders else set()
+    return together
 
 
-def _merges(repo: Repository, sound: Oid | None, to: Oid) -> Iterator[set[str]]:
-    """Yield what each commit since ``sound`` brought; of a merged branch, all of it at once."""
+def _merges(repo: Repository, last_valid_commit: Oid | None, to: Oid) -> Iterator[set[str]]:
+    """Yield the files that each commit changed; a merge changes all files of its branch."""
     walker = repo.walk(to, SortMode.TOPOLOGICAL)
-    if sound is not None:
-        walker.hide(sound)
+    if last_valid_commit is not None:
+        walker.hide(last_valid_commit)
     for commit in walker:
         if commit.parents:
             before, after = commit.parents[0].tree, commit.tree
             yield {
                 path
                 for root in CONFIG_ROOTS
-                for path, _ in trees.below_root(repo, before, after, root)
+                for path, _ in trees.differences_below(repo, before, after, root)
             }
 
 
@@ -196,11 +204,11 @@ def _blobs(repo: Repository, commit: Oid) -> Iterator[tuple[str, Oid]]:
     for root in CONFIG_ROOTS:
         entry = trees.child(tree, root)
         if isinstance(entry, Tree):
-            yield from trees.entries(entry, f"{root}/")
+            yield from trees.files_below(entry, f"{root}/")
         elif isinstance(entry, Blob):
             yield root, entry.id
 
 
 def _text(repo: Repository, blob: Oid) -> str:
-    found = repo[blob]
-    return found.data.decode("utf-8", "replace") if isinstance(found, Blob) else ""
+    content = repo[blob]
+    return content.data.decode("utf-8", "replace") if isinstance(content, Blob) else ""

@@ -1,8 +1,7 @@
-"""What is not valid in a state repo, as a file of its own that the generator writes there.
+"""The problem report: a file in the state repo that lists what is not valid there.
 
-Whoever broke a file sees in the repo what is wrong with it, since which of their commits, and that
-its last valid version is in force. Pure: texts and faults in, text out. The same problems give the
-same bytes whoever reports them, so a report that stands causes no commit.
+It names each fault, since which commit it exists, and who made that commit. The same problems give
+the same bytes, so an unchanged report causes no commit. Pure: texts and faults in, text out.
 """
 
 from __future__ import annotations
@@ -16,15 +15,15 @@ from demandops.settings import API_VERSION, NOTES_ROOT
 
 PATH = f"{NOTES_ROOT}/reports/problems.yaml"
 _HEAD = (
-    "# Written by the generator: files here that are not valid. Of each the last valid version\n"
-    "# is in force until it is mended; then this report goes by itself.\n"
+    "# Written by the generator: the files that are not valid. The last valid version of each\n"
+    "# stays in effect until the file is fixed. The generator then removes this report.\n"
 )
 _MOST = 100
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A fault, and the commit that it came with: its id and its author."""
+    """A fault, and id and author of the commit that caused it."""
 
     file: str
     field: str
@@ -33,34 +32,34 @@ class Problem:
     author: str = ""
 
     def __str__(self) -> str:
-        """Return where and what, and since when."""
+        """Return the fault, and the commit that caused it if known."""
         text = ": ".join(part for part in (self.file, self.field, self.message) if part)
         if not self.since:
             return text
-        return f"{text} (since {self.since[:10]} of {self.author})"
+        return f"{text} (since {self.since[:10]} by {self.author})"
 
 
 Origin = Callable[[str], tuple[str, str] | None]
-"""Gives for a path the commit and the author that a fault in it came with."""
+"""Maps a path to the commit and the author that last changed it."""
 
 
-def reported(
+def with_origins(
     faults: Iterable[Fault], known: Iterable[Problem], origin: Origin
 ) -> tuple[Problem, ...]:
-    """Return a problem for each fault; one that is known keeps what is said of its origin."""
-    standing = {(one.file, one.field, one.message): one for one in known if one.since}
-    found = []
+    """Return a problem for each fault; a known problem keeps its commit and author."""
+    existing = {(old.file, old.field, old.message): old for old in known if old.since}
+    problems = []
     for fault in sorted({(fault.file, fault.field, fault.message) for fault in faults}):
-        if fault in standing:
-            found.append(standing[fault])
+        if fault in existing:
+            problems.append(existing[fault])
             continue
         commit, author = origin(fault[0]) or ("", "")
-        found.append(Problem(*fault, commit, author))
-    return tuple(found)
+        problems.append(Problem(*fault, commit, author))
+    return tuple(problems)
 
 
 def write(problems: tuple[Problem, ...]) -> str | None:
-    """Return the file for these problems, or nothing where there are none."""
+    """Return the text of the report, or None if there are no problems."""
     if not problems:
         return None
     data: dict[str, object] = {
@@ -85,7 +84,7 @@ def _entry(problem: Problem) -> dict[str, str]:
 
 
 def read(text: str | None) -> tuple[Problem, ...]:
-    """Return the problems of a file; of one that is no report, or none, none."""
+    """Return the problems of a report; none if the text is missing or not a report."""
     try:
         data = strict_yaml.load(text or "")
     except InvalidInput:
@@ -99,5 +98,5 @@ def read(text: str | None) -> tuple[Problem, ...]:
 
 
 def _text(value: object) -> str:
-    """Return a text as it may be shown: people may have written the file too."""
+    """Return a printable text, or an empty one: a person may have edited the report."""
     return value if isinstance(value, str) and value.isprintable() else ""

@@ -1,8 +1,8 @@
-"""Claims that a person changed and that cannot be carried out: they are held back, file by file.
+"""Claims that a person changed and that cannot be planned: quarantined, file by file.
 
-A claim that a person edited so that it names an unknown node, say, is in the repo as they left it
-and not in force. What the generator booked on the same subject is, also where it came later: so a
-file is held at the generator's last version of it, and not at what the whole subject once was.
+The edited file stays in the repo, for example a claim that names an unknown node, but the last
+valid version of the claim is in effect. That is the version that the generator wrote last, even
+if it wrote it after the edit.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from demandops.staterepo.history import commit_message
 from demandops.staterepo.load.snapshot import Snapshot
 
 
-def held_back(
+def quarantine_invalid(
     repo: Repository,
     snapshot: Snapshot,
     before: Snapshot,
     subjects: Iterable[Subject],
     read: FileReader,
 ) -> tuple[Snapshot, list[Subject], list[Fault]]:
-    """Hold back what of ``subjects`` cannot be planned, neither as configured now nor as before.
+    """Quarantine the subjects that cannot be planned with the new or the old configuration.
 
     Returns:
-        The snapshot with the last versions that could be in force, the subjects that are as their
-        files say, and what is wrong with the others.
+        The snapshot with the last valid claims, the subjects that are not quarantined, and the
+        faults of those that are.
     """
     good, faults = [], list[Fault]()
     for subject in subjects:
-        found = _faults(snapshot.state, before, subject, read)
-        if found and _faults(
+        subject_faults = _faults(snapshot.state, before, subject, read)
+        if subject_faults and _faults(
             replace(before.state, ledger=snapshot.state.ledger), before, subject, read
         ):
-            faults += _told_of(found, snapshot, before, subject)
-            snapshot = _holding(repo, snapshot, before, subject)
+            faults += _located_in_claim_files(subject_faults, snapshot, before, subject)
+            snapshot = _with_last_valid_claims(repo, snapshot, before, subject)
         else:
             good.append(subject)
     return snapshot, good, faults
@@ -59,47 +59,54 @@ def _faults(
     return ()
 
 
-def _told_of(
+def _located_in_claim_files(
     faults: Iterable[Fault], snapshot: Snapshot, before: Snapshot, subject: Subject
 ) -> list[Fault]:
-    """Return faults of a subject, each told to be in the file of a claim that is another now."""
+    """Return faults of a subject, located in the file of a claim that changed."""
     claims = snapshot.state.ledger.claims_on(subject)
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
     paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]
-    return [found.within(paths[0]) if paths else found for found in faults]
+    return [fault.within(paths[0]) if paths else fault for fault in faults]
 
 
-def _holding(repo: Repository, snapshot: Snapshot, before: Snapshot, subject: Subject) -> Snapshot:
+def _with_last_valid_claims(
+    repo: Repository, snapshot: Snapshot, before: Snapshot, subject: Subject
+) -> Snapshot:
     ledger, keys = snapshot.state.ledger, snapshot.keys
     claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
     known = {claim_file.path_of(claim.key): claim.key for claim in claims}
-    ours = _generators(repo, snapshot, before, known)
+    generated = _claims_by_generator(repo, snapshot, before, known)
     for path, key in known.items():
-        claim = ours[path] if path in ours else before.state.ledger.get(key)
+        claim = generated[path] if path in generated else before.state.ledger.get(key)
         ledger = ledger.replace(key, claim)
         if claim is not None:
             keys = keys.insert(path, key)
-    held = tuple(dict.fromkeys((*snapshot.held, *known)))
-    return replace(snapshot, state=replace(snapshot.state, ledger=ledger), keys=keys, held=held)
+    quarantined = tuple(dict.fromkeys((*snapshot.quarantined_files, *known)))
+    return replace(
+        snapshot,
+        state=replace(snapshot.state, ledger=ledger),
+        keys=keys,
+        quarantined_files=quarantined,
+    )
 
 
-def _generators(
+def _claims_by_generator(
     repo: Repository, snapshot: Snapshot, before: Snapshot, paths: Iterable[str]
 ) -> dict[str, Claim | None]:
-    """Return what a generator last wrote to the paths since ``before``, where one did."""
+    """Return path → the claim that a generator last wrote there since ``before``."""
     walker = repo.walk(snapshot.commit, SortMode.TOPOLOGICAL)
     walker.hide(before.commit)
-    found: dict[str, Claim | None] = {}
+    claims: dict[str, Claim | None] = {}
     left = set(paths)
     for commit in walker:
-        if not commit.parents or not commit_message.is_generators(commit.message):
+        if not commit.parents or not commit_message.is_by_generator(commit.message):
             continue
         old, new = commit.parents[0].tree, commit.tree
         for path in sorted(left):
-            if trees.blob(old, path) != trees.blob(new, path):
-                found[path] = _claim(trees.read_text(new, path), path)
+            if trees.blob_id(old, path) != trees.blob_id(new, path):
+                claims[path] = _claim(trees.read_text(new, path), path)
                 left.remove(path)
-    return found
+    return claims
 
 
 def _claim(text: str | None, path: str) -> Claim | None:

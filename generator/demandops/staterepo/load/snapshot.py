@@ -1,7 +1,7 @@
-"""What a commit of the state repo says: configuration and ledger, loaded whole or brought forward.
+"""A commit's configuration and ledger, loaded whole or advanced from an earlier commit.
 
-Loading costs what is there, :func:`advance` what changed. A file that a person broke keeps its
-last valid version in force and is reported; nothing else stops for it.
+:func:`load` reads all files, :func:`advance` only those that changed. If a file is not valid, its
+last valid version stays in effect and the file is reported.
 """
 
 from __future__ import annotations
@@ -25,36 +25,37 @@ from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
 from demandops.staterepo.load import last_valid_config
-from demandops.staterepo.load.last_valid_config import Source
+from demandops.staterepo.load.last_valid_config import ConfigSource
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A commit and what it says.
+    """A commit and its state: configuration and ledger.
 
-    ``keys`` finds the claim behind a ledger file, so that a removed file is understood.
-    ``problems`` are files that are not valid and whose last valid version is in force; ``sound`` is
-    the newest commit without any; ``held`` are ledger files that are not in force as they stand;
-    ``source`` is where the configuration in force is, where it is not the commit's own.
+    ``keys``: the claim of each ledger file, so that the claim of a removed file is known.
+    ``problems``: what is not valid; the last valid versions are in effect instead.
+    ``last_valid_commit``: the newest commit without problems.
+    ``quarantined_files``: ledger files whose content at this commit is not in effect.
+    ``other_config_source``: where the configuration in effect is, if not in this commit.
     """
 
     commit: Oid
     state: State
     keys: HashTrieMap[str, ClaimKey]
     problems: tuple[Fault, ...] = ()
-    sound: Oid | None = None
-    held: tuple[str, ...] = ()
-    source: Source | None = None
+    last_valid_commit: Oid | None = None
+    quarantined_files: tuple[str, ...] = ()
+    other_config_source: ConfigSource | None = None
 
     @property
-    def configuration(self) -> Source:
-        """Where the configuration in force is."""
-        return self.source or Source(self.commit)
+    def config_source(self) -> ConfigSource:
+        """Where the configuration in effect is."""
+        return self.other_config_source or ConfigSource(self.commit)
 
-    def after(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
-        """Return the snapshot of a commit of our own, whose state is known already."""
+    def with_commit(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
+        """Return the snapshot of a new commit by this program, whose state is known."""
         keys = self.keys
         for key in changes:
             path = claim_file.path_of(key)
@@ -62,20 +63,22 @@ class Snapshot:
                 keys = keys.insert(path, key)
             elif path in keys:
                 keys = keys.remove(path)
-        sound = self.sound if self.problems else commit
-        return replace(self, commit=commit, state=state, keys=keys, sound=sound)
+        last_valid_commit = self.last_valid_commit if self.problems else commit
+        return replace(
+            self, commit=commit, state=state, keys=keys, last_valid_commit=last_valid_commit
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Advance:
-    """A snapshot brought forward: what people or other writers changed on the way."""
+    """A later snapshot, and the subjects that changed on the way to it."""
 
     snapshot: Snapshot
     subjects: tuple[Subject, ...]
     config_changed: bool
 
-    def then(self, further: Advance) -> Advance:
-        """Return both steps as one: ``further`` starts where this one ends."""
+    def followed_by(self, further: Advance) -> Advance:
+        """Return both steps as one; ``further`` starts where this one ends."""
         return Advance(
             further.snapshot,
             tuple(dict.fromkeys((*self.subjects, *further.subjects))),
@@ -89,27 +92,27 @@ def load(
     """Load a commit whole.
 
     Args:
-        progress: told (files read, files in all) while the ledger is read.
+        progress: called with (files read, all files) while the ledger is read.
 
     Raises:
-        InvalidInput: with every fault of every file.
-        StateRepoError: where the commit holds no state repo.
+        InvalidInput: every fault of every file.
+        StateRepoError: the commit is not a state repo.
     """
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
     if faults:
         raise InvalidInput(faults)
-    return Snapshot(commit.id, State.of(config, ledger), keys, sound=commit.id)
+    return Snapshot(commit.id, State.of(config, ledger), keys, last_valid_commit=commit.id)
 
 
 def load_last_valid(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Load a commit; of what is not valid there, the last version before it that was.
+    """Load a commit, with last valid versions of the files that are not valid.
 
     Raises:
-        InvalidInput, StateRepoError: where there never was a valid configuration.
+        InvalidInput, StateRepoError: there never was a valid configuration.
     """
     commit = trees.commit_of(repo, revision)
     problems: list[Fault] = []
@@ -117,9 +120,9 @@ def load_last_valid(
         config = last_valid_config.config_at(commit.tree)
     except InvalidInput as error:
         problems += error.faults
-        config = last_valid_config.newest_valid(commit, error)
+        config = last_valid_config.newest_valid_config(commit, error)
         config = config.with_ended(
-            ended_override_file.read(last_valid_config.markers_at(commit.tree))
+            ended_override_file.read(last_valid_config.end_markers_at(commit.tree))
         )
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
     for path in dict.fromkeys(found.file for found in faults):
@@ -127,9 +130,11 @@ def load_last_valid(
         if claim is not None:
             ledger, keys = ledger.replace(claim.key, claim), keys.insert(path, claim.key)
     problems += faults
-    sound = None if problems else commit.id
-    held = tuple(dict.fromkeys(found.file for found in faults))
-    return Snapshot(commit.id, State.of(config, ledger), keys, tuple(problems), sound, held)
+    last_valid_commit = None if problems else commit.id
+    quarantined = tuple(dict.fromkeys(fault.file for fault in faults))
+    return Snapshot(
+        commit.id, State.of(config, ledger), keys, tuple(problems), last_valid_commit, quarantined
+    )
 
 
 def _last_valid_claim(commit: Commit, path: str) -> Claim | None:
@@ -145,12 +150,12 @@ def _last_valid_claim(commit: Commit, path: str) -> Claim | None:
     return None
 
 
-def _edited_by_hand(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Tell whether a commit that is not the generator's changed generated files on the way."""
+def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
+    """Return whether a person changed generated files between two commits."""
     walker = repo.walk(to, SortMode.TOPOLOGICAL)
     walker.hide(before)
     for commit in walker:
-        if commit_message.is_generators(commit.message) or not commit.parents:
+        if commit_message.is_by_generator(commit.message) or not commit.parents:
             continue
         if _differ(commit.parents[0].tree, commit.tree, GENERATED_ROOTS):
             return True
@@ -180,7 +185,7 @@ def _ledger_at(
 def _ledger_files(tree: Tree) -> Iterable[tuple[str, Oid]]:
     root = claim_file.LEDGER_ROOT
     if root in tree and isinstance(tree[root], Tree):
-        yield from trees.entries(tree[root], f"{root}/")  # type: ignore[arg-type]
+        yield from trees.files_below(tree[root], f"{root}/")  # type: ignore[arg-type]
 
 
 def _text(repo: Repository, blob: Oid) -> str:
@@ -188,34 +193,38 @@ def _text(repo: Repository, blob: Oid) -> str:
 
 
 def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
-    """Bring a snapshot forward to another commit, reading only what differs.
+    """Advance a snapshot to another commit, reading only what differs.
 
-    What is not valid there is left as it was before, and told in the new snapshot's problems.
+    What is not valid stays as it was and is listed in the new snapshot's problems.
     """
     before, after = trees.commit_of(repo, snapshot.commit).tree, trees.commit_of(repo, to).tree
-    last_valid_config.refuse_other_rendering(after)
+    last_valid_config.refuse_other_render_version(after)
     state, problems = snapshot.state, list[Fault]()
-    config_changed = _edited_by_hand(repo, snapshot.commit, to)
-    source = snapshot.source
+    config_changed = _has_manual_edit(repo, snapshot.commit, to)
+    source = snapshot.other_config_source
     if snapshot.problems or _differ(before, after, CONFIG_ROOTS):
-        now = last_valid_config.found(
-            repo, (snapshot.configuration, snapshot.sound), to, lambda files: _tried(files, state)
+        valid = last_valid_config.load_last_valid_config(
+            repo,
+            snapshot.config_source,
+            snapshot.last_valid_commit,
+            to,
+            lambda files: _load_and_rehearse(files, state),
         )
-        problems += now.faults
-        source = now.source if problems else None
-        if now.config is not None:
-            config = now.config.with_ended(state.config.ended)
+        problems += valid.faults
+        source = valid.source if problems else None
+        if valid.config is not None:
+            config = valid.config.with_ended(state.config.ended)
             config_changed = config_changed or config != state.config
             state = State(config, State.of(config, state.ledger).engine, state.ledger)
-    ended = ended_override_file.read(last_valid_config.markers_at(after))
+    ended = ended_override_file.read(last_valid_config.end_markers_at(after))
     if ended != state.config.ended:
         state = replace(state, config=state.config.with_ended(ended))
         config_changed = True
-    ledger, keys, subjects, held = state.ledger, snapshot.keys, list[Subject](), list[str]()
+    ledger, keys, subjects, invalid = state.ledger, snapshot.keys, list[Subject](), list[str]()
     changed = dict(
         trees.differences(repo, _subtree(before, "ledger"), _subtree(after, "ledger"), "ledger/")
     )
-    changed |= {path: trees.blob(after, path) for path in snapshot.held}
+    changed |= {path: trees.blob_id(after, path) for path in snapshot.quarantined_files}
     for path, blob in sorted(changed.items()):
         if claim_file.kind_of(path) is None:
             continue
@@ -230,26 +239,27 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
             claim = claim_file.read(_text(repo, blob), path)
         except InvalidInput as error:
             problems += error.faults
-            held.append(path)
+            invalid.append(path)
             continue
         if ledger.get(claim.key) != claim:
             ledger = ledger.replace(claim.key, claim)
             subjects.append(claim.subject)
         keys = keys.insert(path, claim.key)
-    state, sound = replace(state, ledger=ledger), snapshot.sound if problems else to
+    state = replace(state, ledger=ledger)
+    last_valid_commit = snapshot.last_valid_commit if problems else to
     return Advance(
-        Snapshot(to, state, keys, tuple(problems), sound, tuple(held), source),
+        Snapshot(to, state, keys, tuple(problems), last_valid_commit, tuple(invalid), source),
         tuple(dict.fromkeys(subjects)),
         config_changed,
     )
 
 
 def _differ(one: Tree, other: Tree, roots: Iterable[str]) -> bool:
-    return any(trees.id_of(one, root) != trees.id_of(other, root) for root in roots)
+    return any(trees.entry_id(one, root) != trees.entry_id(other, root) for root in roots)
 
 
-def _tried(files: Mapping[str, str], state: State) -> Config:
-    """Return the configuration of a commit, tried on invented demands if it changed."""
+def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
+    """Return the configuration of these files; if it changed, render sample demands with it."""
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config = load_config(files)
@@ -264,9 +274,9 @@ def _subtree(tree: Tree, name: str) -> Tree | None:
 
 
 class ReadAhead:
-    """What was read behind the published snapshot, and could not be built on yet.
+    """Remembers what was read after the published snapshot until a commit is published on it.
 
-    With writers that are faster, each try would read more than the one before, and be too late.
+    If other writers are faster, each attempt would otherwise read more and again be too late.
     """
 
     def __init__(self) -> None:
@@ -279,6 +289,6 @@ class ReadAhead:
         if known is None or self._start != before.commit:
             known = Advance(before, (), False)
         if known.snapshot.commit != tip or known.snapshot.problems:
-            known = known.then(advance(repo, known.snapshot, tip))
+            known = known.followed_by(advance(repo, known.snapshot, tip))
         self._known, self._start = known, before.commit
         return known

@@ -1,1 +1,1 @@
-"""A checked-out state repo, as a person is about to merge it."""
+"""Checks of a pull request: a checked-out state repo that a person is about to merge."""

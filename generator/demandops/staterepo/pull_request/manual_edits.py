@@ -1,6 +1,6 @@
-"""Edits by hand of what the generator writes: which they are, and what would do the same.
+"""Manual edits to generated files, and overrides that would have the same effect.
 
-What is refused here would be lost with the next commit of the generator, in silence.
+They are refused because the generator's next commit would silently undo them.
 """
 
 from __future__ import annotations
@@ -23,54 +23,58 @@ from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.pull_request.worktree import Base
 
-_LOST = "is generated, and an edit by hand is lost; take it back"
+_LOST = "is generated, so a manual edit is lost; revert it"
 _MOST_LEFT = 5
 
 
-def edited(files: Mapping[str, str], before: Mapping[str, str]) -> list[str]:
-    """Return the generator's own files that differ from what they were, sorted."""
+def changed_paths(files: Mapping[str, str], before: Mapping[str, str]) -> list[str]:
+    """Return the files that only the generator may write and that changed, sorted."""
     return [
         path
         for path in sorted({*files, *before})
-        if files.get(path) != before.get(path) and _is_generators(path)
+        if files.get(path) != before.get(path) and _is_written_by_generator(path)
     ]
 
 
-def _is_generators(path: str) -> bool:
+def _is_written_by_generator(path: str) -> bool:
     root = path.split("/", maxsplit=1)[0]
-    if trees.is_note(path):
+    if trees.is_readme(path):
         return False
-    if root == claim_file.LEDGER_ROOT:  # claims are judged as such
+    if root == claim_file.LEDGER_ROOT:  # people may edit claims
         return claim_file.kind_of(path) is None
     return root in (*GENERATED_ROOTS, NOTES_ROOT)
 
 
-def refused(
+def faults_and_suggestions(
     files: Mapping[str, str], base: Base, paths: Collection[str], owner: str
 ) -> tuple[list[Fault], tuple[Suggestion, ...]]:
-    """Return a fault for each edit by hand, and the override that would do what it was to do.
+    """Return a fault for each manual edit, and an override with the same effect if there is one.
 
     Args:
-        files: the files as edited.
-        base: what they were before.
-        paths: the generator's files among those that differ.
+        files: the files after the edit.
+        base: the files before it.
+        paths: the generated files that were edited.
         owner: who edited them.
     """
     releases = _by_path(base)
-    taken = {path for path in files if path.startswith(f"{OVERRIDES_ROOT}/")}
+    used = {path for path in files if path.startswith(f"{OVERRIDES_ROOT}/")}
     faults, suggestions = list[Fault](), list[Suggestion]()
     for path in paths:
         before, after = base.files.get(path), files.get(path)
-        release, found = releases.get(path), None
+        release, suggestion = releases.get(path), None
         if release is not None and before is not None and base.state is not None:
             who = owner if owner.isprintable() and owner.strip() else "unknown"
             texts = (before, after)
-            found = suggest_override(path, texts, release, base.state.config, who.strip()[:100])
-        if found is not None:
+            suggestion = suggest_override(
+                path, texts, release, base.state.config, who.strip()[:100]
+            )
+        if suggestion is not None:
             also = sorted(one.name for one in releases.values() if _fits(release, one))
-            found = replace(found, name=_free(found.name, taken), other_releases=tuple(also))
-            suggestions.append(found)
-        message = _message(path, before is None, after is None, found)
+            suggestion = replace(
+                suggestion, name=_unused_path(suggestion.name, used), other_releases=tuple(also)
+            )
+            suggestions.append(suggestion)
+        message = _message(path, before is None, after is None, suggestion)
         faults.append(fault("", message).within(path))
     return faults, tuple(suggestions)
 
@@ -86,42 +90,44 @@ def _by_path(base: Base) -> dict[str, Release]:
     return {path_of(release): release for release in known.values()}
 
 
-def _free(name: str, taken: set[str]) -> str:
-    """Return the path of an override that is not there yet."""
-    for number in range(1, len(taken) + 2):
+def _unused_path(name: str, used: set[str]) -> str:
+    """Return the path of an override that does not exist yet."""
+    for number in range(1, len(used) + 2):
         path = f"{OVERRIDES_ROOT}/{name}{f'-{number}' if number > 1 else ''}.yaml"
-        if path not in taken:
+        if path not in used:
             break
-    taken.add(path)
+    used.add(path)
     return path
 
 
-def _message(path: str, added: bool, deleted: bool, found: Suggestion | None) -> str:
-    if found is not None and deleted:
+def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | None) -> str:
+    if suggestion is not None and deleted:
         return (
-            f"{_LOST}; to have it stopped, merge {found.name} as shown, or delete the claims in "
-            "ledger/ that it follows from"
+            f"{_LOST}; to stop the release, merge {suggestion.name} as shown, or delete its "
+            "claims in ledger/"
         )
-    if found is not None:
-        rest = ""
-        if found.not_covered:
-            more = ", …" if len(found.not_covered) > _MOST_LEFT else ""
-            rest = f" (no override changes {', '.join(found.not_covered[:_MOST_LEFT])}{more})"
-        return f"{_LOST}, and merge {found.name} as shown{rest}"
+    if suggestion is not None:
+        unchanged = ""
+        if suggestion.not_covered:
+            more = ", …" if len(suggestion.not_covered) > _MOST_LEFT else ""
+            unchanged = (
+                f" (no override changes {', '.join(suggestion.not_covered[:_MOST_LEFT])}{more})"
+            )
+        return f"{_LOST}, and merge {suggestion.name} as shown{unchanged}"
     if path.startswith(f"{NOTES_ROOT}/"):
-        return "is the generator's own, and written anew by it; take the edit back"
+        return "is written by the generator, which undoes the edit; revert it"
     if path.startswith(f"{claim_file.LEDGER_ROOT}/") and added:
-        return "is no claim's place, and the generator removes it; take it away"
+        return "is not the path of a claim, so the generator removes it; delete it"
     if added:
         return (
-            "is generated, and what no demand asks for is removed; take it away, and demand it: "
-            "demandops request"
+            "is in a generated folder, where files without a demand are removed; delete it and use "
+            "`demandops request`"
         )
-    return f"{_LOST}, and change {_source_of(path)} that it follows from"
+    return f"{_LOST}, and change {_source_of(path)} instead"
 
 
 def _source_of(path: str) -> str:
-    """Return what a person edits instead of a file that is no release."""
+    """Return what to edit instead of a generated file that is not a release."""
     if path.startswith(f"{BOOTSTRAP_ROOT}/"):
         return "demandops.yaml, inventory/ or policy/access-domains.yaml"
     if "/_charts/" in path:

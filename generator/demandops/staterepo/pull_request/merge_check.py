@@ -1,9 +1,8 @@
-"""A checked-out state repo, as a person edits it: is what they are about to merge sound?
+"""Whether an edit of a checked-out state repo can be merged, and what merging would do.
 
-Compared with the commit that the edit started from: all is valid and renders, generated files are
-not edited by hand, and a chart that changed has a new version, for Flux and Argo CD go by the
-version alone. Beside the faults stands what merging would do, to the desired state and to the
-bookkeeping.
+All files must be valid and render, generated files must not have manual edits, and a changed chart
+must have a new version, because Flux and Argo CD compare only versions. The edit is compared with
+the commit that it started from. The result also previews desired state and bookkeeping.
 """
 
 from __future__ import annotations
@@ -38,78 +37,77 @@ from demandops.staterepo.pull_request.worktree import Base, author_of, base_of, 
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
-    """What a check found.
+class CheckResult:
+    """The result of a check.
 
-    ``consequence`` is missing where the files are not valid; ``books`` is missing there too, and
-    where there is nothing valid to compare with. ``base`` is what was compared with, if anything;
-    where its own files are not valid (``base_in_force``), the last valid ones stand in. What is in
-    ``warnings`` is no fault and may still not be meant.
+    ``preview`` is None if the files are not valid; ``bookkeeping`` is also None if no valid commit
+    can be compared with. ``base`` is the commit compared with, if any; if its files are not valid
+    (``base_valid``), their last valid versions are used. ``warnings`` are likely mistakes.
     """
 
     faults: tuple[Fault, ...]
     suggestions: tuple[Suggestion, ...] = ()
-    consequence: MergePreview | None = None
-    books: tuple[EntryChange, ...] | None = None
+    preview: MergePreview | None = None
+    bookkeeping: tuple[EntryChange, ...] | None = None
     base: str | None = None
-    base_in_force: bool = True
+    base_valid: bool = True
     warnings: tuple[Fault, ...] = ()
 
 
-def check(folder: Path, base: str | None = None, now: datetime | None = None) -> Checked:
-    """Check the files of a folder, that everything renders, and what follows from the edit.
+def check(folder: Path, base: str | None = None, now: datetime | None = None) -> CheckResult:
+    """Check the files of a folder, render them, and preview what merging would do.
 
     Args:
-        folder: a checked-out state repo, or an unpacked one without Git.
-        base: what the edit is to be merged into; by default ``origin/main``, or ``main``. It is
-            compared with where the work tree left that.
-        now: overrides that ended by then are not tried; the time of the day where left out.
+        folder: a checked-out state repo, or its files without Git.
+        base: the merge target; by default ``origin/main``, else ``main``. The edit is compared
+            with the common ancestor.
+        now: overrides that ended by then are left out; by default the current time.
 
     Raises:
-        StateRepoError: where it is no state repo, or ``base`` is no commit, or the clone is too
-            shallow to tell.
+        StateRepoError: it is not a state repo, ``base`` is not a commit, or the clone is too
+            shallow.
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
     before = start.files if start else files
     ledger = _ledger(files, faults)
-    found = Checked((), base=start.commit if start else None)
-    found = replace(found, base_in_force=start is None or start.in_force)
-    edited = manual_edits.edited(files, before)
+    result = CheckResult((), base=start.commit if start else None)
+    result = replace(result, base_valid=start is None or start.valid)
+    edited = manual_edits.changed_paths(files, before)
     try:
-        moment = now or datetime.now(timezone.utc)
-        state = _state(files, before, ledger, faults, moment)
-        claims = [path for path in {*files, *before} if files.get(path) != before.get(path)]
-        state = _taken_in(state, start, claims, files, moment)
-        standing = {
+        now = now or datetime.now(timezone.utc)
+        state = _state(files, before, ledger, faults, now)
+        changed = [path for path in {*files, *before} if files.get(path) != before.get(path)]
+        state = _applied(state, start, changed, files, now)
+        current = {
             path: text
             for path, text in before.items()
-            if _generated(path) and not trees.is_note(path)
+            if _generated(path) and not trees.is_readme(path)
         }
-        wanted = _wanted(state, standing, claims)
+        wanted = _rendered(state, current, changed)
     except InvalidInput as error:
-        refused, suggested = _hand_edits(folder, files, start, edited)
+        refused, suggested = _manual_edits(folder, files, start, edited)
         faults += error.faults
-        return replace(found, faults=_ordered([*faults, *refused]), suggestions=suggested)
-    # what the generator would write all the same is no edit: a proposal of its own, an upgrade
+        return replace(result, faults=_ordered([*faults, *refused]), suggestions=suggested)
+    # a proposal or an upgrade contains exactly what the generator would write: not a manual edit
     edited = [
         path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
     ]
-    refused, suggested = _hand_edits(folder, files, start, edited)
+    refused, suggested = _manual_edits(folder, files, start, edited)
     new = merge_preview.planned_releases(state.ledger, state.config)
     old = new if start is None else _releases(start)
     return replace(
-        found,
+        result,
         faults=_ordered([*faults, *refused]),
         suggestions=suggested,
-        consequence=merge_preview.preview(old, new, standing, wanted),
-        books=_books(start, state),
-        warnings=_warnings(state, moment),
+        preview=merge_preview.preview(old, new, current, wanted),
+        bookkeeping=_bookkeeping_changes(start, state),
+        warnings=_warnings(state, now),
     )
 
 
 def _ordered(faults: list[Fault]) -> tuple[Fault, ...]:
-    return tuple(sorted(dict.fromkeys(faults), key=lambda found: found.file))
+    return tuple(sorted(dict.fromkeys(faults), key=lambda fault: fault.file))
 
 
 def _generated(path: str) -> bool:
@@ -137,13 +135,14 @@ def _state(
     faults: list[Fault],
     now: datetime,
 ) -> State:
-    """Return what the files say; faults that do not keep it from being rendered are put down."""
+    """Return the state of the files; add faults that do not prevent rendering to ``faults``."""
     config = load({p: t for p, t in files.items() if p.split("/")[0] in CONFIG_ROOTS})
     version = config.repository.render_version
     if version < RENDER_VERSION:
         message = (
             f"is {version}, but this program renders version {RENDER_VERSION}; check with the "
-            "program that the generator runs, or have all rendered anew by `demandops upgrade`"
+            "generator's version of the program, or run `demandops upgrade` to render everything "
+            "again"
         )
         raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
     faults += _unversioned_charts(config, files, before)
@@ -153,26 +152,26 @@ def _state(
     return state
 
 
-def _taken_in(
+def _applied(
     state: State,
     start: Base | None,
     changed: Collection[str],
     files: Mapping[str, str],
     now: datetime,
 ) -> State:
-    """Return the books as the generator would have them once it took the change in."""
+    """Return the state after the generator has applied the change."""
     if start is None or start.state is None:
         return state
     old, new = start.state.ledger, state.ledger
     subjects = [
         claim.subject
-        for books in (old, new)
-        for claim in books
+        for ledger in (old, new)
+        for claim in ledger
         if claim_file.path_of(claim.key) in changed
     ]
     before, after = (old, start.state.config), (new, state.config)
-    taken = update_ledger(before, after, dict.fromkeys(subjects), _marked(files), now)
-    return replace(state, ledger=taken.ledger, config=taken.config)
+    applied = update_ledger(before, after, dict.fromkeys(subjects), _marked(files), now)
+    return replace(state, ledger=applied.ledger, config=applied.config)
 
 
 def _marked(files: Mapping[str, str]) -> dict[str, str]:
@@ -182,10 +181,10 @@ def _marked(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def _with_ended(config: Config, files: Mapping[str, str], now: datetime) -> Config:
-    """Return the configuration without the overrides that a generator ended, or would at once."""
+    """Return the configuration without overrides that have ended or expired."""
     config = config.with_ended(ended_override_file.read(_marked(files)))
-    over = {one.name: written(one.end) for one in expired_overrides(config, now) if one.end}
-    return config.with_ended({**config.ended, **over})
+    expired = {one.name: written(one.end) for one in expired_overrides(config, now) if one.end}
+    return config.with_ended({**config.ended, **expired})
 
 
 def _warnings(state: State, now: datetime) -> tuple[Fault, ...]:
@@ -193,13 +192,13 @@ def _warnings(state: State, now: datetime) -> tuple[Fault, ...]:
     return tuple(fault("", text).within(path) for path, text in idle)
 
 
-def _wanted(state: State, standing: Mapping[str, str], edited: Collection[str]) -> dict[str, str]:
-    """Return every generated file; of what cannot be rendered, the faults of every release."""
+def _rendered(state: State, current: Mapping[str, str], edited: Collection[str]) -> dict[str, str]:
+    """Return every generated file, or raise the faults of every release."""
     try:
-        return rendered_files(state, standing)
+        return rendered_files(state, current)
     except InvalidInput as error:
-        found = merge_preview.render_faults(state.ledger, state.config, state.engine, edited)
-        raise InvalidInput(found or error.faults) from None
+        faults = merge_preview.render_faults(state.ledger, state.config, state.engine, edited)
+        raise InvalidInput(faults or error.faults) from None
 
 
 def _releases(start: Base) -> dict[ReleaseKey, Release]:
@@ -208,7 +207,7 @@ def _releases(start: Base) -> dict[ReleaseKey, Release]:
     return merge_preview.planned_releases(start.state.ledger, start.state.config)
 
 
-def _books(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
+def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
     if start is None:
         return ()
     if start.state is None:
@@ -220,12 +219,12 @@ def _books(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
     return bookkeeping_changes(old, bookkeeping(state.ledger, state.config))
 
 
-def _hand_edits(
+def _manual_edits(
     folder: Path, files: Mapping[str, str], start: Base | None, edited: list[str]
 ) -> tuple[list[Fault], tuple[Suggestion, ...]]:
     if start is None or not edited:
         return [], ()
-    return manual_edits.refused(files, start, edited, author_of(folder))
+    return manual_edits.faults_and_suggestions(files, start, edited, author_of(folder))
 
 
 def _unversioned_charts(
@@ -250,7 +249,7 @@ def _unversioned_charts(
             yield fault(
                 "version",
                 f"is still {source.version}, but {changed[0].removeprefix(prefix)} changed; raise "
-                f"it here and at charts.{name} in registry/charts.yaml, or no cluster takes it",
+                f"it here and at charts.{name} in registry/charts.yaml, or no cluster applies it",
             ).within(metadata)
 
 

@@ -1,4 +1,4 @@
-"""A checked-out state repo on this disk: its files, and the commit that an edit started from."""
+"""A checked-out state repo: its files, and the commit that an edit started from."""
 
 from __future__ import annotations
 
@@ -20,39 +20,40 @@ from demandops.staterepo.load import snapshot as snapshots
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
 _SHALLOW = (
-    "this clone is shallow and does not hold the commit that the edit started from; fetch all of "
-    "it: git fetch --unshallow origin (in a pipeline fetch-depth: 0, or GIT_DEPTH: 0)"
+    "this clone is shallow and lacks the commit that the edit started from; fetch all commits: "
+    "git fetch --unshallow origin (in a pipeline fetch-depth: 0, or GIT_DEPTH: 0)"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Base:
-    """The commit that an edit started from. ``state`` is missing where none was ever valid."""
+    """The commit that an edit started from. ``state`` is None if none was ever valid."""
 
     commit: str
     files: Mapping[str, str]
     state: State | None
-    in_force: bool
-    """Whether its own files are valid, or ``state`` is from an earlier commit."""
+    valid: bool
+    """Whether its files are valid; if not, ``state`` is from an earlier commit."""
 
 
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
-    """Return path → text of all that is the state repo's, and a fault for each symbolic link.
+    """Return path → text of the state repo's files, and a fault for each symbolic link.
 
     Raises:
-        StateRepoError: where the folder holds no state repo, or not all of it can be read.
+        StateRepoError: the folder is not a state repo, or a file cannot be read.
     """
     if not (folder / "demandops.yaml").is_file():
         raise StateRepoError(
-            f"{folder} is no state repo, for it has no demandops.yaml; `demandops init` makes one"
+            f"{folder} is not a state repo, because it has no demandops.yaml; `demandops init` "
+            "makes one"
         )
     files, faults = dict[str, str](), list[Fault]()
     for root in _ROOTS:
         top = folder / root
         for path in [top, *sorted(top.rglob("*"))]:
             name = path.relative_to(folder).as_posix()
-            if path.is_symlink():  # it may lead to what the reader of a report must not see
-                message = "is a symbolic link, which is not followed; put a file there"
+            if path.is_symlink():  # it may point to a file that the report must not show
+                message = "is a symbolic link, which is not followed; replace it by a file"
                 faults.append(fault("", message).within(name))
             elif path.is_file():
                 files[name] = _text(path)
@@ -67,20 +68,20 @@ def _text(path: Path) -> str:
 
 
 def base_of(folder: Path, revision: str | None) -> Base | None:
-    """Return what an edit is compared with; nothing where Git knows no earlier commit.
+    """Return the commit that an edit is compared with, or None if Git knows no commit.
 
     Args:
         folder: a checked-out state repo.
-        revision: what the edit is to be merged into, by default ``origin/main``, else ``main``.
+        revision: the merge target, by default ``origin/main``, else ``main``.
 
     Raises:
-        StateRepoError: where there is no such commit, or none that both come from.
+        StateRepoError: there is no such commit, or it has no ancestor in common with HEAD.
     """
     try:
         repo = Repository(str(folder))
     except pygit2.GitError:
         if revision is not None:
-            raise StateRepoError(f"{folder} is no Git checkout; leave out --base") from None
+            raise StateRepoError(f"{folder} is not a Git checkout; leave out --base") from None
         return None
     if repo.is_empty or repo.head_is_unborn:
         return None
@@ -94,7 +95,7 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
 
 
 def _started_from(repo: Repository, revision: str | None) -> Commit:
-    """Return the commit that the work tree and what it is to be merged into both come from."""
+    """Return the common ancestor of HEAD and the merge target."""
     head = repo.head.peel(Commit)
     known = [name for name in _DEFAULTS if name in repo.references]
     if revision is None and not known:
@@ -112,14 +113,14 @@ def _started_from(repo: Repository, revision: str | None) -> Commit:
         if repo.is_shallow:
             raise StateRepoError(_SHALLOW)
         raise StateRepoError(
-            f"HEAD and {revision or known[0]} have no commit in common; name with --base what the "
-            "edit is to be merged into"
+            f"HEAD and {revision or known[0]} have no commit in common; name the merge target with "
+            "--base"
         )
     return trees.commit_of(repo, common)
 
 
 def author_of(folder: Path) -> str:
-    """Return the name of who made the newest commit here, or nothing."""
+    """Return the author of the newest commit, or an empty text."""
     try:
         repo = Repository(str(folder))
         return str(repo.head.peel(Commit).author.name)

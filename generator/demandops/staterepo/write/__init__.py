@@ -1,1 +1,1 @@
-"""What is written: commits, the journal of demands, and the branches of proposals."""
+"""Writing: the commits of a batch, the journal of demands, and the branches of proposals."""

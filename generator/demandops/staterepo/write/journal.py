@@ -1,8 +1,8 @@
-"""The outbox: every demand that is not yet published, kept on disk, so that a crash loses none.
+"""The journal: every accepted demand that is not yet published, on disk, so a crash loses none.
 
-An append-only journal, one JSON line for each demand received and one for each done. A demand is
-written and fsynced before it is judged; after a restart what is not done is judged again, and its
-operation id tells whether its commit arrived after all.
+It has one JSON line for each demand received and one for each demand done. A demand is written and
+fsynced before it is evaluated. After a restart, demands that are not done are evaluated again;
+their operation ids show whether a commit was already published.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _MAX_SLOTS = 256
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """A demand as it came: its operation id, the goal, when, and the tip known then.
+    """An accepted demand: operation id, goal, time received, and the tip known then.
 
-    ``proposal``: what it awaits approval on, where it does.
+    ``proposal``: the proposal with which it awaits approval, if any.
     """
 
     operation: str
@@ -36,7 +36,7 @@ class JournalEntry:
     proposal: dict[str, Any] | None = None
 
     def line(self) -> str:
-        """Return its line of the journal; the goal is not copied, for it may be deep."""
+        """Return its line of the journal, without copying the goal, which may be deep."""
         record = {field.name: getattr(self, field.name) for field in fields(self)}
         if self.proposal is None:
             del record["proposal"]
@@ -44,7 +44,7 @@ class JournalEntry:
 
 
 class Journal:
-    """The journal of one process. Not thread-safe: its user locks."""
+    """The journal of one process. Not thread-safe: the caller locks."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -52,7 +52,7 @@ class Journal:
         self._compact()
 
     def append(self, entries: Iterable[JournalEntry]) -> None:
-        """Keep ``entries``, on the disk when this returns."""
+        """Write and fsync ``entries``."""
         lines = []
         for entry in entries:
             self.pending[entry.operation] = entry
@@ -61,11 +61,11 @@ class Journal:
             self._file.write("".join(lines))
             self._sync()
 
-    def done(self, operations: Iterable[str], *, durably: bool = False) -> None:
-        """Forget demands that are published, refused or withdrawn.
+    def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
+        """Remove demands that are published, refused or withdrawn.
 
-        Not fsynced unless told so: the next :meth:`append` does it, and only after it could a
-        demand exist that a replay of these would harm.
+        Fsynced only if ``durably``: the next :meth:`append` does it, and before that no demand
+        exists that replaying these could harm.
         """
         for operation in operations:
             if self.pending.pop(operation, None) is not None:
@@ -77,7 +77,7 @@ class Journal:
             self._compact()
 
     def close(self) -> None:
-        """Close the journal; what is pending stays for the next process."""
+        """Close the journal; pending demands stay for the next process."""
         self._sync()
         self._file.close()
 
@@ -98,7 +98,7 @@ class Journal:
 
 
 def _load(path: Path) -> dict[str, JournalEntry]:
-    """Return what is pending; a last line that a crash cut off was never acknowledged."""
+    """Return the pending demands; skip a line that a crash cut off, which was not acknowledged."""
     pending: dict[str, JournalEntry] = {}
     text = path.read_bytes().decode("utf-8", "replace") if path.exists() else ""
     for line in text.splitlines():
@@ -123,10 +123,10 @@ def _sync_folder(folder: Path) -> None:
 
 
 class Slot:
-    """A folder for one process's outbox and clone, locked while the process lives.
+    """A folder for the journal and the clone of one process, locked while the process lives.
 
-    Several processes may serve one state repo from one machine: each takes the first free slot,
-    and takes over what a dead one left in its outbox.
+    Several processes on one machine may serve one state repo. Each takes the first free slot and
+    takes over the journals of dead processes.
     """
 
     def __init__(self, root: Path) -> None:
@@ -135,7 +135,7 @@ class Slot:
         except OSError as error:
             raise StateRepoError(
                 f"the data folder {root} cannot be made: {error.strerror}; set DEMANDOPS_DATA_HOME "
-                "to a folder that can be written to"
+                "to a writable folder"
             ) from None
         for number in range(_MAX_SLOTS):
             folder = root / f"slot-{number}"
@@ -145,14 +145,14 @@ class Slot:
                 break
         else:
             raise OSError(f"{_MAX_SLOTS} processes use {root} already")
-        self.outbox = Journal(self.folder / "outbox.jsonl")
+        self.journal = Journal(self.folder / "outbox.jsonl")
         self._adopt_orphans(root)
 
     def _adopt_orphans(self, root: Path) -> None:
-        """Take over what dead processes left behind.
+        """Take over the journals of dead processes.
 
-        Kept here before it is removed there: a crash between the two leaves an entry twice, and
-        its operation id lets it count once.
+        An entry is written here before it is removed there. A crash between the two leaves it
+        twice, but its operation id makes it count once.
         """
         for folder in sorted(root.glob("slot-*")):
             journal = folder / "outbox.jsonl"
@@ -161,12 +161,12 @@ class Slot:
             lock = _lock(folder)
             if lock is not None:
                 with lock:
-                    self.outbox.append(_load(journal).values())
+                    self.journal.append(_load(journal).values())
                     journal.unlink()
 
     def close(self) -> None:
-        """Give the slot back."""
-        self.outbox.close()
+        """Close the journal and release the slot."""
+        self.journal.close()
         self._lock.close()
 
 

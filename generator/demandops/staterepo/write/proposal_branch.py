@@ -1,8 +1,7 @@
-"""Proposals in the state repo: branches ``demand/…`` that wait for a person to merge them.
+"""Proposals in the state repo: branches ``demand/…`` that a person merges to approve.
 
-They are the generator's own: it lays one anew on a newer main and takes it away again, each time
-only from the commit that it put there itself. Knows nothing of who waits for them, and of forges
-only the options that GitLab takes with a push.
+The generator rebuilds a branch on a newer main and deletes it in the end, but only if the branch
+is at the commit that the generator put there. Knows no forge except GitLab's push options.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from pygit2 import Oid, Repository
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.clone import ClonedRepository
+from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import MAIN, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
@@ -34,56 +33,56 @@ _MAX_SLUG = 40
 
 
 class BranchMoved(StateRepoError):
-    """Somebody else moved or took away a branch: it is not at the commit that was put there."""
+    """Raised when a branch is not at the commit that the generator put there."""
 
 
-def branch_of(name: str, operation: str) -> str:
-    """Return the branch for a demand: readable, and of this operation alone."""
+def branch_name(name: str, operation: str) -> str:
+    """Return the branch for a demand: readable, and unique to the operation."""
     slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_MAX_SLUG].rstrip("-")
     digest = hashlib.sha256(operation.encode()).hexdigest()[:12]
     return f"{PREFIX}{slug}-{digest}" if slug else f"{PREFIX}{digest}"
 
 
 @dataclass(frozen=True, slots=True)
-class Heads:
-    """Where the state repo's branches are: main, and those of proposals by name."""
+class BranchHeads:
+    """The commits of main and of the proposals' branches, by name."""
 
     main: str
     branches: dict[str, str]
 
 
-class Branches:
+class ProposalBranches:
     """The branches ``demand/…`` of a state repo, on this disk or behind a URL."""
 
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository
-        self._remote = repository if isinstance(repository, ClonedRepository) else None
+        self._remote = repository if isinstance(repository, RemoteRepository) else None
 
-    def heads(self) -> Heads:
-        """Ask where the branches are now.
+    def heads(self) -> BranchHeads:
+        """Return the current commits of the branches.
 
         Raises:
-            RemoteAway: where the remote does not answer.
+            RemoteAway: the remote cannot be reached.
         """
         if self._remote is None:
             found = _heads(Repository(self._repository.objects.path))
         else:
-            found = self._remote.listed(MAIN, f"{_HEADS}{PREFIX}*")
+            found = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
         named = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
-        return Heads(named.pop(MAIN_BRANCH, ""), named)
+        return BranchHeads(named.pop(MAIN_BRANCH, ""), named)
 
     def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
-        """Make a branch point to ``commit``, durably; return the link that the server told.
+        """Make a branch point to ``commit``, durably; return the link that the server printed.
 
         Args:
             branch: its name.
-            commit: a commit that is here.
-            expected: where the branch is now; empty where there must be none.
-            options: push options; a server that knows none gets the branch without.
+            commit: a commit in this repository.
+            expected: the branch's commit now; empty if the branch must not exist.
+            options: push options; left out if the server supports none.
 
         Raises:
-            BranchMoved: where the branch is not as expected.
-            RemoteAway, PushDenied: where it could not be pushed for another reason.
+            BranchMoved: the branch is not at ``expected``.
+            RemoteAway, PushDenied: it could not be pushed for another reason.
         """
         if self._remote is None:
             self._move(branch, commit, expected)
@@ -92,11 +91,11 @@ class Branches:
         return self._push(f"{commit}:{reference}", branch, str(commit), expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
-        """Take a branch away; one that is gone already may be.
+        """Delete a branch, if it exists.
 
         Raises:
-            BranchMoved: where it is at another commit: somebody worked on it.
-            RemoteAway, PushDenied: where it could not be pushed for another reason.
+            BranchMoved: the branch is at another commit.
+            RemoteAway, PushDenied: the deletion could not be pushed for another reason.
         """
         if self._remote is None:
             self._move(branch, None, expected)
@@ -106,8 +105,8 @@ class Branches:
     def _push(
         self, spec: str, branch: str, wanted: str, expected: str, options: Sequence[str] = ()
     ) -> str:
-        """Push, and where that failed look whether the branch is as wanted all the same."""
-        assert self._remote is not None  # noqa: S101 - the callers have looked
+        """Push; if that fails, check whether the branch is as wanted nevertheless."""
+        assert self._remote is not None  # noqa: S101 - checked by the callers
         lease = f"{_HEADS}{branch}:{expected}"
         try:
             return _link(self._remote.push(spec, lease, options))
@@ -116,10 +115,12 @@ class Branches:
                 return self._push(spec, branch, wanted, expected)
             now = self.heads().branches.get(branch, "")
             if now == wanted:
-                return ""  # it was taken, and the answer got lost
+                return ""  # the push succeeded, but the answer was lost
             if now != expected:
-                raise BranchMoved(f"{branch} was changed by somebody else") from None
-            raise self._remote.why_not(error) from None
+                raise BranchMoved(
+                    f"{branch} was changed by someone other than the generator"
+                ) from None
+            raise self._remote.push_error(error) from None
 
     def _move(self, branch: str, commit: Oid | None, expected: str) -> None:
         references = self._repository.objects.references
@@ -128,7 +129,7 @@ class Branches:
         if commit is None and not now:
             return
         if now != expected:
-            raise BranchMoved(f"{branch} was changed by somebody else")
+            raise BranchMoved(f"{branch} was changed by someone other than the generator")
         if commit is None:
             references.delete(name)
         elif now:
@@ -142,30 +143,30 @@ class Branches:
         return trees.write(objects, commit_of(objects, tip).tree, files)
 
     def message(self, commit: str) -> str:
-        """Return a commit's message; nothing where the commit is not here."""
+        """Return a commit's message; empty if the commit is not here."""
         try:
             return commit_of(self._repository.objects, commit).message
         except StateRepoError:
             return ""
 
-    def is_fresh(self, tip: Oid, commit: str, base: str, made: Oid) -> bool:
-        """Tell whether merging ``commit`` into ``tip`` gives the files of ``made``, and cleanly.
+    def is_up_to_date(self, tip: Oid, commit: str, base: str, wanted: Oid) -> bool:
+        """Return whether merging ``commit`` into ``tip`` gives the tree ``wanted``, cleanly.
 
         Args:
-            tip: main as it is.
-            commit: the proposal as it stands, on top of ``base``.
-            base: main as it was.
-            made: the tree that the demand would have on main as it is.
+            tip: the current commit of main.
+            commit: the proposal, on top of ``base``.
+            base: the commit of main that the proposal was made on.
+            wanted: the tree that the demand gives on the current main.
         """
         objects = self._repository.objects
         try:
-            old, stands = commit_of(objects, base).tree, commit_of(objects, commit).tree
+            old, proposal = commit_of(objects, base).tree, commit_of(objects, commit).tree
         except StateRepoError:
-            return False  # the clone was made anew, or git tidied up
+            return False  # the clone was made again, or `git gc` removed the commit
         now = commit_of(objects, tip).tree
-        wanted = objects[made].peel(pygit2.Tree)
-        proposed = dict(trees.differences(objects, old, stands, ""))
-        if proposed != dict(trees.differences(objects, now, wanted, "")):
+        new = objects[wanted].peel(pygit2.Tree)
+        proposed = dict(trees.differences(objects, old, proposal, ""))
+        if proposed != dict(trees.differences(objects, now, new, "")):
             return False
         moved = dict(trees.differences(objects, old, now, ""))
         return not set(moved) & set(proposed)
@@ -176,17 +177,17 @@ def _heads(repo: Repository) -> dict[str, str]:
     return {name: str(repo.references[name].target) for name in [MAIN, *names]}
 
 
-def _link(said: str) -> str:
-    """Return the address that a server prints for a person; GitLab's are of a merge request."""
-    lines = [line for line in said.splitlines() if line.startswith("remote:")]
+def _link(output: str) -> str:
+    """Return the address of the merge request that GitLab prints, or an empty text."""
+    lines = [line for line in output.splitlines() if line.startswith("remote:")]
     links = [found[0] for line in lines if (found := _LINK.search(line))]
     return next((link for link in links if "/merge_requests/" in link), "")
 
 
 def gitlab_options(title: str, description: str, labels: Iterable[str]) -> list[str]:
-    """Return the push options by which GitLab opens a merge request.
+    """Return the push options that make GitLab open a merge request.
 
-    They hold no line breaks, so the description is of one line.
+    Push options cannot hold line breaks, so the description has one line.
     """
     return [
         "merge_request.create",
@@ -200,7 +201,7 @@ def gitlab_options(title: str, description: str, labels: Iterable[str]) -> list[
 
 @dataclass(frozen=True, slots=True)
 class PendingProposal:
-    """A proposal that nobody has decided yet, as its commits tell it."""
+    """A proposal that awaits approval, described by its commits."""
 
     branch: str
     commit: str
@@ -211,17 +212,17 @@ class PendingProposal:
     operations: tuple[str, ...]
 
 
-def waiting(repository: StateRepository) -> Iterator[PendingProposal]:
+def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     """Yield the proposals that are not merged, by branch.
 
     Raises:
-        RemoteAway: where the remote does not answer.
+        RemoteAway: the remote cannot be reached.
     """
-    if isinstance(repository, ClonedRepository):
+    if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
     repo = Repository(repository.objects.path)
     space = f"refs/remotes/origin/{PREFIX}"
-    if not isinstance(repository, ClonedRepository):
+    if not isinstance(repository, RemoteRepository):
         space = f"{_HEADS}{PREFIX}"
     main = repository.tip()
     for name in sorted(name for name in repo.references if name.startswith(space)):
@@ -231,10 +232,10 @@ def waiting(repository: StateRepository) -> Iterator[PendingProposal]:
             if PROPOSAL in entry.trailers
         ]
         if entries:
-            yield _described(repo, f"{PREFIX}{name.removeprefix(space)}", entries)
+            yield _from_commits(repo, f"{PREFIX}{name.removeprefix(space)}", entries)
 
 
-def _described(
+def _from_commits(
     repo: Repository, branch: str, entries: list[commit_log.LogEntry]
 ) -> PendingProposal:
     def all_of(key: str) -> tuple[str, ...]:

@@ -1,4 +1,7 @@
-"""A state repo behind a URL: a bare clone, and git itself to fetch and push."""
+"""The state repo behind a URL: a bare clone, fetched and pushed by git.
+
+Explains why a fetch or a push failed: remote unreachable, or push rejected.
+"""
 
 from __future__ import annotations
 
@@ -24,49 +27,51 @@ from demandops.staterepo.git.repository import (
     ENVIRONMENT,
     MAIN,
     TIMEOUT_S,
-    CutShort,
+    FetchInterrupted,
     PushDenied,
     RemoteAway,
     StateRepository,
 )
 
 _REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
-_BEHIND = re.compile(r"\[rejected\]")
-_REMOTE_SAYS = re.compile(r"remote: ?(.*)")
-_REFUSED = re.compile(r"\[remote rejected\] \((.*)\)")
-_PASSING = re.compile(r"lock|failed to update ref|incorrect old value")
+_REMOTE_MOVED = re.compile(r"\[rejected\]")
+_REMOTE_MESSAGE = re.compile(r"remote: ?(.*)")
+_REMOTE_REJECTED = re.compile(r"\[remote rejected\] \((.*)\)")
+_TEMPORARY = re.compile(r"lock|failed to update ref|incorrect old value")
 _POLL_S = 0.02
-_NO_RIGHT = re.compile(r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE)
+_NO_PERMISSION = re.compile(
+    r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
+)
 
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")
 
 
-class ClonedRepository(StateRepository):
-    """A bare clone of a remote; clone, fetch and push run git itself, with the user's set-up."""
+class RemoteRepository(StateRepository):
+    """A bare clone of a remote; git runs with the user's configuration."""
 
-    def __init__(self, url: str, folder: Path, say: Say, patient: bool) -> None:
+    def __init__(self, url: str, folder: Path, notify: Notify, allow_offline: bool) -> None:
         self.address = without_secrets(url)
         self._url = url
         self._folder = folder
-        self._given_up = False
-        self._talking: subprocess.Popen[bytes] | None = None
-        for lock in folder.rglob("*.lock"):  # the folder is ours alone: a killed process left it
+        self._aborted = False
+        self._process: subprocess.Popen[bytes] | None = None
+        for lock in folder.rglob("*.lock"):  # of a killed process: no other uses the folder
             lock.unlink(missing_ok=True)
-        if not self._is_sound():
-            self._clone(say)
+        if not self._is_usable():
+            self._clone(notify)
         self._git = git.Repo(folder)
         self.objects = Repository(str(folder))
         try:
             self.refresh()
         except RemoteAway as error:
-            if not patient:
+            if not allow_offline:
                 raise
-            log.warning("%s; going on from what was fetched last", error)
+            log.warning("%s; continuing with what was fetched last", error)
 
-    def _is_sound(self) -> bool:
-        """Tell whether the clone of an earlier run can be used (a crash may have cut it off)."""
+    def _is_usable(self) -> bool:
+        """Return whether an earlier run left a complete clone."""
         try:
             repo = Repository(str(self._folder))
             target = repo.references[_REMOTE_MAIN].target
@@ -74,8 +79,8 @@ class ClonedRepository(StateRepository):
         except (pygit2.GitError, KeyError):
             return False
 
-    def _clone(self, say: Say) -> None:
-        say(f"cloning {self.address}")
+    def _clone(self, notify: Notify) -> None:
+        notify(f"cloning {self.address}")
         if self._folder.exists():
             shutil.rmtree(self._folder)
         self._folder.parent.mkdir(parents=True, exist_ok=True)
@@ -90,9 +95,9 @@ class ClonedRepository(StateRepository):
 
     def _fetch(self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False) -> None:
         try:
-            # told here, not configured: a push that outlives a killed generator moves nothing here
+            # given here, not configured, so that a push that outlives its generator moves no ref
             spec = f"+{MAIN}:{_REMOTE_MAIN}"
-            self._talk(repo, "fetch", "--no-tags", "--quiet", "origin", spec, urgent=urgent)
+            self._run_git(repo, "fetch", "--no-tags", "--quiet", "origin", spec, urgent=urgent)
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
             if "couldn't find remote ref" in text:
@@ -103,7 +108,7 @@ class ClonedRepository(StateRepository):
             raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
 
     def tip(self) -> Oid:
-        """Return the remote's commit as of the last fetch or push."""
+        """Return the remote's commit at the last fetch or push."""
         target = self.objects.references[_REMOTE_MAIN].target
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target
@@ -113,129 +118,131 @@ class ClonedRepository(StateRepository):
         self._fetch(self._git)
         return self.tip()
 
-    def look(self, urgent: Callable[[], bool]) -> Oid:
-        """Fetch, but give way to what is urgent: a demand is not to wait for a slow remote."""
+    def refresh_unless_urgent(self, urgent: Callable[[], bool]) -> Oid:
+        """Fetch, but stop if something is urgent: a demand must not wait for a slow remote."""
         self._fetch(self._git, urgent)
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Push ``commit``; the remote takes it only on top of what it has."""
+        """Push ``commit``; the remote accepts it only on top of its own tip."""
         try:
             lease = f"--force-with-lease={MAIN}:{expected}"  # forces nothing: commit is on top
             spec = f"{commit}:{MAIN}"
-            self._talk(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
+            self._run_git(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
         except git.GitCommandError as error:
             text = without_secrets(f"{error.stdout}\n{error.stderr}")
-            if _BEHIND.search(text):  # git looked at the remote first: nothing was sent
+            if _REMOTE_MOVED.search(text):  # git compared with the remote first: nothing was sent
                 return False
             tip = self.refresh()
             if tip == commit or self.objects.descendant_of(tip, commit):
-                return True  # it was taken, and the answer got lost
+                return True  # the push succeeded, but the answer was lost
             if tip != expected:
                 return False
-            raise self._why_not(text) from None
+            raise self._push_error(text) from None
         self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         return True
 
-    def listed(self, *patterns: str) -> dict[str, str]:
-        """Ask the remote for its references that match, and return name → commit.
+    def list_references(self, *patterns: str) -> dict[str, str]:
+        """Return name → commit of the remote's references that match.
 
         Raises:
-            RemoteAway: where it cannot be reached.
+            RemoteAway: the remote cannot be reached.
         """
         try:
-            out, _ = self._talk(self._git, "ls-remote", "--quiet", "origin", *patterns)
+            out, _ = self._run_git(self._git, "ls-remote", "--quiet", "origin", *patterns)
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
-            raise RemoteAway(f"{self.address} cannot be asked: {_last_line(text)}") from None
+            raise RemoteAway(f"{self.address} cannot be read: {_last_line(text)}") from None
         pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
     def fetch_branches(self, prefix: str) -> None:
-        """Fetch the branches whose names begin so, and forget those that are gone.
+        """Fetch the branches whose names start with ``prefix``; drop those that were deleted.
 
         Raises:
-            RemoteAway: where the remote cannot be reached.
+            RemoteAway: the remote cannot be reached.
         """
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
         try:
-            self._talk(self._git, "fetch", "--no-tags", "--quiet", "--prune", "origin", spec)
+            self._run_git(self._git, "fetch", "--no-tags", "--quiet", "--prune", "origin", spec)
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
             raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
 
     def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
-        """Push one reference and return what the remote had to say.
+        """Push one reference and return git's output.
 
         Args:
-            spec: what goes where.
-            lease: ``<reference>:<commit>``, what the remote must have, or nothing there.
-            options: what the server is told (``git push --push-option``).
+            spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
+            lease: ``<reference>:<commit>``, which commit the remote must have; empty for none.
+            options: options for the server (``git push --push-option``).
 
         Raises:
-            git.GitCommandError: where the remote did not take it.
+            git.GitCommandError: the push failed.
         """
-        told = [f"--push-option={option}" for option in options]
+        push_options = [f"--push-option={option}" for option in options]
         expects = f"--force-with-lease={lease}"
-        out, err = self._talk(self._git, "push", "--porcelain", *told, expects, "origin", spec)
+        out, err = self._run_git(
+            self._git, "push", "--porcelain", *push_options, expects, "origin", spec
+        )
         return f"{out}\n{err}"
 
-    def why_not(self, error: git.GitCommandError) -> StateRepoError:
-        """Return why a push was not taken: to be tried again, or denied."""
-        return self._why_not(without_secrets(f"{error.stdout}\n{error.stderr}"))
+    def push_error(self, error: git.GitCommandError) -> StateRepoError:
+        """Return the error for a failed push: unreachable (try again) or denied."""
+        return self._push_error(without_secrets(f"{error.stdout}\n{error.stderr}"))
 
-    def _talk(
+    def _run_git(
         self, repo: git.Repo, *command: str, urgent: Callable[[], bool] = lambda: False
     ) -> tuple[str, str]:
-        if self._given_up:
-            raise RemoteAway(f"{self.address} was given up")
+        if self._aborted:
+            raise RemoteAway(f"{self.address}: the connection was aborted")
         with repo.git.custom_environment(**ENVIRONMENT):
-            guard = repo.git.execute(  # kept: it ends the process when it goes
+            guard = repo.git.execute(  # keep a reference: it ends the process when it is collected
                 [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
                 as_process=True,
                 start_new_session=True,
             )
         process = guard.proc
         assert process is not None  # noqa: S101 - it was started just now
-        self._talking = process
-        if self._given_up:  # between the first look and now
-            self.give_up()
+        self._process = process
+        if self._aborted:  # since the first check
+            self.abort()
         try:
-            out, err = _heard(process, urgent)
+            out, err = _wait_for(process, urgent)
         finally:
-            self._talking = None
+            self._process = None
         if process.returncode:
             raise git.GitCommandError(list(command), process.returncode, err, out)
         return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
 
-    def give_up(self) -> None:
-        """End what git is waiting for, and start nothing more."""
-        self._given_up = True
-        process = self._talking
+    def abort(self) -> None:
+        """End the running git command and start no more."""
+        self._aborted = True
+        process = self._process
         if process is not None:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGTERM)
 
-    def _why_not(self, text: str) -> StateRepoError:
-        """Tell a push that can be tried again from one that is denied."""
-        refused = _REFUSED.search(text)
-        if refused and not _PASSING.search(refused[1]):
-            said = " ".join(line.strip(" '") for line in _REMOTE_SAYS.findall(text)).strip()
-            reason = f"{refused[1]}: {said}" if said else refused[1]
-            return PushDenied(f"{self.address} takes no push: {reason}")
-        if _NO_RIGHT.search(text):
-            return PushDenied(f"{self.address} takes no push: {_last_line(text)}")
-        reason = refused[1] if refused else _last_line(text)
+    def _push_error(self, text: str) -> StateRepoError:
+        """Return ``PushDenied`` if the remote rejected the push, else ``RemoteAway``."""
+        rejected = _REMOTE_REJECTED.search(text)
+        if rejected and not _TEMPORARY.search(rejected[1]):
+            message = " ".join(line.strip(" '") for line in _REMOTE_MESSAGE.findall(text)).strip()
+            reason = f"{rejected[1]}: {message}" if message else rejected[1]
+            return PushDenied(f"{self.address} rejects the push: {reason}")
+        if _NO_PERMISSION.search(text):
+            return PushDenied(f"{self.address} rejects the push: {_last_line(text)}")
+        reason = rejected[1] if rejected else _last_line(text)
         return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
 
     @property
     def always_current(self) -> bool:
-        """Say no: the remote may have moved since the last fetch."""
+        """Return false: the remote may have moved since the last fetch."""
         return False
 
 
-def _heard(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:
-    """Return what git says; end it where it takes too long, or something urgent comes."""
+def _wait_for(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:
+    """Return git's output; end git if it takes too long or something is urgent."""
     end = time.monotonic() + TIMEOUT_S
     while True:
         try:
@@ -244,14 +251,14 @@ def _heard(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tupl
             hurry = urgent()
             if not hurry and time.monotonic() < end:
                 continue
-            heard = _ended(process)
+            output = _terminate(process)
             if hurry:
-                raise CutShort("a look at the remote was ended for a demand") from None
-            return heard
+                raise FetchInterrupted("the fetch was interrupted by a demand") from None
+            return output
 
 
-def _ended(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
-    """End git and all that it started; kindly first, so that it takes its locks with it."""
+def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
+    """End git and its child processes; SIGTERM first, so that git removes its locks."""
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -261,7 +268,7 @@ def _ended(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
 
 
 def _last_line(text: str) -> str:
-    text = text.replace("stderr: '", "")  # GitPython's, in front of what git said
+    text = text.replace("stderr: '", "")  # GitPython's prefix
     lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
     fatal = [line for line in lines if line.startswith(("fatal:", "error:", "remote:", "!"))]
     return (fatal or lines or ["git gave no reason"])[-1]

@@ -1,11 +1,9 @@
-"""What a rollback needs of history: a commit's claims, what people changed since, and who asks."""
+"""The commit that a rollback returns to: its claims, and which configuration changed since."""
 
 from __future__ import annotations
 
-import getpass
 from datetime import datetime, timezone
 
-from pygit2 import Config as GitConfig
 from pygit2 import Oid, Repository
 
 from demandops.config.config import CONFIG_ROOTS
@@ -19,15 +17,15 @@ from demandops.staterepo.git.tree import commit_of
 
 
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
-    """Return the request to go back to a commit.
+    """Return the request to roll back to a commit.
 
     Args:
         to: the commit.
         more: the other fields of :class:`Restoration`.
 
     Raises:
-        InvalidInput: with every claim file of that commit that is not valid.
-        StateRepoError: where there is no such commit.
+        InvalidInput: every fault of that commit's claim files.
+        StateRepoError: there is no such commit.
     """
     commit = commit_of(repo, to)
     claims: list[Claim] = []
@@ -51,26 +49,8 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     )
 
 
-def configured_since(repo: Repository, commit: str | Oid, tip: str | Oid) -> list[str]:
-    """Return the files of people that are not what they were at ``commit``."""
+def config_files_changed_since(repo: Repository, commit: str | Oid, tip: str | Oid) -> list[str]:
+    """Return the configuration files that changed since ``commit``."""
     before, after = commit_of(repo, commit).tree, commit_of(repo, tip).tree
     changed = trees.differences(repo, before, after, "")
     return sorted(path for path, _ in changed if path.split("/")[0] in CONFIG_ROOTS)
-
-
-def person(repo: Repository) -> tuple[str, str]:
-    """Return name and e-mail address of who runs this, as git has them, else of the login."""
-    settings = repo.config.snapshot()
-    try:
-        login = getpass.getuser()
-    except (KeyError, OSError):  # a container's user without an entry
-        login = "unknown"
-    name = _configured(settings, "user.name") or login
-    return name, _configured(settings, "user.email") or f"{login}@demandops.invalid"
-
-
-def _configured(settings: GitConfig, key: str) -> str:
-    try:
-        return settings[key] or ""
-    except KeyError:
-        return ""

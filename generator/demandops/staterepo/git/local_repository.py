@@ -1,4 +1,4 @@
-"""A state repo on this disk: a bare repository, written in place and fsynced."""
+"""The state repo as a bare repository on this disk, written in place and fsynced."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _STALE_LOCK_S = 5.0
 log = logging.getLogger("demandops")
 
 
-class BareRepository(StateRepository):
+class LocalRepository(StateRepository):
     """A bare repository on this disk, written in place and fsynced."""
 
     def __init__(self, path: Path) -> None:
@@ -29,7 +29,7 @@ class BareRepository(StateRepository):
             self.objects = Repository(str(path))
         except pygit2.GitError:
             raise StateRepoError(
-                f"{path} is no Git repository; make one with `demandops init {path} --bare`"
+                f"{path} is not a Git repository; make one with `demandops init {path} --bare`"
             ) from None
         if not self.objects.is_bare:
             _refuse_checked_out(path)
@@ -40,17 +40,17 @@ class BareRepository(StateRepository):
             )
 
     def tip(self) -> Oid:
-        """Return the branch's commit, read anew: others may write here too."""
+        """Return the branch's commit, read each time because other processes may move it."""
         target = self.objects.references[MAIN].target
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target
 
     def refresh(self) -> Oid:
-        """Return the tip; it is never behind."""
+        """Return the tip, which is always current."""
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Move the branch if it still is at ``expected`` (checked under Git's own lock)."""
+        """Move the branch if it still is at ``expected``, checked under Git's lock."""
         reference = self.objects.references[MAIN]
         if reference.target != expected:
             return False
@@ -58,11 +58,11 @@ class BareRepository(StateRepository):
             reference.set_target(commit, "demandops")
         except (pygit2.GitError, OSError):
             self._break_stale_lock()
-            return False  # another writer holds the lock or was first: judge anew
+            return False  # another writer holds the lock or was first: evaluate again
         return True
 
     def _break_stale_lock(self) -> None:
-        """Remove a branch's lock that a killed process left: Git holds one for milliseconds."""
+        """Remove the branch's lock if a killed process left it: Git holds it for milliseconds."""
         lock = Path(self.objects.path) / f"{MAIN}.lock"
         with suppress(FileNotFoundError):
             if time.time() - lock.stat().st_mtime > _STALE_LOCK_S:
@@ -71,7 +71,7 @@ class BareRepository(StateRepository):
 
     @property
     def always_current(self) -> bool:
-        """Say yes: there is no copy that could be behind."""
+        """Return true: there is no copy that could be out of date."""
         return True
 
 
@@ -84,6 +84,6 @@ def _refuse_checked_out(path: Path) -> None:
         ]
     if MAIN in heads:
         raise StateRepoError(
-            f"{path} has '{MAIN_BRANCH}' checked out, and its files would fall behind the commits; "
+            f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
             f"use a bare clone: git clone --bare {path} {path}.git"
         )
