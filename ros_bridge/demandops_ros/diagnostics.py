@@ -10,7 +10,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from demandops.service import Generator
-from demandops.service.follower import Condition
+from demandops.service.remote_status import Condition
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 

@@ -18,7 +18,7 @@ from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_status import RolloutStatus
 from demandops.service import Generator
-from demandops.service.push_listener import Webhook, read_secret
+from demandops.service.push_webhook import Webhook, read_secret
 from demandops.service.timing.polling import DEFAULT_INTERVAL, interval_s
 from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from rcl_interfaces.msg import ParameterDescriptor

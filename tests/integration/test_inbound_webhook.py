@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 from demandops.errors import InvalidInput
 from demandops.service import push_listener
-from demandops.service.push_listener import Webhook, read_secret
+from demandops.service.push_webhook import Webhook, read_secret
 
 SECRET = b"s3cret-of-the-hook"
 BODY = b'{"ref": "refs/heads/main"}'

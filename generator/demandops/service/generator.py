@@ -11,9 +11,9 @@ from pathlib import Path
 from demandops import settings
 from demandops.config.config import Config
 from demandops.errors import DemandOpsError, ShuttingDown, StateRepoError
-from demandops.service import follower
 from demandops.service.approvals.approvals import Approvals
 from demandops.service.demand_queue import DemandQueue
+from demandops.service.remote_status import Condition
 from demandops.service.ticket import Listener, Ticket, handed_in
 from demandops.service.worker import Worker
 from demandops.staterepo.git import connect
@@ -98,9 +98,15 @@ class Generator:
         return self._settler.snapshot
 
     @property
-    def condition(self) -> follower.Condition:
+    def condition(self) -> Condition:
         """How it is with the state repo; safe to read from any thread."""
-        return follower.condition(self._settler.follower.link, self.snapshot, self._waiting)
+        snapshot = self.snapshot
+        return Condition(
+            self._settler.follower.link.contact,
+            snapshot.problems,
+            self._waiting.unpublished,
+            str(snapshot.commit),
+        )
 
     def look(self) -> None:
         """Have the state repo looked at now, for somebody pushed to it; from any thread."""

@@ -16,7 +16,7 @@ from demandops.errors import ShuttingDown
 from demandops.service.approvals.approvals import Approvals, Deferred
 from demandops.service.demand_queue import DemandQueue
 from demandops.service.evaluation import Evaluator, Result
-from demandops.service.follower import Follower
+from demandops.service.fetcher import Follower
 from demandops.service.ticket import Receipt, Ticket
 from demandops.service.timing.backoff import LIMIT_EMBEDDED, LIMIT_REMOTE, Backoff
 from demandops.service.timing.lease_expiry import LONGEST_WAIT_S, Expiries

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 
 import pytest
-from demandops.service.timing.polling import Link, PollTimer, interval_s
+from demandops.service.remote_status import Link
+from demandops.service.timing.polling import PollTimer, interval_s
 
 
 class Clock:

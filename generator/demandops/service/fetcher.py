@@ -10,11 +10,11 @@ import logging
 import random
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from demandops.errors import Fault, StateRepoError
 from demandops.service.demand_queue import DemandQueue
-from demandops.service.timing.polling import Contact, Link, PollTimer
+from demandops.service.remote_status import Link
+from demandops.service.timing.polling import PollTimer
 from demandops.staterepo.git.repository import CutShort, StateRepository
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.write import commit_line
@@ -23,20 +23,6 @@ log = logging.getLogger("demandops")
 
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class Condition:
-    """How it is with the state repo, for diagnostics.
-
-    ``problems`` are what is not valid there, ``waiting`` the demands that are kept in the outbox,
-    ``commit`` the newest commit that was taken in.
-    """
-
-    contact: Contact
-    problems: tuple[Fault, ...]
-    waiting: int
-    commit: str
 
 
 class Follower:
@@ -149,8 +135,3 @@ class Follower:
         for file in sorted({one.file for one in self._logged} - {one.file for one in found}):
             log.info("%s: what was not valid is mended", file or "the state repo")
         self._logged = frozenset(found)
-
-
-def condition(link: Link, snapshot: Snapshot, waiting: DemandQueue) -> Condition:
-    """Return how it is with the state repo."""
-    return Condition(link.contact, snapshot.problems, waiting.unpublished, str(snapshot.commit))
