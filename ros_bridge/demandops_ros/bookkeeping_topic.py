@@ -60,7 +60,7 @@ class BookkeepingTopic:
         self._publisher = node.create_publisher(BookkeepingMessage, "~/bookkeeping", _LATCHED)
         self._changed, self._closed = Event(), Event()
         self._changed.set()
-        generator.watch(lambda config: self._changed.set())
+        generator.on_publish(lambda config: self._changed.set())
         Thread(target=self._run, name="demandops-bookkeeping-topic", daemon=True).start()
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from demandops.service import Generator
-from demandops.service.remote_status import Condition
+from demandops.service.remote_status import StateRepoStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
@@ -29,36 +29,36 @@ class Diagnostics:
     def _publish(self) -> None:
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        message.status = statuses(self._generator.condition, self._generator.address)
+        message.status = statuses(self._generator.state_repo_status, self._generator.address)
         self._publisher.publish(message)
 
 
-def statuses(condition: Condition, address: str) -> list[DiagnosticStatus]:
+def statuses(condition: StateRepoStatus, address: str) -> list[DiagnosticStatus]:
     """Return the two states that a condition comes to."""
     return [_of_state_repo(condition, address), _of_configuration(condition, address)]
 
 
-def _of_state_repo(condition: Condition, address: str) -> DiagnosticStatus:
-    contact = condition.contact
+def _of_state_repo(condition: StateRepoStatus, address: str) -> DiagnosticStatus:
+    contact = condition.remote
     level, text = DiagnosticStatus.OK, "reachable"
-    if contact.denied:
-        level, text = DiagnosticStatus.ERROR, contact.denied
-    if contact.trouble:
+    if contact.push_denied:
+        level, text = DiagnosticStatus.ERROR, contact.push_denied
+    if contact.unreachable:
         # while nobody waits for it only people's changes are late
-        level = DiagnosticStatus.ERROR if condition.waiting else DiagnosticStatus.WARN
-        text = contact.trouble
+        level = DiagnosticStatus.ERROR if condition.unpublished else DiagnosticStatus.WARN
+        text = contact.unreachable
     values = {
-        "reachable": str(not contact.trouble).lower(),
-        "away since": _moment(contact.since),
-        "last reached": _moment(contact.reached),
-        "last push": _moment(contact.pushed),
-        "demands in the outbox": str(condition.waiting),
+        "reachable": str(not contact.unreachable).lower(),
+        "away since": _moment(contact.unreachable_since),
+        "last reached": _moment(contact.last_reached),
+        "last push": _moment(contact.last_push),
+        "demands in the outbox": str(condition.unpublished),
         "commit": condition.commit,
     }
     return _status("demandops: state repo", address, level, text, values)
 
 
-def _of_configuration(condition: Condition, address: str) -> DiagnosticStatus:
+def _of_configuration(condition: StateRepoStatus, address: str) -> DiagnosticStatus:
     problems = [str(problem) for problem in condition.problems]
     level, text = DiagnosticStatus.OK, "all files are valid"
     if problems:

@@ -132,7 +132,7 @@ class DemandNode(Node):  # type: ignore[misc]
         reason = "shutting down" if self._stopping else ""
         if len(self._open) >= self._generator.queue_limit:
             reason = "too many are waiting"
-            trouble = self._generator.condition.contact.trouble
+            trouble = self._generator.state_repo_status.remote.unreachable
             reason += f" for the state repo: {trouble}" if trouble else ""
         if reason:
             self.get_logger().warning(f"goal '{form.name(goal)}' rejected: {reason}")

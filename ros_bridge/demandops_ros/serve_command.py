@@ -18,8 +18,8 @@ from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_status import RolloutStatus
 from demandops.service import Generator
-from demandops.service.push_webhook import Webhook, read_secret
-from demandops.service.timing.polling import DEFAULT_INTERVAL, interval_s
+from demandops.service.push_webhook import PushWebhook, read_secret
+from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
 from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
@@ -126,13 +126,13 @@ def serve(
                 settings["state_repo"],
                 progress=tell,
                 with_targets=bool(clusters),
-                fetch_interval=interval_s(settings["fetch_interval"]),
+                fetch_interval=parse_interval(settings["fetch_interval"]),
                 signing_key=signing_key,
             )
-        waker = reconcile_trigger.ReconcileTrigger(clusters, generator.changed)
-        generator.watch(waker)
+        waker = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
+        generator.on_publish(waker)
         waker(generator.snapshot.state.config)  # an earlier run may have ended right after a push
-        hook = Webhook(webhook, secret, generator.look) if webhook else None
+        hook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
         status = RolloutStatus(clusters, generator) if clusters else None
         _run(generator, settings, status, hook)
         waker.close()
@@ -167,7 +167,7 @@ def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str,
             "parameter state_repo"
         )
     try:
-        interval_s(values["fetch_interval"])
+        parse_interval(values["fetch_interval"])
     except ValueError as error:
         raise click.UsageError(f"fetch interval: {error}") from None
     if values["answer"] not in LEVELS:
@@ -190,7 +190,7 @@ def _run(
     generator: Generator,
     settings: dict[str, Any],
     status: RolloutStatus | None,
-    hook: Webhook | None,
+    hook: PushWebhook | None,
 ) -> None:
     node = DemandNode(
         generator,

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
-from demandops.service.ticket import Receipt, Record, Ticket, left_over
+from demandops.service.ticket import ProposalRecord, Receipt, Ticket, ticket_from_journal
 from demandops.staterepo.write.journal import Journal
 
 TAKEN_BACK = "the demand was taken back before it was committed"
@@ -26,12 +26,12 @@ class DemandQueue:
     """
 
     def __init__(self, outbox: Journal, limit: int) -> None:
-        self._outbox = outbox
+        self._journal = outbox
         self._limit = limit
         self._changed = threading.Condition()
-        self._queue = deque(left_over(entry) for entry in outbox.pending.values())
+        self._queue = deque(ticket_from_journal(entry) for entry in outbox.pending.values())
         self._tickets = {ticket.operation: ticket for ticket in self._queue}
-        self._unkept: list[Ticket] = []
+        self._not_journaled: list[Ticket] = []
         self._closed = self._woken = False
         self.blocked = ""
 
@@ -42,14 +42,14 @@ class DemandQueue:
             return tuple(self._tickets)
 
     @property
-    def anything(self) -> bool:
+    def has_waiting(self) -> bool:
         """Whether a demand waits to be taken up."""
         return bool(self._queue)
 
     @property
     def unpublished(self) -> int:
         """How many demands the outbox holds, but for those that await approval."""
-        return sum(1 for entry in self._outbox.pending.values() if entry.proposal is None)
+        return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
 
     def add(self, ticket: Ticket) -> None:
         """Put a demand in.
@@ -66,7 +66,7 @@ class DemandQueue:
                     f"{self._limit} demands are waiting already{why}; send it again later"
                 )
             self._queue.append(ticket)
-            self._unkept.append(ticket)
+            self._not_journaled.append(ticket)
             self._tickets[ticket.operation] = ticket
             self._changed.notify()
 
@@ -91,11 +91,11 @@ class DemandQueue:
             self._changed.notify()
 
     @property
-    def urgent(self) -> bool:
+    def must_not_wait(self) -> bool:
         """Whether something is to do that must not wait for a look at the remote."""
         return bool(self._queue) or self._closed
 
-    def keep(self, timeout: float) -> list[Ticket]:
+    def journal_arrivals(self, timeout: float) -> list[Ticket]:
         """Wait for demands that come in and journal them, for nothing gets on at the moment.
 
         Returns:
@@ -103,23 +103,23 @@ class DemandQueue:
             woken.
         """
         with self._changed:
-            if not self._unkept and not self._woken:
+            if not self._not_journaled and not self._woken:
                 self._changed.wait(timeout)
             self._woken = False
-            return self._journal()
+            return self._journal_new()
 
-    def _journal(self) -> list[Ticket]:
+    def _journal_new(self) -> list[Ticket]:
         """Put what came in since the last time into the outbox."""
         fresh = [
             ticket
-            for ticket in self._unkept
-            if ticket.state == "waiting" and ticket.operation not in self._outbox.pending
+            for ticket in self._not_journaled
+            if ticket.state == "waiting" and ticket.operation not in self._journal.pending
         ]
-        self._outbox.append(ticket.entry() for ticket in fresh)
-        self._unkept = []
+        self._journal.append(ticket.journal_entry() for ticket in fresh)
+        self._not_journaled = []
         return fresh
 
-    def propose(self, ticket: Ticket, record: Record) -> bool:
+    def set_proposal(self, ticket: Ticket, record: ProposalRecord) -> bool:
         """Keep on the disk what a demand awaits approval on; false where it was taken back.
 
         Until it is booked, a demand that awaits approval can be taken back.
@@ -128,7 +128,7 @@ class DemandQueue:
             if ticket.state == "withdrawn":
                 return False
             ticket.state, ticket.proposal = "waiting", record
-            self._outbox.append([ticket.entry()])
+            self._journal.append([ticket.journal_entry()])
         return True
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
@@ -136,17 +136,17 @@ class DemandQueue:
         with self._changed:
             for ticket in tickets:
                 ticket.proposal = None
-                self._outbox.append([ticket.entry()])
+                self._journal.append([ticket.journal_entry()])
                 self._queue.append(ticket)
             self._changed.notify()
 
-    def take_up(self, batch: list[Ticket], limit: int) -> None:
+    def take(self, batch: list[Ticket], limit: int) -> None:
         """Move what waits into the batch, up to ``limit`` in all; all that waits is journaled."""
         with self._changed:  # held while journaling: a demand is taken back before it or after
             room = limit - len(batch)
             fresh = [self._queue.popleft() for _ in range(min(room, len(self._queue)))]
             batch += fresh
-            self._journal()
+            self._journal_new()
 
     def withdraw(self, operation: str) -> bool:
         """Take a demand back. False once it is committed, or was never known."""
@@ -155,48 +155,48 @@ class DemandQueue:
             if ticket is None or ticket.state != "waiting":
                 return ticket is not None and ticket.state == "withdrawn"
             if ticket.proposal is not None:
-                self._mark(ticket, TAKEN_BACK)
+                self._withdraw_proposed(ticket, TAKEN_BACK)
                 return True
             ticket.state = "withdrawn"
-            self._outbox.done([operation], durably=True)  # nor may a restart take it up
+            self._journal.done([operation], durably=True)  # nor may a restart take it up
             self._woken = True
             self._changed.notify()  # it is answered although nothing gets on
         return True
 
-    def retract(self, tickets: Iterable[Ticket], reason: str) -> None:
+    def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
         """Mark demands that await approval as ones to go; a restart knows it as well."""
         with self._changed:
             for ticket in tickets:
-                self._mark(ticket, reason)
+                self._withdraw_proposed(ticket, reason)
 
-    def _mark(self, ticket: Ticket, reason: str) -> None:
+    def _withdraw_proposed(self, ticket: Ticket, reason: str) -> None:
         """Kept in the outbox until the branch is gone: nobody may merge what was taken back."""
         if ticket.proposal is None or ticket.state != "waiting":
             return
         ticket.state = "withdrawn"
         ticket.proposal = replace(ticket.proposal, withdrawn=reason)
-        self._outbox.append([ticket.entry()])
+        self._journal.append([ticket.journal_entry()])
         self._woken = True
         self._changed.notify()
 
-    def hold(self, ticket: Ticket) -> bool:
+    def mark_committed(self, ticket: Ticket) -> bool:
         """Make a demand one that cannot be taken back any more; false where it was."""
         with self._changed:
             if ticket.state != "withdrawn":
                 ticket.state = "committed"
             return ticket.state == "committed"
 
-    def dismiss_withdrawn(self, batch: list[Ticket]) -> None:
+    def answer_withdrawn(self, batch: list[Ticket]) -> None:
         """Answer those that were taken back at once: the remote may be away for long.
 
         Not one that was proposed: its branch has to go first.
         """
         with self._changed:
-            gone = [ticket for ticket in self._queue if _is_dismissed(ticket)]
+            gone = [ticket for ticket in self._queue if _is_withdrawn(ticket)]
             if gone:
-                self._queue = deque(one for one in self._queue if not _is_dismissed(one))
-        withdrawn = [ticket for ticket in batch if _is_dismissed(ticket)]
-        batch[:] = [ticket for ticket in batch if not _is_dismissed(ticket)]
+                self._queue = deque(one for one in self._queue if not _is_withdrawn(one))
+        withdrawn = [ticket for ticket in batch if _is_withdrawn(ticket)]
+        batch[:] = [ticket for ticket in batch if not _is_withdrawn(ticket)]
         for ticket in [*withdrawn, *gone]:
             self._forget(ticket)
             ticket.future.set_exception(Withdrawn(TAKEN_BACK))
@@ -205,11 +205,11 @@ class DemandQueue:
         """Tell each what came of it; the outbox forgets them."""
         results = list(results)
         with self._changed:
-            self._outbox.done(ticket.operation for ticket, _ in results)
+            self._journal.done(ticket.operation for ticket, _ in results)
         for ticket, result in results:
             self._forget(ticket)
             if isinstance(result, Receipt):
-                ticket.tell("pushed", f"pushed {result.commit}")
+                ticket.notify("pushed", f"pushed {result.commit}")
                 ticket.future.set_result(result)
             else:
                 ticket.future.set_exception(result)
@@ -219,7 +219,7 @@ class DemandQueue:
         batch = list(batch)
         if not keep:
             with self._changed, suppress(OSError):  # a full disk must not withhold the answer
-                self._outbox.done(ticket.operation for ticket in batch)
+                self._journal.done(ticket.operation for ticket in batch)
         for ticket in batch:
             self._forget(ticket)
             ticket.future.set_exception(error)
@@ -230,5 +230,5 @@ class DemandQueue:
             self._tickets.pop(ticket.operation, None)
 
 
-def _is_dismissed(ticket: Ticket) -> bool:
+def _is_withdrawn(ticket: Ticket) -> bool:
     return ticket.state == "withdrawn" and ticket.proposal is None

@@ -15,9 +15,9 @@ from demandops.demand import decommission_goal
 from demandops.demand.demand_request import Operation
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
-from demandops.service.approvals.approvals import GIVEN_UP, Approvals, Deferred
+from demandops.service.approvals.approvals import RELEASED, Approvals, Deferred
 from demandops.service.demand_queue import TAKEN_BACK, DemandQueue
-from demandops.service.rollout_targets import of_decision as targets_of
+from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import Receipt, Ticket
 from demandops.service.timing.rate_limit import RateLimit
 from demandops.staterepo.git.repository import StateRepository
@@ -41,11 +41,11 @@ class Evaluator:
         approvals: Approvals,
         with_targets: bool,
     ) -> None:
-        self._repository, self._waiting, self._approvals = repository, waiting, approvals
+        self._repository, self._queue, self._approvals = repository, waiting, approvals
         self._with_targets = with_targets
-        self._throttle = RateLimit()
+        self._rate_limit = RateLimit()
 
-    def __call__(
+    def evaluate(
         self,
         line: commit_line.CommitLine,
         ticket: Ticket,
@@ -62,37 +62,39 @@ class Evaluator:
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
         if ticket.operation in arrived:
-            return _published_before(ticket, arrived[ticket.operation])
+            return _receipt_of_published(ticket, arrived[ticket.operation])
         try:
-            gone = self._approvals.gave_up(ticket, line.head.state, earlier)
+            gone = self._approvals.released_in_batch(ticket, line.head.state, earlier)
             earlier[:] = [
-                (t, Withdrawn(GIVEN_UP) if t.operation in gone else r) for t, r in earlier
+                (t, Withdrawn(RELEASED) if t.operation in gone else r) for t, r in earlier
             ]
             goal = ticket.goal
             if rollback_goal.is_rollback(goal):
-                goal = rollback_goal.understood(goal, self._repository, line.start)
+                goal = rollback_goal.to_restoration(goal, self._repository, line.start)
             decision = decide(
                 line.head.state,
                 goal,
                 ticket.received,
                 line.read,
-                lambda stage: ticket.tell(stage, stage),
-                lambda request, config: self._throttle.faults(
+                lambda stage: ticket.notify(stage, stage),
+                lambda request, config: self._rate_limit.faults(
                     request, config, ticket.operation, ticket.received
                 ),
             )
             if decision.approval:
                 return Deferred(decision)
-            if not self._waiting.hold(ticket):
+            if not self._queue.mark_committed(ticket):
                 return Withdrawn(TAKEN_BACK)
-            self._approvals.replaced_by(decision.request)
+            self._approvals.withdraw_replaced(decision.request)
             before = line.head.state.ledger
-            targets = targets_of(before, decision) if self._with_targets else ()
+            targets = targets_of_decision(before, decision) if self._with_targets else ()
             return replace(_commit(line, ticket, decision), targets=targets)
         except InvalidInput as error:
-            if self._approvals.released(ticket):  # what was proposed, and nothing else
+            if self._approvals.has_released_a_proposal(
+                ticket
+            ):  # what was proposed, and nothing else
                 line.note(ticket.operation, "Unchanged")
-                return _released(ticket, str(line.head.commit))
+                return _receipt_of_released(ticket, str(line.head.commit))
             line.note(ticket.operation, "Refused")
             return error
         except SigningFailed as error:
@@ -101,7 +103,9 @@ class Evaluator:
             log.exception("a fault of the generator, at demand %s", ticket.operation)
             return StateRepoError(f"a fault of the generator: {error!r}; its log says more")
 
-    def arrived(self, start: Snapshot, batch: list[Ticket]) -> dict[str, commit_log.Arrival]:
+    def published_before(
+        self, start: Snapshot, batch: list[Ticket]
+    ) -> dict[str, commit_log.Arrival]:
         """Return operation id → arrival of demands that were published although nobody was told.
 
         The connection may have been cut, or the process killed, after the remote took the push.
@@ -116,7 +120,7 @@ class Evaluator:
 def _commit(line: commit_line.CommitLine, ticket: Ticket, decision: Decision) -> Receipt:
     if decision.files:
         commit = line.commit(decision, ticket.operation, ticket.received, _now())
-        ticket.tell("committed", f"committed {commit}")
+        ticket.notify("committed", f"committed {commit}")
     else:
         commit = str(line.head.commit)
         line.note(ticket.operation, "Unchanged")
@@ -132,7 +136,7 @@ def _commit(line: commit_line.CommitLine, ticket: Ticket, decision: Decision) ->
     )
 
 
-def _published_before(ticket: Ticket, arrival: commit_log.Arrival) -> Receipt | DemandOpsError:
+def _receipt_of_published(ticket: Ticket, arrival: commit_log.Arrival) -> Receipt | DemandOpsError:
     if arrival.outcome == "refused":
         message = "was refused when the connection was cut; send it again to hear why"
         return Refused([fault("", message, code="refused")])
@@ -148,7 +152,7 @@ def _published_before(ticket: Ticket, arrival: commit_log.Arrival) -> Receipt | 
     return Receipt(ticket.operation, str(name), outcome, arrival.commit)
 
 
-def _released(ticket: Ticket, commit: str) -> Receipt:
+def _receipt_of_released(ticket: Ticket, commit: str) -> Receipt:
     goal = ticket.goal
     name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
     return Receipt(ticket.operation, str(name), "released", commit)

@@ -1,6 +1,6 @@
 """Following the state repo: what others publish there is taken in while no demand comes.
 
-Belongs to the worker thread, but for :meth:`Follower.nudge` and what it tells of its link. Demands
+Belongs to the worker thread, but for :meth:`Fetcher.nudge` and what it tells of its link. Demands
 go first: a look gives way to them, for their own push shows what is new as well.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 
 from demandops.errors import Fault, StateRepoError
 from demandops.service.demand_queue import DemandQueue
-from demandops.service.remote_status import Link
+from demandops.service.remote_status import RemoteMonitor
 from demandops.service.timing.polling import PollTimer
 from demandops.staterepo.git.repository import CutShort, StateRepository
 from demandops.staterepo.load.snapshot import Snapshot
@@ -25,7 +25,7 @@ _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
 
 
-class Follower:
+class Fetcher:
     """Looks at the state repo at an interval, and takes in what is new there."""
 
     def __init__(
@@ -46,27 +46,27 @@ class Follower:
             taken: told of a line that is published.
         """
         self._repository = repository
-        self._waiting = waiting
-        self._line, self._taken = line, taken
-        self._looks = PollTimer(fetch_interval, embedded=repository.always_current)
+        self._queue = waiting
+        self._new_commit_line, self._on_published = line, taken
+        self._timer = PollTimer(fetch_interval, embedded=repository.always_current)
         self._logged: frozenset[Fault] = frozenset()
         self._given_up = threading.Event()
-        self.link = Link(repository.address)
+        self.remote = RemoteMonitor(repository.address)
 
-    def nudge(self) -> None:
+    def fetch_now(self) -> None:
         """Have the state repo looked at now; from any thread."""
-        self._looks.nudge()
-        self._waiting.wake()
+        self._timer.request()
+        self._queue.wake()
 
-    def give_up(self) -> None:
+    def stop_retrying(self) -> None:
         """Try nothing again; from any thread."""
         self._given_up.set()
 
-    def pause(self) -> float | None:
+    def seconds_until_due(self) -> float | None:
         """Return the seconds until the next look is due; nothing: none is."""
-        return self._looks.pause()
+        return self._timer.seconds_until_due()
 
-    def notice(self, known: Snapshot, due: bool) -> bool:
+    def fetch_if_due(self, known: Snapshot, due: bool) -> bool:
         """Take in what others published, where it is time to look or it costs nothing.
 
         Args:
@@ -77,56 +77,56 @@ class Follower:
             Whether the state repo was reached, or need not be.
         """
         try:
-            if self._looks.begin():
-                self._repository.look(lambda: self._waiting.urgent)
+            if self._timer.start_if_due():
+                self._repository.look(lambda: self._queue.must_not_wait)
             elif not (self._repository.always_current or due):
                 return True
             new = due or self._repository.tip() != known.commit
-            self.in_touch(pushed=new and self._take_in())
+            self.record_reached(pushed=new and self._carry_out_changes())
         except CutShort:
-            self._looks.again()
+            self._timer.interrupted()
         except StateRepoError as error:
-            self.out_of_touch(error)
+            self.record_unreachable(error)
             return False
         return True
 
-    def catch_up(self) -> None:
+    def carry_out_changes(self) -> None:
         """Try again what people changed and could not be carried out: a release may allow it."""
         try:
-            self._take_in()
+            self._carry_out_changes()
         except StateRepoError as error:
-            self.out_of_touch(error)
+            self.record_unreachable(error)
 
-    def _take_in(self) -> bool:
+    def _carry_out_changes(self) -> bool:
         """Bring the snapshot to the newest tip, and publish what follows from people's changes.
 
         Returns:
             Whether there was something to publish.
         """
         for _ in range(_TRIES):
-            line = self._line()
+            line = self._new_commit_line()
             if line.publish():
-                self._taken(line)
+                self._on_published(line)
                 return line.head.commit != line.start.commit
             self._repository.refresh()
             self._given_up.wait(random.uniform(0, _LONGEST_PAUSE_S))  # noqa: S311 - no secret
         return False  # others are quicker, and follow people's changes as this generator would
 
-    def in_touch(self, *, pushed: bool) -> None:
+    def record_reached(self, *, pushed: bool) -> None:
         """Note that the state repo was reached."""
-        self._waiting.blocked = ""
-        self.link.reached(pushed=pushed)
-        self._looks.done(reached=True)
+        self._queue.blocked = ""
+        self.remote.record_reached(pushed=pushed)
+        self._timer.finished(reached=True)
 
-    def out_of_touch(self, error: StateRepoError) -> None:
+    def record_unreachable(self, error: StateRepoError) -> None:
         """Note that the state repo could not be reached, or takes nothing."""
         if self._given_up.is_set():  # nobody tries again, so it is no news
             return
-        self._waiting.blocked = str(error)
-        self.link.lost(str(error))
-        self._looks.done(reached=False)
+        self._queue.blocked = str(error)
+        self.remote.record_unreachable(str(error))
+        self._timer.finished(reached=False)
 
-    def tell(self, problems: Iterable[Fault]) -> None:
+    def log_problems(self, problems: Iterable[Fault]) -> None:
         """Log what is not valid, and what is again, once each."""
         found = list(dict.fromkeys(problems))
         for one in found:

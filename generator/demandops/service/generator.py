@@ -13,8 +13,8 @@ from demandops.config.config import Config
 from demandops.errors import DemandOpsError, ShuttingDown, StateRepoError
 from demandops.service.approvals.approvals import Approvals
 from demandops.service.demand_queue import DemandQueue
-from demandops.service.remote_status import Condition
-from demandops.service.ticket import Listener, Ticket, handed_in
+from demandops.service.remote_status import StateRepoStatus
+from demandops.service.ticket import Listener, Ticket, new_ticket
 from demandops.service.worker import Worker
 from demandops.staterepo.git import connect
 from demandops.staterepo.git.signing import Signer
@@ -71,46 +71,46 @@ class Generator:
         self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
-        self._waiting = DemandQueue(self._slot.outbox, queue_limit)
-        self._watchers: list[Callable[[Config], None]] = []
+        self._queue = DemandQueue(self._slot.outbox, queue_limit)
+        self._listeners: list[Callable[[Config], None]] = []
         self._approvals = Approvals(
-            repository, self._waiting, with_targets, settings.forge_token_file()
+            repository, self._queue, with_targets, settings.forge_token_file()
         )
-        self._settler = Worker(
+        self._worker = Worker(
             repository,
             snapshot,
-            self._waiting,
-            self._tell_watchers,
+            self._queue,
+            self._call_listeners,
             with_targets,
             self._approvals,
             fetch_interval,
         )
         self._finished: Future[bool] | None = None
         self._stop_lock = threading.Lock()
-        for operation in self._waiting.operations:
+        for operation in self._queue.operations:
             log.info("taking up demand %s from the outbox", operation)
-        self._worker = threading.Thread(target=self._run, name="demandops-writer", daemon=True)
-        self._worker.start()
+        self._thread = threading.Thread(target=self._run, name="demandops-writer", daemon=True)
+        self._thread.start()
 
     @property
     def snapshot(self) -> Snapshot:
         """The newest published state; safe to read from any thread."""
-        return self._settler.snapshot
+        return self._worker.snapshot
 
     @property
-    def condition(self) -> Condition:
+    def state_repo_status(self) -> StateRepoStatus:
         """How it is with the state repo; safe to read from any thread."""
         snapshot = self.snapshot
-        return Condition(
-            self._settler.follower.link.contact,
+        return StateRepoStatus(
+            self._worker.fetcher.remote.status,
             snapshot.problems,
-            self._waiting.unpublished,
+            self._queue.unpublished,
             str(snapshot.commit),
         )
 
-    def look(self) -> None:
+    def fetch_now(self) -> None:
         """Have the state repo looked at now, for somebody pushed to it; from any thread."""
-        self._settler.follower.nudge()
+        self._worker.fetcher.fetch_now()
 
     def submit(
         self,
@@ -132,10 +132,10 @@ class Generator:
         Raises:
             ShuttingDown, QueueFull: where the demand is not taken at all.
         """
-        ticket = handed_in(goal, operation, listener)
+        ticket = new_ticket(goal, operation, listener)
         if not ticket.future.done():
             ticket.base = str(self.snapshot.commit)
-            self._waiting.add(ticket)
+            self._queue.add(ticket)
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:
@@ -146,7 +146,7 @@ class Generator:
         """Tell whether two commits hold the same under ``path``; from any thread."""
         return self._repository.unchanged(commit, other, path)
 
-    def changed(self, since: str) -> tuple[str, list[str] | None]:
+    def changes_since(self, since: str) -> tuple[str, list[str] | None]:
         """Return the newest published commit and which paths changed since another.
 
         The paths are None where that other is not known. From any thread.
@@ -156,17 +156,17 @@ class Generator:
 
     def withdraw(self, operation: str) -> bool:
         """Take a demand back. False once it is committed, or was never known."""
-        return self._waiting.withdraw(operation)
+        return self._queue.withdraw(operation)
 
-    def watch(self, on_published: Callable[[Config], None]) -> None:
+    def on_publish(self, on_published: Callable[[Config], None]) -> None:
         """Have ``on_published`` called after every push, in the worker thread.
 
         It is given the configuration in force and must return at once.
         """
-        self._watchers.append(on_published)
+        self._listeners.append(on_published)
 
-    def _tell_watchers(self, config: Config) -> None:
-        for watcher in self._watchers:
+    def _call_listeners(self, config: Config) -> None:
+        for watcher in self._listeners:
             watcher(config)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
@@ -183,18 +183,18 @@ class Generator:
             if self._finished is not None:
                 return self._finished
             self._finished = finished = Future[bool]()
-        self._waiting.close()
+        self._queue.close()
         threading.Thread(
             target=self._end, args=(timeout, finished), name="demandops-stop", daemon=True
         ).start()
         return finished
 
     def _end(self, timeout: float, finished: Future[bool]) -> None:
-        self._worker.join(timeout)
-        if self._worker.is_alive():
-            self._settler.give_up()
-        self._worker.join()
-        left = self._waiting.unpublished
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            self._worker.stop_retrying()
+        self._thread.join()
+        left = self._queue.unpublished
         self._slot.close()
         finished.set_result(not left)
 
@@ -204,23 +204,23 @@ class Generator:
 
     def _run(self) -> None:
         """Settle what comes until all is settled and no more is taken; in the worker thread."""
-        while self._waiting.wait(self._settler.pause()):
+        while self._queue.wait(self._worker.seconds_until_due()):
             batch: list[Ticket] = []
             try:
-                self._settler.take_up(batch)
+                self._worker.take(batch)
                 if not batch:
-                    self._settler.notice()
+                    self._worker.fetch_if_due()
                 else:
-                    self._settler.settle(batch)
-                    self._settler.catch_up()
-                    self._settler.tidy()
-                self._settler.attend()
+                    self._worker.publish(batch)
+                    self._worker.retry_changes()
+                    self._worker.tidy()
+                self._worker.check_proposals()
             except ShuttingDown as error:
-                self._waiting.fail(batch, error, keep=True)
+                self._queue.fail(batch, error, keep=True)
             except DemandOpsError as error:
-                self._waiting.fail(batch, error)
+                self._queue.fail(batch, error)
             except Exception as error:
                 log.exception("a fault of the generator")
                 told = StateRepoError(f"a fault of the generator: {error!r}; its log says more")
-                self._waiting.fail(batch, told)
+                self._queue.fail(batch, told)
         self._approvals.suspend()

@@ -53,7 +53,7 @@ def read_secret(path: Path) -> bytes:
     return secret
 
 
-class Webhook:
+class PushWebhook:
     """A server that hears of pushes; it runs from the beginning to :meth:`close`."""
 
     def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:

@@ -35,7 +35,9 @@ def is_rollback(goal: object) -> bool:
     return isinstance(goal, dict) and goal.get("kind") == _KIND
 
 
-def understood(goal: dict[str, Any], repository: StateRepository, head: Snapshot) -> Restoration:
+def to_restoration(
+    goal: dict[str, Any], repository: StateRepository, head: Snapshot
+) -> Restoration:
     """Return the request behind a goal.
 
     Raises:

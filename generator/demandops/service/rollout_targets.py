@@ -15,7 +15,7 @@ from demandops.plan.release_keys import ReleaseKey, affected, all_keys, keys_of
 from demandops.render.gitops.argocd import project_of
 
 
-def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
+def targets_of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
     """Return every release that a demand needs, and those that run no more because of it."""
     after, config = decision.state.ledger, decision.state.config
     subjects = [*_asked(decision.request, after), *decision.changes.subjects()]
@@ -38,7 +38,7 @@ def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def of_state(state: State) -> list[tuple[Release, Target]]:
+def targets_of_state(state: State) -> list[tuple[Release, Target]]:
     """Return every release that the state asks for, by name, and what it is to come to."""
     found = []
     for key in all_keys(state.ledger, state.config):

@@ -49,7 +49,7 @@ class Receipt:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class ProposalRecord:
     """What the journal keeps of a proposal: enough to take it up again.
 
     ``commits`` are those that the branch was put to or is about to be, the newest last, and
@@ -81,35 +81,35 @@ class Ticket:
     base: str = ""
     maybe_published: bool = False
     state: Literal["waiting", "committed", "withdrawn", "done"] = "waiting"
-    told: set[str] = field(default_factory=set)
-    proposal: Record | None = None
+    notified: set[str] = field(default_factory=set)
+    proposal: ProposalRecord | None = None
 
     def __post_init__(self) -> None:
         self.future.set_running_or_notify_cancel()  # `withdraw` takes a demand back, not cancel
 
-    def tell(self, stage: Stage, text: str) -> None:
+    def notify(self, stage: Stage, text: str) -> None:
         """Tell a stage once, also where the demand is judged again; of a proposal each news."""
         news = text if stage == "proposed" else stage
-        if news in self.told:
+        if news in self.notified:
             return
-        self.told.add(news)
+        self.notified.add(news)
         try:
             self.listener(stage, text)
         except Exception:
             log.exception("a listener failed")
 
-    def doubt(self, base: str) -> None:
+    def mark_maybe_published(self, base: str) -> None:
         """Note that a push on top of ``base`` may have been taken although it seemed to fail."""
         if not self.maybe_published:
             self.base, self.maybe_published = base, True
 
-    def entry(self) -> JournalEntry:
+    def journal_entry(self) -> JournalEntry:
         """Return what the outbox keeps of it."""
         kept = asdict(self.proposal) if self.proposal else None
         return JournalEntry(self.operation, self.goal, self.received.isoformat(), self.base, kept)
 
 
-def handed_in(goal: object, operation: str | None, listener: Listener) -> Ticket:
+def new_ticket(goal: object, operation: str | None, listener: Listener) -> Ticket:
     """Return a ticket for a goal; its future has failed already where the goal is no plain data.
 
     Raises:
@@ -126,12 +126,12 @@ def handed_in(goal: object, operation: str | None, listener: Listener) -> Ticket
     return ticket
 
 
-def left_over(entry: JournalEntry) -> Ticket:
+def ticket_from_journal(entry: JournalEntry) -> Ticket:
     """Return a ticket for a demand that an earlier run left in the outbox."""
     received = datetime.fromisoformat(entry.received)
     ticket = Ticket(entry.operation, entry.goal, received, lambda stage, text: None)
-    ticket.doubt(entry.base)
+    ticket.mark_maybe_published(entry.base)
     if entry.proposal is not None:
         kept = entry.proposal
-        ticket.proposal = Record(**{**kept, "commits": tuple(kept["commits"])})
+        ticket.proposal = ProposalRecord(**{**kept, "commits": tuple(kept["commits"])})
     return ticket

@@ -26,7 +26,7 @@ from demandops.cli.output import (
 from demandops.decision import Decision, admit, decide, form_faults
 from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
 from demandops.service import Generator, Receipt
-from demandops.service.approvals.proposal import where_told
+from demandops.service.approvals.proposal import parse_waiting_text
 from demandops.staterepo import reader
 
 
@@ -184,7 +184,7 @@ def _handed_in(
         if wait:
             errors.print(f"{document.file}: request '{name}' {text}")
         elif not answer.done():
-            answer.set_result(where_told(text))
+            answer.set_result(parse_waiting_text(text))
 
     def finish(future: Future[Receipt]) -> None:
         if answer.done():

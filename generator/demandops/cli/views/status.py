@@ -49,7 +49,7 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
         problems = repo.problems()
         with progress("reading the ledger") as tell:
             snapshot = repo.snapshot(progress=tell)
-        found = rollout_targets.of_state(snapshot.state)
+        found = rollout_targets.targets_of_state(snapshot.state)
         stores = _read(clusters, [target for _, target in found])
         commit = str(snapshot.commit)
         rows = [_row(release, target, commit, stores, repo) for release, target in found]

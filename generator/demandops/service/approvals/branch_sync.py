@@ -16,9 +16,14 @@ from demandops.decision import Decision, decide
 from demandops.demand import approval_rule
 from demandops.errors import DemandOpsError, InvalidInput
 from demandops.service.approvals.forge_worker import ForgeWorker
-from demandops.service.approvals.proposal import Proposal, markdown, news, one_line
+from demandops.service.approvals.proposal import (
+    Proposal,
+    pull_request_body,
+    push_option_description,
+    waiting_text,
+)
 from demandops.service.demand_queue import DemandQueue
-from demandops.service.ticket import Record, Ticket
+from demandops.service.ticket import ProposalRecord, Ticket
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.write import commit_line
@@ -38,11 +43,11 @@ class BranchSync:
         on_news: Callable[[str], None],
     ) -> None:
         self._repository = repository
-        self._waiting = waiting
+        self._queue = waiting
         self._branches = Branches(repository)
-        self._desk = ForgeWorker(token_file, on_news)
+        self._forge = ForgeWorker(token_file, on_news)
 
-    def heads(self) -> Heads:
+    def fetch_heads(self) -> Heads:
         """Ask where the branches are.
 
         Raises:
@@ -50,16 +55,16 @@ class BranchSync:
         """
         return self._branches.heads()
 
-    def turned_down(self, proposal: Proposal, heads: Heads) -> str:
+    def turned_down_because(self, proposal: Proposal, heads: Heads) -> str:
         """Return how a person turned a proposal down that is not on main; empty where none did."""
-        request = self._desk.request(proposal.branch)
+        request = self._forge.pull_request(proposal.branch)
         if proposal.record.pushed and proposal.branch not in heads.branches:
             return f"was turned down: {proposal.branch} is gone and was not merged"
         if request is not None and request.state == "closed":
             return f"was turned down: {request.link} was closed"
         return ""
 
-    def take_away(self, proposal: Proposal, heads: Heads, *, if_unchanged: bool = False) -> None:
+    def delete(self, proposal: Proposal, heads: Heads, *, if_unchanged: bool = False) -> None:
         """Delete the branch; ``if_unchanged``: not where somebody else has worked on it.
 
         Raises:
@@ -71,9 +76,9 @@ class BranchSync:
 
     def forget(self, proposal: Proposal, *, close: bool) -> None:
         """Ask nobody any more; ``close`` the request where it is open."""
-        self._desk.drop(proposal.branch, close=close)
+        self._forge.forget(proposal.branch, close=close)
 
-    def keep_up(
+    def update(
         self,
         proposal: Proposal,
         left: list[tuple[Ticket, Decision]],
@@ -96,10 +101,10 @@ class BranchSync:
         proposal.requests = [decision.request for _, decision in left]
         record = proposal.record
         if head and head not in record.commits:
-            self._tell_of_edits(proposal)
+            self._mark_edited(proposal)
         else:
-            steps, faulty = self._steps(left, snapshot)
-            self._waiting.answer(faulty)
+            steps, faulty = self._decide(left, snapshot)
+            self._queue.answer(faulty)
             dropped = [ticket for ticket, _ in faulty]
             proposal.tickets = [t for t in proposal.tickets if t not in dropped]
             if not steps:
@@ -107,31 +112,31 @@ class BranchSync:
             files = {path: text for _, d in steps for path, text in d.files.items()}
             made = self._branches.tree(snapshot.commit, files)
             stands = head and self._branches.is_fresh(snapshot.commit, head, record.base, made)
-            if not stands and not self._lay(proposal, steps, snapshot, head):
+            if not stands and not self._commit_and_push(proposal, steps, snapshot, head):
                 return False
         forge = snapshot.state.config.repository.proposals
         message = self._branches.message(proposal.record.commits[-1])
-        title, body = message.split("\n", 1)[0], markdown(message, proposal.reasons)
+        title, body = message.split("\n", 1)[0], pull_request_body(message, proposal.reasons)
         if forge.forge in ("github", "gitea"):
-            self._desk.want(forge, proposal.branch, title, body)
-            if not self._desk.answered(proposal.branch):
+            self._forge.open(forge, proposal.branch, title, body)
+            if not self._forge.has_answered(proposal.branch):
                 return True  # told together with the link
-        self._tell(proposal)
+        self._notify(proposal)
         return True
 
-    def _tell(self, proposal: Proposal) -> None:
-        request = self._desk.request(proposal.branch)
+    def _notify(self, proposal: Proposal) -> None:
+        request = self._forge.pull_request(proposal.branch)
         link = request.link if request else proposal.record.link
-        text = news(proposal.branch, link, proposal.reasons)
+        text = waiting_text(proposal.branch, link, proposal.reasons)
         for ticket in proposal.tickets:
-            ticket.tell("proposed", text)
+            ticket.notify("proposed", text)
 
-    def _tell_of_edits(self, proposal: Proposal) -> None:
+    def _mark_edited(self, proposal: Proposal) -> None:
         if not proposal.edited:
             log.info("%s was changed by somebody else and is left to them", proposal.branch)
         proposal.edited = True
 
-    def _steps(
+    def _decide(
         self, left: list[tuple[Ticket, Decision]], snapshot: Snapshot
     ) -> tuple[list[tuple[Ticket, Decision]], list[tuple[Ticket, DemandOpsError]]]:
         """Judge what is left one after the other, with leases that count from the approval."""
@@ -155,7 +160,7 @@ class BranchSync:
             steps.append((ticket, step))
         return steps, faulty
 
-    def _lay(
+    def _commit_and_push(
         self,
         proposal: Proposal,
         steps: list[tuple[Ticket, Decision]],
@@ -170,11 +175,11 @@ class BranchSync:
                 line.commit(step, ticket.operation, ticket.received, now, proposal.branch)
         made, old = str(line.head.commit), proposal.record
         record = replace(old, commits=(head, made) if head else (made,), base=str(snapshot.commit))
-        if not self._keep(proposal, record):
+        if not self._journal(proposal, record):
             return False
         options = self._options(proposal, snapshot, made)
         link = self._branches.put(proposal.branch, line.head.commit, head, options)
-        self._keep(proposal, replace(record, pushed=True, link=link or old.link))
+        self._journal(proposal, replace(record, pushed=True, link=link or old.link))
         log.info("%s %s", proposal.branch, "is laid anew" if head else "awaits approval")
         return True
 
@@ -184,10 +189,12 @@ class BranchSync:
             return []
         message = self._branches.message(made)
         title = message.split("\n", 1)[0]
-        return gitlab_options(title, one_line(message, proposal.reasons), forge.labels)
+        return gitlab_options(
+            title, push_option_description(message, proposal.reasons), forge.labels
+        )
 
-    def _keep(self, proposal: Proposal, record: Record) -> bool:
+    def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
         """Keep a record in the journal, for each demand; false where one was taken back."""
         proposal.record = record
-        kept = [self._waiting.propose(ticket, record) for ticket in proposal.tickets]
+        kept = [self._queue.set_proposal(ticket, record) for ticket in proposal.tickets]
         return all(kept)

@@ -36,41 +36,41 @@ class ForgeWorker:
 
     def __init__(self, token_file: Path | None, on_news: Callable[[str], None]) -> None:
         self._token_file = token_file
-        self._on_news = on_news
-        self._orders: queue.Queue[tuple[_Task, bool]] = queue.Queue()
+        self._on_update = on_news
+        self._tasks: queue.Queue[tuple[_Task, bool]] = queue.Queue()
         self._wanted: dict[str, _Task] = {}
-        self._answers: dict[str, PullRequest | None] = {}
+        self._pull_requests: dict[str, PullRequest | None] = {}
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
-        self._said = ""
+        self._last_error = ""
 
-    def want(self, forge: Proposals, branch: str, title: str, body: str) -> None:
+    def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
         """Have a request opened for a branch, unless that was said before."""
         if branch in self._wanted:
             return
         task = _Task(forge, branch, title, body)
         with self._lock:
             self._wanted[branch] = task
-        self._order(task, close=False)
+        self._enqueue(task, close=False)
 
-    def answered(self, branch: str) -> bool:
+    def has_answered(self, branch: str) -> bool:
         """Tell whether the forge was asked about a branch, with or without success."""
-        return branch in self._answers
+        return branch in self._pull_requests
 
-    def request(self, branch: str) -> PullRequest | None:
+    def pull_request(self, branch: str) -> PullRequest | None:
         """Return what is known of the request for a branch."""
-        return self._answers.get(branch)
+        return self._pull_requests.get(branch)
 
-    def drop(self, branch: str, *, close: bool) -> None:
+    def forget(self, branch: str, *, close: bool) -> None:
         """Watch a request no more; ``close`` it where it is open."""
         with self._lock:
             task = self._wanted.pop(branch, None)
-            self._answers.pop(branch, None)
+            self._pull_requests.pop(branch, None)
         if task is not None and close:
-            self._order(task, close=True)
+            self._enqueue(task, close=True)
 
-    def _order(self, task: _Task, *, close: bool) -> None:
-        self._orders.put((task, close))
+    def _enqueue(self, task: _Task, *, close: bool) -> None:
+        self._tasks.put((task, close))
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="demandops-desk", daemon=True)
             self._thread.start()
@@ -80,7 +80,7 @@ class ForgeWorker:
     def _run(self) -> None:
         while True:
             try:
-                task, close = self._orders.get(timeout=POLL_S)
+                task, close = self._tasks.get(timeout=POLL_S)
             except queue.Empty:
                 with self._lock:
                     tasks = list(self._wanted.values())
@@ -90,10 +90,10 @@ class ForgeWorker:
             try:
                 self._handle(task, close=close)
             finally:
-                self._orders.task_done()
+                self._tasks.task_done()
 
     def _handle(self, task: _Task, *, close: bool) -> None:
-        known = self._answers.get(task.branch)
+        known = self._pull_requests.get(task.branch)
         found = known
         try:
             forge = forge_for(task.forge, self._token_file)
@@ -109,9 +109,9 @@ class ForgeWorker:
             else:
                 found = forge.find(task.branch, MAIN_BRANCH) or known
         except ForgeError as error:
-            if str(error) != self._said:
+            if str(error) != self._last_error:
                 log.warning("%s: %s", task.branch, error)
-            self._said = str(error)
+            self._last_error = str(error)
         except Exception:
             log.exception("a fault of the generator, at the request for %s", task.branch)
         self._remember(task, found)
@@ -120,7 +120,9 @@ class ForgeWorker:
         with self._lock:
             if task.branch not in self._wanted:
                 return
-            news = task.branch not in self._answers or self._answers[task.branch] != found
-            self._answers[task.branch] = found
+            news = (
+                task.branch not in self._pull_requests or self._pull_requests[task.branch] != found
+            )
+            self._pull_requests[task.branch] = found
         if news:
-            self._on_news(task.branch)
+            self._on_update(task.branch)

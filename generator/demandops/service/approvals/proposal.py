@@ -14,7 +14,7 @@ from demandops.demand.approval_rule import subjects_of
 from demandops.demand.claim import Subject
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import InvalidInput
-from demandops.service.ticket import Record, Ticket
+from demandops.service.ticket import ProposalRecord, Ticket
 
 Key = tuple[str, ...]
 
@@ -29,12 +29,12 @@ class Proposal:
     """
 
     key: Key
-    record: Record
+    record: ProposalRecord
     tickets: list[Ticket] = field(default_factory=list)
     requests: list[DemandRequest] = field(default_factory=list)
     reasons: tuple[str, ...] = ()
-    seen: str = ""
-    looked: str = ""
+    searched_to: str = ""
+    checked_at: str = ""
     edited: bool = False
 
     @property
@@ -42,11 +42,11 @@ class Proposal:
         """The branch that is to be merged."""
         return self.record.branch
 
-    def stands(self, tip: str, branches: Mapping[str, str]) -> bool:
+    def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
         """Tell whether nothing happened to it since it was looked at, with main at ``tip``."""
         head = branches.get(self.branch)
         waits = all(ticket.state == "waiting" for ticket in self.tickets)
-        return waits and self.looked == tip and head in self.record.commits[-1:]
+        return waits and self.checked_at == tip and head in self.record.commits[-1:]
 
     def requesters(self) -> set[str]:
         """Return in whose name it stands."""
@@ -56,7 +56,7 @@ class Proposal:
         """Return what it asks for."""
         return {subject for request in self.requests for subject in subjects_of(request)}
 
-    def is_given_up_by(self, request: DemandRequest) -> bool:
+    def is_released_by(self, request: DemandRequest) -> bool:
         """Tell whether a request gives up all of it, in the name of one of its requesters."""
         if key_of(request) not in map(key_of, self.requests) or not self.requesters() & set(
             request.requesters()
@@ -73,13 +73,13 @@ def key_of(request: DemandRequest) -> Key:
     return ("demand", request.demand)
 
 
-def gives_up(goal: object) -> bool:
+def is_release(goal: object) -> bool:
     """Tell whether a goal, not parsed yet, gives something up."""
     given = goal if isinstance(goal, dict) else {}
     return bool(given.get("shutdown") or given.get("operation") == Operation.RELEASE.value)
 
 
-def admitted(state: State, goal: object) -> DemandRequest | None:
+def admit_or_none(state: State, goal: object) -> DemandRequest | None:
     """Return what a goal asks, or nothing where it is refused."""
     try:
         return admit(state, goal)
@@ -87,21 +87,21 @@ def admitted(state: State, goal: object) -> DemandRequest | None:
         return None
 
 
-def news(branch: str, link: str, reasons: Iterable[str]) -> str:
+def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
     """Return what a requester is told while the demand waits."""
     where = f"{branch} {link}" if link else branch
     why = ", ".join(reasons)
     return f"{_NEWS}{where}" + (f" (asked for by {why})" if why else "")
 
 
-def where_told(text: str) -> dict[str, str]:
-    """Return branch and link out of :func:`news`; no link where there is none."""
+def parse_waiting_text(text: str) -> dict[str, str]:
+    """Return branch and link out of :func:`waiting_text`; no link where there is none."""
     branch, _, rest = text.removeprefix(_NEWS).partition(" ")
     link = rest.split(" ")[0] if rest.startswith("http") else ""
     return {"branch": branch, "link": link}
 
 
-def markdown(message: str, reasons: Iterable[str]) -> str:
+def pull_request_body(message: str, reasons: Iterable[str]) -> str:
     """Return a commit's message as the text of a merge request.
 
     Fenced, for it holds ids that anybody may choose: nothing in them links, mentions or renders.
@@ -115,7 +115,7 @@ def markdown(message: str, reasons: Iterable[str]) -> str:
     )
 
 
-def one_line(message: str, reasons: Iterable[str]) -> str:
+def push_option_description(message: str, reasons: Iterable[str]) -> str:
     """Return the same in one line, for push options hold no more."""
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
     fence = "`" * (max((len(run) for run in re.findall(r"`+", why)), default=0) + 1)

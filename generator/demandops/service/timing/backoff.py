@@ -27,7 +27,7 @@ class Backoff:
 
     def published(self) -> None:
         """Note that a line was published."""
-        self.share = self._limit
+        self.max_demands = self._limit
         """How many demands the next line may have."""
         self._turn = self._away = FIRST_PAUSE_S
 
@@ -40,12 +40,12 @@ class Backoff:
             pushing_s: seconds until it was known that it came too late.
         """
         # judging for longer than the push takes loses to faster writers for ever
-        self.share = max(1, int(size * min(1.0, pushing_s / max(judging_s, 1e-9))))
+        self.max_demands = max(1, int(size * min(1.0, pushing_s / max(judging_s, 1e-9))))
         wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
         self._away = FIRST_PAUSE_S
         return _jittered(wait)
 
-    def away(self) -> float:
+    def unreachable(self) -> float:
         """Note that the remote could not be reached."""
         wait, self._away = self._away, min(self._away * 2, LONGEST_AWAY_S)
         return _jittered(wait)

@@ -40,7 +40,7 @@ class LeaseClock:
         self._last = (wall(), steady())
         self._stepped: datetime | None = None
 
-    def ended(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
+    def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
         """Return the time and the claims whose lease is over, the first to end first.
 
         What of a demand has ended goes together, so none of it while some is granted more time.
@@ -50,7 +50,7 @@ class LeaseClock:
         granted = {claim.demand for claim in ended if not self._is_over(claim, now)}
         return now, [claim for claim in ended if claim.demand not in granted]
 
-    def pause(self, ledger: Ledger, longest: float) -> float:
+    def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next look is due: ``longest`` at most, one at least.
 
         Not at once, for what is over and still there could not be released or is granted more.
@@ -79,23 +79,23 @@ class LeaseClock:
         return now > self._stepped + term
 
 
-class Expiries:
+class LeaseExpiry:
     """Hands in the releases of what ran out; nobody waits for their receipts."""
 
     def __init__(self) -> None:
         self._clock = LeaseClock()
         self._tried: dict[str, datetime] = {}
 
-    def pause(self, ledger: Ledger, longest: float) -> float:
+    def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next look is due."""
-        return self._clock.pause(ledger, longest)
+        return self._clock.seconds_until_due(ledger, longest)
 
     def tickets(self, ledger: Ledger) -> list[Ticket]:
         """Return a ticket for each demand whose lease ran out.
 
         One that cannot be released (its files do not render) is tried again after a while.
         """
-        now, claims = self._clock.ended(ledger)
+        now, claims = self._clock.ended_claims(ledger)
         since = now - timedelta(seconds=LONGEST_WAIT_S)
         over = dict.fromkeys(claim.demand for claim in claims)
         tried = self._tried  # what is over no more was released or renewed

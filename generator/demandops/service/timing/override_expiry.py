@@ -16,14 +16,14 @@ _AGAIN = timedelta(seconds=60)
 _SHORTEST_S = 1.0
 
 
-class OverrideClock:
+class OverrideExpiry:
     """Ends overrides at their time, each in a commit of its own."""
 
     def __init__(self) -> None:
         self._failed: dict[tuple[str, datetime], datetime] = {}
         self._not_before: datetime | None = None
 
-    def end(self, line: CommitLine, now: datetime) -> None:
+    def end_due(self, line: CommitLine, now: datetime) -> None:
         """Commit on a line that what is over has ended; what cannot be carried out stays."""
         for override in due(line.head.state.config, now):
             tried = self._failed.get((override.name, override.end or now))
@@ -37,15 +37,15 @@ class OverrideClock:
                 for found in error.faults:
                     log.error("%s cannot be ended: %s (trying again later)", override.path, found)
 
-    def put_off(self, now: datetime) -> None:
+    def postpone(self, now: datetime) -> None:
         """Wait a while before anything is ended again: it could not be published."""
         self._not_before = now + _AGAIN
 
-    def anything(self, config: Config, now: datetime) -> bool:
+    def is_due(self, config: Config, now: datetime) -> bool:
         """Tell whether an override is to be ended now."""
         return any(self._when(one.name, one.end) <= now for one in config.in_force if one.end)
 
-    def pause(self, config: Config, now: datetime, longest: float) -> float:
+    def seconds_until_due(self, config: Config, now: datetime, longest: float) -> float:
         """Return the seconds until the next look is due: ``longest`` at most, one at least."""
         ends = [self._when(one.name, one.end) for one in config.in_force if one.end]
         wait = min((end - now).total_seconds() + 0.01 for end in ends) if ends else longest

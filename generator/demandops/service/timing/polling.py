@@ -21,7 +21,7 @@ _EMBEDDED_S = 1.0
 """A repository on this disk is looked at this often at least: it is one file that is read."""
 
 
-def interval_s(text: str) -> float:
+def parse_interval(text: str) -> float:
     """Return the seconds of a fetch interval: a duration like ``30s``, or seconds; 0: never.
 
     Raises:
@@ -64,27 +64,27 @@ class PollTimer:
         self._pause = self._interval
         self._last = -_SHORTEST_GAP_S + steady()
         self._next = steady() if interval else None
-        self._nudged = threading.Event()
+        self._requested = threading.Event()
 
-    def nudge(self) -> None:
+    def request(self) -> None:
         """Have a look taken at once; however often it is asked for meanwhile, it is one."""
-        self._nudged.set()
+        self._requested.set()
 
-    def pause(self) -> float | None:
+    def seconds_until_due(self) -> float | None:
         """Return the seconds until the next look is due; nothing: none is."""
         times = [] if self._next is None else [self._next]
-        if self._nudged.is_set():
+        if self._requested.is_set():
             times.append(self._last + _SHORTEST_GAP_S)
         return max(min(times) - self._steady(), 0.0) if times else None
 
-    def begin(self) -> bool:
+    def start_if_due(self) -> bool:
         """Tell whether a look is due; what is asked for from now on is another one."""
-        due = self.pause() == 0.0
+        due = self.seconds_until_due() == 0.0
         if due:
-            self._nudged.clear()
+            self._requested.clear()
         return due
 
-    def done(self, *, reached: bool) -> None:
+    def finished(self, *, reached: bool) -> None:
         """Note that the state repo was asked for what is new, here or by a push."""
         longest = max(_LONGEST_BACKOFF_S, self._interval)
         self._last = self._steady()
@@ -92,6 +92,6 @@ class PollTimer:
             self._pause = self._interval if reached else min(self._pause * 2, longest)
             self._next = self._last + self._jittered(self._pause)
 
-    def again(self) -> None:
+    def interrupted(self) -> None:
         """Note that a look was cut short: it is still due."""
-        self._nudged.set()
+        self._requested.set()
