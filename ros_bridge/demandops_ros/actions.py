@@ -23,23 +23,23 @@ from demandops.errors import (
 from demandops.service import Receipt
 from demandops_interfaces.action import Demand
 
-from demandops_ros.messages import as_data, demand_data
+from demandops_ros.messages import demand_goal_to_data, message_to_data
 
-LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
+ANSWER_LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
 
 
-class Form(Protocol):
+class ActionAdapter(Protocol):
     """One action."""
 
     action: Any
 
-    def data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
+    def to_data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
         """Return a goal as plain data."""
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         """Return what the log calls a goal."""
 
-    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
+    def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
         """Return when a goal is to be answered, or nothing where it cannot say."""
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
@@ -49,20 +49,20 @@ class Form(Protocol):
         """Return the result for what came of a goal, and how far it is."""
 
 
-class DeploymentRequestForm:
+class DeploymentRequestAdapter:
     """The reference's action: all it can say is one line of text."""
 
     action = DeploymentRequest
 
-    def data(self, goal: Any) -> Any:  # noqa: ANN401
+    def to_data(self, goal: Any) -> Any:  # noqa: ANN401
         """Return a goal as plain data."""
-        return as_data(goal)
+        return message_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         """Return the request's id."""
         return str(goal.id)
 
-    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
+    def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
         """Return nothing: the message has no field for it."""
         return None
 
@@ -75,22 +75,22 @@ class DeploymentRequestForm:
         return DeploymentRequest.Result(message=_text(outcome))
 
 
-class DemandForm:
+class DemandAdapter:
     """Our own action."""
 
     action = Demand
 
-    def data(self, goal: Any) -> Any:  # noqa: ANN401
+    def to_data(self, goal: Any) -> Any:  # noqa: ANN401
         """Return a goal as plain data."""
-        return demand_data(goal)
+        return demand_goal_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         """Return the demand's id."""
         return str(goal.demand_id)
 
-    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
+    def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
         """Return the level that the goal asks for."""
-        return LEVELS[goal.answer] if goal.answer < len(LEVELS) else None
+        return ANSWER_LEVELS[goal.answer] if goal.answer < len(ANSWER_LEVELS) else None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         """Return stage and text."""

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
 
-def answer(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
+def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
     """Fill the response with the bookkeeping at ``request.at``; the newest where it is empty."""
     try:
         if request.at:

@@ -28,11 +28,11 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
-from demandops_ros.messages import demand_goal
+from demandops_ros.messages import demand_goal_from_data
 
 log = logging.getLogger("demandops.client")
 
-Told = Callable[[str, str], None]
+StageListener = Callable[[str, str], None]
 """Called with stage and text as a demand goes along, from the client's thread."""
 
 _DEPTH = 100
@@ -135,7 +135,7 @@ class DemandClient:
         lease: float | str | None = None,
         answer: str = "pushed",
         request: str = "",
-        told: Told = lambda stage, text: None,
+        on_stage: StageListener = lambda stage, text: None,
     ) -> Answer:
         """Make a demand what is listed, and return once it is published.
 
@@ -145,7 +145,7 @@ class DemandClient:
             answer: when to return: pushed, reconciled or healthy.
             lease: seconds, or a duration like ``10m``; the access domain's where left out.
             request: free text for the commit.
-            told: called with each stage.
+            on_stage: called with each stage.
 
         Raises:
             DemandError: with the code, where it is not honoured or nobody answers in time.
@@ -158,7 +158,7 @@ class DemandClient:
             "applications": list(applications),
             "connections": list(connections),
         }
-        return self.send(data | ({"lease": lease} if lease is not None else {}), told)
+        return self.send(data | ({"lease": lease} if lease is not None else {}), on_stage)
 
     def renew(self, demand: str) -> Answer:
         """Renew a demand's leases.
@@ -180,13 +180,15 @@ class DemandClient:
         """Return a demand to be held for a ``with`` block; takes what :meth:`put` takes."""
         return HeldDemand(self, demand, lambda: self.put(demand, *args, **options))
 
-    def send(self, data: Mapping[str, Any], told: Told = lambda stage, text: None) -> Answer:
+    def send(
+        self, data: Mapping[str, Any], on_stage: StageListener = lambda stage, text: None
+    ) -> Answer:
         """Send a document of the kind ``Demand`` and wait for the answer; see :meth:`put`."""
-        goal = demand_goal({"requesters": list(self.requesters), **data})
+        goal = demand_goal_from_data({"requesters": list(self.requesters), **data})
         deadline = time.monotonic() + self.timeout_s
         if not self._client.wait_for_server(timeout_sec=self.timeout_s):
             raise DemandError("no-server", f"nobody takes demands on {self._action_name}")
-        handle, lost = self._accepted(goal, told, deadline)
+        handle, lost = self._send_until_heard(goal, on_stage, deadline)
         if not handle.accepted:
             raise DemandError("rejected", "the node takes no demands now; send it again later")
         answer = self._await(handle.get_result_async(), deadline)
@@ -199,7 +201,12 @@ class DemandClient:
         warnings = tuple(result.warnings)
         return Answer(result.outcome, result.commit, lease_s, warnings, result.reached)
 
-    def _accepted(self, goal: Any, told: Told, deadline: float) -> tuple[Any, bool]:  # noqa: ANN401
+    def _send_until_heard(
+        self,
+        goal: Any,
+        on_stage: StageListener,
+        deadline: float,  # noqa: ANN401
+    ) -> tuple[Any, bool]:
         """Send a goal until the node has heard it; tell whether an attempt got lost.
 
         A node that has not yet found this client loses its response. Sending again does no harm:
@@ -208,7 +215,7 @@ class DemandClient:
         lost = False
         while True:
             sent = self._client.send_goal_async(
-                goal, feedback_callback=lambda fb: told(fb.feedback.stage, fb.feedback.message)
+                goal, feedback_callback=lambda fb: on_stage(fb.feedback.stage, fb.feedback.message)
             )
             try:
                 return self._await(sent, min(deadline, time.monotonic() + _UNHEARD_S)), lost
@@ -237,24 +244,27 @@ class HeldDemand:
         self._client = client
         self._put = put
         self._over = Event()
-        self._keeper: Thread | None = None
+        self._renewer: Thread | None = None
 
     def __enter__(self) -> HeldDemand:
         """Put the demand and keep it."""
         self.answer = self._put()
         self.commit = self.answer.commit
         if self.answer.lease_s:
-            self._keeper = Thread(
-                target=self._keep, args=(self.answer.lease_s,), name="demandops-lease", daemon=True
+            self._renewer = Thread(
+                target=self._renew_until_over,
+                args=(self.answer.lease_s,),
+                name="demandops-lease",
+                daemon=True,
             )
-            self._keeper.start()
+            self._renewer.start()
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         """Give the demand up."""
         self._over.set()
-        if self._keeper is not None:
-            self._keeper.join()
+        if self._renewer is not None:
+            self._renewer.join()
         try:
             self._client.release(self.id)
         except DemandError as problem:
@@ -262,7 +272,7 @@ class HeldDemand:
                 raise
             log.warning("demand %s was not released: %s", self.id, problem)
 
-    def _keep(self, lease_s: float) -> None:
+    def _renew_until_over(self, lease_s: float) -> None:
         pause = lease_s * _RENEW_AFTER
         while not self._over.wait(pause):
             pause = lease_s * _RENEW_AFTER

@@ -113,7 +113,7 @@ def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
         str(data.get("demand", "")),
         data.get("applications", ()),
         data.get("connections", ()),
-        told=_stage(output),
+        on_stage=_stage(output),
         **options,
     ) as held:
         if held.answer is not None:

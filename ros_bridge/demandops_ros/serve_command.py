@@ -27,8 +27,8 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from demandops_ros.actions import LEVELS
-from demandops_ros.node import Answers, DemandNode
+from demandops_ros.actions import ANSWER_LEVELS
+from demandops_ros.node import AnswerSettings, DemandNode
 
 _OF_ANY_TYPE = ParameterDescriptor(dynamic_typing=True)
 _LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -38,7 +38,7 @@ _FLUSH_S = 0.3
 _EXIT_INTERRUPTED = 130
 
 
-class _ToRos(logging.Handler):
+class _RosLogHandler(logging.Handler):
     """Brings what the generator logs into the node's log."""
 
     def __init__(self, node: Node) -> None:
@@ -118,7 +118,7 @@ def serve(
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        settings = _parameters(state_repo, fetch_interval)
+        settings = _read_parameters(state_repo, fetch_interval)
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
         with progress("reading the ledger") as tell:
@@ -140,7 +140,7 @@ def serve(
         rclpy.try_shutdown()
 
 
-def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
+def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
     """Read the node's parameters before it exists, for it needs the state repo to begin with."""
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
     try:
@@ -149,10 +149,10 @@ def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str,
             "demand_action_name": probe.declare_parameter(
                 "demand_action_name", DEFAULT_DEMAND_ACTION_NAME
             ).value,
-            "answer": probe.declare_parameter("answer", LEVELS[0]).value,
+            "answer": probe.declare_parameter("answer", ANSWER_LEVELS[0]).value,
             "answer_timeout": probe.declare_parameter("answer_timeout", 120.0).value,
             "state_repo": probe.declare_parameter("state_repo", state_repo or "").value,
-            "fetch_interval": _as_told(
+            "fetch_interval": _as_text(
                 probe.declare_parameter(
                     "fetch_interval", fetch_interval or DEFAULT_INTERVAL, _OF_ANY_TYPE
                 ).value
@@ -170,9 +170,9 @@ def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str,
         parse_interval(values["fetch_interval"])
     except ValueError as error:
         raise click.UsageError(f"fetch interval: {error}") from None
-    if values["answer"] not in LEVELS:
+    if values["answer"] not in ANSWER_LEVELS:
         raise click.UsageError(
-            f"parameter answer is '{values['answer']}'; it takes {', '.join(LEVELS)}"
+            f"parameter answer is '{values['answer']}'; it takes {', '.join(ANSWER_LEVELS)}"
         )
     if values["log_level"] not in _LEVELS:
         raise click.UsageError(
@@ -181,7 +181,7 @@ def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str,
     return values
 
 
-def _as_told(value: object) -> str:
+def _as_text(value: object) -> str:
     """Return a parameter as text: ROS reads 30 as a number and 30s as text."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
@@ -196,7 +196,7 @@ def _run(
         generator,
         settings["action_name"],
         settings["demand_action_name"],
-        Answers(settings["answer"], settings["answer_timeout"], status),
+        AnswerSettings(settings["answer"], settings["answer_timeout"], status),
     )
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
@@ -206,7 +206,7 @@ def _run(
         node.declare_parameter(name, shown, descriptor)
     set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
     library_log = logging.getLogger("demandops")
-    library_log.handlers, library_log.propagate = [_ToRos(node)], False
+    library_log.handlers, library_log.propagate = [_RosLogHandler(node)], False
     library_log.setLevel(logging.DEBUG)
     executor = SingleThreadedExecutor()
     executor.add_node(node)

@@ -19,7 +19,7 @@ from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops.staterepo.git import tree as trees
 from demandops_interfaces.action import Demand
 from demandops_interfaces.msg import Bookkeeping
-from demandops_ros.client import DemandClient, DemandError
+from demandops_ros import DemandClient, DemandError
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
@@ -105,7 +105,7 @@ def test_a_third_type_of_application_is_demanded_with_yaml_alone(
     served = serve(str(state))
     stages: list[str] = []
     with client.demand(
-        "v0/recording", [RECORDER], told=lambda stage, _: stages.append(stage)
+        "v0/recording", [RECORDER], on_stage=lambda stage, _: stages.append(stage)
     ) as it:
         assert it.answer is not None and it.answer.outcome == "booked"
         assert it.answer.warnings == ()
