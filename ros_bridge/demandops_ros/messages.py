@@ -1,4 +1,4 @@
-"""Messages as plain data, and back. Knows no rclpy: messages are all it takes."""
+"""Converts ROS messages to plain data and back; needs the messages only, not rclpy."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from demandops_interfaces.action import Demand as DemandMessage
 
 
 def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
-    """Return a message as mappings, lists and plain values, as its YAML form would parse.
+    """Return a message as mappings, lists and plain values, as its YAML form parses.
 
-    ``DeploymentRequest.Goal`` becomes what
-    :func:`demandops.demand.deployment_request_goal.parse` takes, so that a goal over ROS 2 and the
-    same goal in a file are one thing.
+    A ``DeploymentRequest.Goal`` becomes what
+    :func:`demandops.demand.deployment_request_goal.parse` takes, so that a goal over ROS 2 equals
+    the same goal in a file.
     """
     fields = getattr(message, "get_fields_and_field_types", None)
     if fields is not None:
@@ -40,7 +40,7 @@ _ANSWERS = ("pushed", "reconciled", "healthy")
 def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return a ``Demand.Goal`` as what :func:`demandops.demand.demand_goal.parse` takes.
 
-    A number that the message does not define is passed on as text, to be refused with its field.
+    A number that the message does not define becomes text, which the parser refuses by field.
     """
     data = {
         "apiVersion": API_VERSION,
@@ -62,8 +62,8 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return the ``Demand.Goal`` for a document of the kind ``Demand``.
 
     Raises:
-        ValueError: for a field or a word that it does not have.
-        TypeError, AssertionError: for a value of another type.
+        ValueError: for an unknown field or word.
+        TypeError, AssertionError: for a value of the wrong type.
     """
     goal = DemandMessage.Goal()
     known = {"apiVersion", "kind", "lease", "operation", "answer", "applications", "connections"}
@@ -78,7 +78,7 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     seconds = seconds_of(lease) if isinstance(lease, str) else lease
     goal.lease = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
     goal.applications = [_application_message(app) for app in data.get("applications", ())]
-    goal.connections = [_connection_message(one) for one in data.get("connections", ())]
+    goal.connections = [_connection_message(item) for item in data.get("connections", ())]
     return goal
 
 
@@ -132,12 +132,12 @@ def _route_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
 def _reject_unknown(data: Mapping[str, Any], known: set[str], what: str) -> None:
     for name in data:
         if name not in known:
-            raise ValueError(f"'{name}' is no field of {what}{near(name, known)}")
+            raise ValueError(f"'{name}' is not a field of {what}{near(name, known)}")
 
 
 def _number(words: tuple[str, ...], word: str, field: str) -> int:
     if word not in words:
-        raise ValueError(f"{field}: '{word}' is none of {', '.join(words)}")
+        raise ValueError(f"{field}: '{word}' is not one of {', '.join(words)}")
     return words.index(word)
 
 
@@ -177,11 +177,11 @@ def _connection(connection: Any) -> dict[str, Any]:  # noqa: ANN401
 
 
 def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
-    """Fill a message from plain data and return it; absent fields keep ROS's defaults.
+    """Fill a message from plain data and return it; missing fields keep ROS's defaults.
 
     Raises:
-        AttributeError: for a field that the message has not.
-        AssertionError, TypeError: for a value of another type.
+        AttributeError: for a field that the message does not have.
+        AssertionError, TypeError: for a value of the wrong type.
     """
     types = message.get_fields_and_field_types()
     for name, value in data.items():
@@ -200,6 +200,6 @@ def _converted(default: Any, type_name: str, value: Any) -> Any:  # noqa: ANN401
 
 
 def _new(type_name: str) -> Any:  # noqa: ANN401
-    """Return a message of a sequence's type: ``sequence<pkg/Name>``."""
+    """Return a new message of the type in ``sequence<pkg/Name>``."""
     package, name = type_name.removeprefix("sequence<").split(">")[0].split(",")[0].split("/")
     return getattr(import_module(f"{package}.msg"), name)()

@@ -1,8 +1,8 @@
-"""The ROS 2 node: action servers that hand demands to the generator.
+"""The ROS 2 node: action servers that submit demands to the generator.
 
-Many goals may be under way: each waits for its receipt without holding the executor. What the
-generator's worker thread tells (stages, receipts) is queued and handled in the executor's own
-thread, woken by a guard condition.
+Many goals may be open: each waits for its receipt without blocking the executor. Stages and
+receipts from the generator's worker thread are queued, and a guard condition wakes the executor to
+handle them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
 QUEUE_DEPTH = 2000
-"""Depth of the services' queues. With ROS's default of 10, goals that arrive together are lost."""
+"""Depth of the services' queues: with ROS's default of 10, goals that arrive at once are lost."""
 
 DEEP_QOS = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST,
@@ -43,9 +43,9 @@ DEEP_QOS = QoSProfile(
 
 @dataclass(frozen=True, slots=True)
 class AnswerSettings:
-    """When goals are answered: those that cannot say at ``level``, none later than ``timeout_s``.
+    """When to answer goals: at ``level`` if the goal names none, after ``timeout_s`` at the latest.
 
-    ``status`` tells what came of a demand, nothing without access to the clusters.
+    ``status`` watches rollouts; None without access to the clusters.
     """
 
     level: Level = "pushed"
@@ -70,7 +70,7 @@ class DemandNode(Node):  # type: ignore[misc]
         self._open: dict[str, ServerGoalHandle] = {}
         self._events: deque[Callable[[], None]] = deque()
         self._stopping = False
-        # a group of its own: a service that waits for an event must not keep events from coming
+        # a group of its own, so that a service that waits for an event does not block events
         self._wake = self.create_guard_condition(
             self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
         )
@@ -102,7 +102,7 @@ class DemandNode(Node):  # type: ignore[misc]
         )
 
     def close(self) -> None:
-        """Stop what runs beside the executor."""
+        """Stop the threads beside the executor."""
         self._bookkeeping_topic.close()
 
     @property
@@ -111,7 +111,7 @@ class DemandNode(Node):  # type: ignore[misc]
         return len(self._open)
 
     def stop_accepting(self) -> None:
-        """Reject further goals; those under way go on."""
+        """Reject further goals; open goals continue."""
         self._stopping = True
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
@@ -128,19 +128,19 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- callbacks of the action server, in the executor's thread ----
 
     def _accept_or_reject(self, adapter: ActionAdapter, goal: Any) -> GoalResponse:  # noqa: ANN401
-        """Accept whatever can be decoded: a goal response carries no text to say why not."""
+        """Accept every goal unless overloaded: a rejection cannot carry a reason, a result can."""
         reason = "shutting down" if self._stopping else ""
         if len(self._open) >= self._generator.queue_limit:
             reason = "too many are waiting"
-            trouble = self._generator.state_repo_status.remote.unreachable
-            reason += f" for the state repo: {trouble}" if trouble else ""
+            unreachable = self._generator.state_repo_status.remote.unreachable
+            reason += f" for the state repo: {unreachable}" if unreachable else ""
         if reason:
             self.get_logger().warning(f"goal '{adapter.name(goal)}' rejected: {reason}")
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        """A demand can be taken back until it is committed."""
+        """Withdraw a demand, which is possible until it is committed."""
         if self._generator.withdraw(_operation(handle)):
             return CancelResponse.ACCEPT
         return CancelResponse.REJECT
@@ -175,7 +175,7 @@ class DemandNode(Node):  # type: ignore[misc]
         )
 
     def _cannot_watch(self, receipt: Receipt) -> str:
-        """Return why it cannot be told what comes of a demand; empty where it can."""
+        """Return why the rollout of a demand cannot be watched, or empty."""
         if self._answer_settings.status is None:
             return "answered at pushed: this node has no access to the clusters"
         problem = self._answer_settings.status.reaches(target.place for target in receipt.targets)
@@ -184,8 +184,8 @@ class DemandNode(Node):  # type: ignore[misc]
     async def _wait_for_rollout(
         self, adapter: ActionAdapter, handle: ServerGoalHandle, receipt: Receipt, level: Level
     ) -> Receipt | NotReached:
-        """Wait until a demand is as far as asked, or its time is over."""
-        assert self._answer_settings.status is not None  # noqa: S101 - the caller has looked
+        """Wait until a rollout reaches a level, or for the time limit."""
+        assert self._answer_settings.status is not None  # noqa: S101 - the caller has checked
         done = Future(executor=self.executor)
         followed = self._answer_settings.status.follow(
             receipt.commit,
@@ -220,16 +220,16 @@ class DemandNode(Node):  # type: ignore[misc]
     ) -> Any:  # noqa: ANN401
         self._open.pop(_operation(handle), None)
         result = adapter.result(outcome, reached)
-        told = f"goal '{adapter.name(handle.request)}': "
+        prefix = f"goal '{adapter.name(handle.request)}': "
         if isinstance(outcome, Receipt):
             handle.succeed()
-            self.get_logger().info(told + result.message)
+            self.get_logger().info(prefix + result.message)
         elif isinstance(outcome, Withdrawn) and handle.is_cancel_requested:
             handle.canceled()
-            self.get_logger().info(told + "cancelled")
+            self.get_logger().info(prefix + "cancelled")
         else:
             handle.abort()
-            self.get_logger().error(told + result.message)
+            self.get_logger().error(prefix + result.message)
         return result
 
     # ---- from the worker thread into the executor's ----

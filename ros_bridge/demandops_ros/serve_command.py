@@ -1,4 +1,4 @@
-"""``demandops serve``: run the ROS 2 node until it is told to stop."""
+"""``demandops serve``: run the ROS 2 node until a signal stops it."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ _EXIT_INTERRUPTED = 130
 
 
 class _RosLogHandler(logging.Handler):
-    """Brings what the generator logs into the node's log."""
+    """Passes the generator's log records to the node's log."""
 
     def __init__(self, node: Node) -> None:
         super().__init__()
         self._log = node.get_logger()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log a record at the level that ROS has for it."""
+        """Log a record at the matching ROS level."""
         text = self.format(record)
         if record.levelno >= logging.ERROR:
             self._log.error(text)
@@ -70,27 +70,27 @@ class _RosLogHandler(logging.Handler):
     envvar="DEMANDOPS_CLUSTERS",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="How the clusters are reached, to wake them after a push and to hear what came of a "
-    "demand; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
+    help="How to reach the clusters, to notify them of a push and to watch rollouts; see "
+    "docs/status.md [env: DEMANDOPS_CLUSTERS].",
 )
 @click.option(
     "--fetch-interval",
     metavar="DURATION",
-    help="How often to look for what people pushed while no demand comes, 30s for one; 0 for "
-    f"never. Default: {DEFAULT_INTERVAL}; also the ROS parameter fetch_interval.",
+    help="How often to fetch what people pushed while no demand comes, such as 30s; 0 for never. "
+    f"Default: {DEFAULT_INTERVAL}; also the ROS parameter fetch_interval.",
 )
 @click.option(
     "--webhook",
     metavar="HOST:PORT",
-    help="Hear of pushes there, and look at once: POST /push by GitHub, GitLab, Gitea or Forgejo; "
-    "see docs/operations.md. Off by default.",
+    help="Listen there for push notifications, and fetch at once: POST /push by GitHub, GitLab, "
+    "Gitea or Forgejo; see docs/operations.md. Off by default.",
 )
 @click.option(
     "--webhook-secret-file",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="The secret that the webhook's notifications are signed with; needed unless it listens "
-    "on this machine alone.",
+    help="The secret that signs the webhook's notifications; needed unless it listens on a "
+    "loopback address.",
 )
 @signing_option
 @click.pass_context
@@ -103,45 +103,47 @@ def serve(
     webhook_secret_file: Path | None,
     signing_key: Path | None,
 ) -> None:
-    """Run the ROS 2 node that takes demands over the actions DeploymentRequest and Demand.
+    """Run the ROS 2 node that accepts demands over the actions DeploymentRequest and Demand.
 
     Everything after --ros-args goes to ROS. Parameters: action_name (of DeploymentRequest),
     demand_action_name, answer (of DeploymentRequest: pushed, reconciled or healthy), answer_timeout
     (seconds), state_repo, fetch_interval, log_level (debug, info, warn, error or fatal). Stop it
-    with Ctrl-C or SIGTERM: it finishes what it has in hand.
+    with Ctrl-C or SIGTERM: it finishes the open goals.
     """
     ros_args = list(ctx.args)
     if ros_args and ros_args[0] != "--ros-args":
-        raise click.UsageError(f"unexpected argument {ros_args[0]}; ROS's own follow --ros-args")
+        raise click.UsageError(
+            f"unexpected argument {ros_args[0]}; ROS arguments follow --ros-args"
+        )
     if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
-        # a container without a home: ROS's log library would refuse to start
+        # ROS's log library does not start in a container without a home
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
         settings = _read_parameters(state_repo, fetch_interval)
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
-        with progress("reading the ledger") as tell:
+        with progress("reading the ledger") as report:
             generator = Generator(
                 settings["state_repo"],
-                progress=tell,
+                progress=report,
                 with_targets=bool(clusters),
                 fetch_interval=parse_interval(settings["fetch_interval"]),
                 signing_key=signing_key,
             )
-        waker = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
-        generator.on_publish(waker)
-        waker(generator.snapshot.state.config)  # an earlier run may have ended right after a push
-        hook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
+        trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
+        generator.on_publish(trigger)
+        trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
+        push_webhook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
         status = RolloutStatus(clusters, generator) if clusters else None
-        _run(generator, settings, status, hook)
-        waker.close()
+        _run(generator, settings, status, push_webhook)
+        trigger.close()
     finally:
         rclpy.try_shutdown()
 
 
 def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
-    """Read the node's parameters before it exists, for it needs the state repo to begin with."""
+    """Read the node's parameters with a probe, because the generator starts before the node."""
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
     try:
         values = {
@@ -163,7 +165,7 @@ def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict
         probe.destroy_node()
     if not values["state_repo"]:
         raise click.UsageError(
-            "which state repo? give --state-repo URL_OR_DIR, set DEMANDOPS_STATE_REPO, or the ROS "
+            "no state repo given; use --state-repo URL_OR_DIR, DEMANDOPS_STATE_REPO or the ROS "
             "parameter state_repo"
         )
     try:
@@ -190,7 +192,7 @@ def _run(
     generator: Generator,
     settings: dict[str, Any],
     status: RolloutStatus | None,
-    hook: PushWebhook | None,
+    push_webhook: PushWebhook | None,
 ) -> None:
     node = DemandNode(
         generator,
@@ -200,7 +202,7 @@ def _run(
     )
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
-        # read when the node starts; a change of them now would do nothing, so none is taken
+        # read only, because the parameters are read at the start
         of_any_type = name == "fetch_interval"
         descriptor = ParameterDescriptor(read_only=True, dynamic_typing=of_any_type)
         node.declare_parameter(name, shown, descriptor)
@@ -211,16 +213,16 @@ def _run(
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     signals = _Signals()
-    # the executor spins in a thread: the main thread is free to notice a signal at once
+    # the executor spins in a thread, so that the main thread notices a signal at once
     spinner = Thread(target=executor.spin, name="demandops-executor")
     spinner.start()
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
-    if hook is not None:
-        node.get_logger().info(f"hearing of pushes at {hook.url}")
+    if push_webhook is not None:
+        node.get_logger().info(f"listening for pushes at {push_webhook.url}")
     signals.wait()
-    if hook is not None:
-        hook.close()
+    if push_webhook is not None:
+        push_webhook.close()
     _drain(executor, node, generator, status)
     executor.shutdown(timeout_sec=1)
     spinner.join(5)
@@ -234,33 +236,35 @@ def _drain(
     generator: Generator,
     status: RolloutStatus | None,
 ) -> None:
-    """Finish what is in hand: goals under way get their results before the node goes."""
+    """Send the results of all open goals before the node is destroyed."""
     node.stop_accepting()
-    node.get_logger().info(f"stopping: finishing {node.open_goals} goals in hand")
+    node.get_logger().info(f"stopping: finishing {node.open_goals} open goals")
     finished = generator.stop()
     published = finished.result()
     if status is not None:
-        status.close()  # goals that wait for their clusters are answered with what is known
+        status.close()  # answers the goals that wait for a rollout
     while node.open_goals:
         time.sleep(_POLL_S)
-    for _ in range(2):  # results leave by tasks of the executor: let those in it pass
-        passed = Event()
-        executor.create_task(passed.set)
-        passed.wait(_TASK_S)
-    time.sleep(_FLUSH_S)  # and clients ask for them
+    for _ in range(2):  # results are sent by tasks of the executor: wait until they have run
+        done = Event()
+        executor.create_task(done.set)
+        done.wait(_TASK_S)
+    time.sleep(_FLUSH_S)  # time for clients to request them
     if not published:
-        node.get_logger().warning("the outbox is not empty; it is taken up at the next start")
+        node.get_logger().warning(
+            "the journal is not empty; its demands are resumed at the next start"
+        )
 
 
 class _Signals:
-    """Ctrl-C and SIGTERM ask to stop; a second one stops at once.
+    """Ctrl-C and SIGTERM stop the program after the open goals; a second one stops it at once.
 
-    The kernel may hand a signal to any thread. Python writes it to the wake-up pipe in whichever,
-    so the main thread, which reads there, learns of it at once.
+    The kernel may deliver a signal to any thread. Python writes it to a wake-up pipe, which the
+    main thread reads, so the main thread notices it at once.
     """
 
     def __init__(self) -> None:
-        self._asked = False
+        self._stopping = False
         self._read, write = os.pipe()
         os.set_blocking(write, False)
         signal.set_wakeup_fd(write)
@@ -268,12 +272,12 @@ class _Signals:
             signal.signal(number, self._handle)
 
     def wait(self) -> None:
-        """Return when the process was told to stop."""
-        while not self._asked:
+        """Wait for a signal."""
+        while not self._stopping:
             os.read(self._read, 1)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._asked:
-            errors.print("stopped at once; what was not published is in the outbox")
+        if self._stopping:
+            errors.print("stopped at once; unpublished demands are in the journal")
             os._exit(_EXIT_INTERRUPTED)
-        self._asked = True
+        self._stopping = True

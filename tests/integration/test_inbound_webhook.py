@@ -93,7 +93,7 @@ FORGED = {
 
 @pytest.mark.parametrize("server", GENUINE)
 def test_who_knows_the_secret_is_heard(signed: PushWebhook, heard: Heard, server: str) -> None:
-    assert send(signed, GENUINE[server]) == (202, "looking")
+    assert send(signed, GENUINE[server]) == (202, "fetching")
     assert heard.times == 1
 
 
@@ -114,7 +114,7 @@ def test_who_does_not_is_refused_and_the_log_holds_nothing_of_it(
 def test_without_a_secret_whoever_is_on_this_machine_is_heard(
     unsigned: PushWebhook, heard: Heard
 ) -> None:
-    assert send(unsigned) == (202, "looking")
+    assert send(unsigned) == (202, "fetching")
     assert send(unsigned, body=None, headers={"Content-Length": "0"})[0] == 202
     assert heard.times == 2
 
@@ -124,7 +124,7 @@ def test_what_else_is_asked_is_answered_and_does_nothing(signed: PushWebhook, he
     assert send(signed, method="GET", path="/", body=None) == (200, "ok")
     assert send(signed, method="HEAD", path="/", body=None) == (200, "")
     assert send(signed, method="GET", path="/push", body=None)[0] == 405
-    assert send(signed, method="GET", path="/admin", body=None) == (404, "nothing is here")
+    assert send(signed, method="GET", path="/admin", body=None) == (404, "not found")
     assert send(signed, github, path="/") == (404, "notifications go to /push")
     assert send(signed, github, path="/push/../push")[0] == 404
     assert send(signed, github, method="PUT")[0] == 501
@@ -179,15 +179,15 @@ def _connected(hook: PushWebhook) -> socket.socket:
 @pytest.mark.parametrize(
     ("address", "message"),
     [
-        ("8090", "'8090' is no address to listen on; write one like 127.0.0.1:8090"),
-        (":8090", "':8090' is no address to listen on; write one like 127.0.0.1:8090"),
-        ("localhost:http", "'localhost:http' is no address to listen on; write one like "
+        ("8090", "'8090' is not an address to listen on; write one like 127.0.0.1:8090"),
+        (":8090", "':8090' is not an address to listen on; write one like 127.0.0.1:8090"),
+        ("localhost:http", "'localhost:http' is not an address to listen on; write one like "
          "127.0.0.1:8090"),
-        ("127.0.0.1:65536", "'127.0.0.1:65536' is no address to listen on; write one like "
+        ("127.0.0.1:65536", "'127.0.0.1:65536' is not an address to listen on; write one like "
          "127.0.0.1:8090"),
         ("0.0.0.0:0", "'0.0.0.0:0' can be reached from other machines, so notifications must be "
          "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1"),
-        ("nowhere.invalid:0", "'nowhere.invalid:0': the host 'nowhere.invalid' is not known here; "
+        ("nowhere.invalid:0", "'nowhere.invalid:0': host 'nowhere.invalid' cannot be resolved; "
          "write an address of this machine"),
     ],
 )  # fmt: skip

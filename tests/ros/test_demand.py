@@ -129,7 +129,9 @@ def test_a_refusal_names_code_field_and_remedy(serve: Serve, client: DemandClien
     with pytest.raises(DemandError) as caught:
         client.release("d")
     assert caught.value.code == "not-held"
-    with pytest.raises(ValueError, match="'node_id' is no field of an application; did you mean"):
+    with pytest.raises(
+        ValueError, match="'node_id' is not a field of an application; did you mean"
+    ):
         client.put("d", [{"node_id": "edge"}])
     assert client.put("d", connections=[LINK]).outcome == "booked"
     assert served.bookkeeping()["connections"]["link"]["topics"] == ["/a", "/b"]
@@ -250,7 +252,7 @@ def test_the_command_line_sends_holds_and_gives_up(serve: Serve, tmp_path: Path)
     holding.send_signal(signal.SIGINT)
     out, told = holding.communicate(timeout=60)
     assert holding.returncode == 0, told
-    assert out.startswith("booked in ") and told.endswith("given up\n")
+    assert out.startswith("booked in ") and told.endswith("released\n")
     assert operations(state)[-1] == "release"
 
 

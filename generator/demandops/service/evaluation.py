@@ -1,6 +1,6 @@
-"""Judging: what becomes of one demand on top of a line of commits, or became of it before.
+"""Evaluates one demand on top of the commits of its batch.
 
-Whatever is wrong with a demand is its answer; nothing that it holds stops the others.
+Every error of a demand is its own answer: it stops no other demand.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Deferred]
 
 
 class Evaluator:
-    """Judges demands, in the thread that owns the state repo."""
+    """Evaluates demands in the worker thread."""
 
     def __init__(
         self,
         repository: StateRepository,
-        waiting: DemandQueue,
+        queue: DemandQueue,
         approvals: Approvals,
         with_targets: bool,
     ) -> None:
-        self._repository, self._queue, self._approvals = repository, waiting, approvals
+        self._repository, self._queue, self._approvals = repository, queue, approvals
         self._with_targets = with_targets
         self._rate_limit = RateLimit()
 
@@ -49,24 +49,24 @@ class Evaluator:
         self,
         line: commit_line.CommitLine,
         ticket: Ticket,
-        arrived: dict[str, commit_log.Arrival],
+        published: dict[str, commit_log.Arrival],
         earlier: list[Result],
     ) -> Receipt | DemandOpsError | Deferred:
-        """Decide a demand on top of the line and commit it there.
+        """Decide a demand, commit it on the commit line and return its result.
 
         Args:
-            arrived: what :meth:`arrived` told of its batch.
-            earlier: what became of the demands of the batch before it; those that it gives up
-                while they await approval are withdrawn there.
+            published: what :meth:`published_before` returned for the batch.
+            earlier: the results of the earlier demands of the batch. A demand that releases one of
+                them before it is proposed replaces its result with ``Withdrawn``.
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
-        if ticket.operation in arrived:
-            return _receipt_of_published(ticket, arrived[ticket.operation])
+        if ticket.operation in published:
+            return _receipt_of_published(ticket, published[ticket.operation])
         try:
-            gone = self._approvals.released_in_batch(ticket, line.head.state, earlier)
+            released = self._approvals.released_in_batch(ticket, line.head.state, earlier)
             earlier[:] = [
-                (t, Withdrawn(RELEASED) if t.operation in gone else r) for t, r in earlier
+                (t, Withdrawn(RELEASED) if t.operation in released else r) for t, r in earlier
             ]
             goal = ticket.goal
             if rollback_goal.is_rollback(goal):
@@ -90,31 +90,29 @@ class Evaluator:
             targets = targets_of_decision(before, decision) if self._with_targets else ()
             return replace(_commit(line, ticket, decision), targets=targets)
         except InvalidInput as error:
-            if self._approvals.has_released_a_proposal(
-                ticket
-            ):  # what was proposed, and nothing else
+            if self._approvals.has_released_a_proposal(ticket):  # which held no claims yet
                 line.note(ticket.operation, "Unchanged")
                 return _receipt_of_released(ticket, str(line.head.commit))
             line.note(ticket.operation, "Refused")
             return error
         except SigningFailed as error:
             return error
-        except Exception as error:  # one demand that the program cannot handle stops no other
-            log.exception("a fault of the generator, at demand %s", ticket.operation)
-            return StateRepoError(f"a fault of the generator: {error!r}; its log says more")
+        except Exception as error:  # a bug that one demand triggers must not stop the others
+            log.exception("internal error while evaluating demand %s", ticket.operation)
+            return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
     def published_before(
         self, start: Snapshot, batch: list[Ticket]
     ) -> dict[str, commit_log.Arrival]:
-        """Return operation id → arrival of demands that were published although nobody was told.
+        """Return, by operation id, the demands that are published although nobody was answered.
 
-        The connection may have been cut, or the process killed, after the remote took the push.
+        The connection was cut, or the process was killed, after the remote accepted the push.
         """
         bases = {ticket.base for ticket in batch if ticket.maybe_published}
-        found: dict[str, commit_log.Arrival] = {}
+        published: dict[str, commit_log.Arrival] = {}
         for base in bases:
-            found |= commit_log.operations_since(self._repository.objects, start.commit, base)
-        return found
+            published |= commit_log.operations_since(self._repository.objects, start.commit, base)
+        return published
 
 
 def _commit(line: commit_line.CommitLine, ticket: Ticket, decision: Decision) -> Receipt:
@@ -138,12 +136,12 @@ def _commit(line: commit_line.CommitLine, ticket: Ticket, decision: Decision) ->
 
 def _receipt_of_published(ticket: Ticket, arrival: commit_log.Arrival) -> Receipt | DemandOpsError:
     if arrival.outcome == "refused":
-        message = "was refused when the connection was cut; send it again to hear why"
+        message = "was refused, but the reason was lost with the connection; send it again"
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal if isinstance(ticket.goal, dict) else {}
-    gives_up = goal.get("shutdown") or goal.get("operation") == Operation.RELEASE.value
-    gives_up = gives_up or decommission_goal.is_decommission(goal)
-    outcome: Outcome = "released" if gives_up else "booked"
+    releases = goal.get("shutdown") or goal.get("operation") == Operation.RELEASE.value
+    releases = releases or decommission_goal.is_decommission(goal)
+    outcome: Outcome = "released" if releases else "booked"
     if rollback_goal.is_rollback(goal):
         outcome = "restored"
     if arrival.outcome == "unchanged":

@@ -1,7 +1,7 @@
-"""Following the state repo: what others publish there is taken in while no demand comes.
+"""Fetches what others push to the state repo while no demand comes, and commits what follows.
 
-Belongs to the worker thread, but for :meth:`Fetcher.nudge` and what it tells of its link. Demands
-go first: a look gives way to them, for their own push shows what is new as well.
+Everything but :meth:`Fetcher.fetch_now` and ``Fetcher.remote`` belongs to the worker thread.
+Demands go first: a fetch stops when one arrives, whose push shows what is new as well.
 """
 
 from __future__ import annotations
@@ -26,55 +26,56 @@ _LONGEST_PAUSE_S = 0.05
 
 
 class Fetcher:
-    """Looks at the state repo at an interval, and takes in what is new there."""
+    """Fetches at an interval and on request, and carries out people's changes."""
 
     def __init__(
         self,
         repository: StateRepository,
-        waiting: DemandQueue,
+        queue: DemandQueue,
         fetch_interval: float,
-        line: Callable[[], commit_line.CommitLine],
-        taken: Callable[[commit_line.CommitLine], None],
+        new_commit_line: Callable[[], commit_line.CommitLine],
+        on_published: Callable[[commit_line.CommitLine], None],
     ) -> None:
-        """Make it.
+        """Plan the first fetch.
 
         Args:
             repository: the state repo.
-            waiting: the demands, which go first.
-            fetch_interval: seconds between two looks; 0: none but of a repository on this disk.
-            line: starts a line on the newest tip, with what follows from people's changes.
-            taken: told of a line that is published.
+            queue: the demands, which go first.
+            fetch_interval: seconds between two fetches; 0: only on request.
+            new_commit_line: returns a commit line on the newest tip, with the commits that carry
+                out people's changes.
+            on_published: called with each commit line after it was published.
         """
         self._repository = repository
-        self._queue = waiting
-        self._new_commit_line, self._on_published = line, taken
+        self._queue = queue
+        self._new_commit_line, self._on_published = new_commit_line, on_published
         self._timer = PollTimer(fetch_interval, embedded=repository.always_current)
         self._logged: frozenset[Fault] = frozenset()
-        self._given_up = threading.Event()
+        self._stopped = threading.Event()
         self.remote = RemoteMonitor(repository.address)
 
     def fetch_now(self) -> None:
-        """Have the state repo looked at now; from any thread."""
+        """Make a fetch due now; from any thread."""
         self._timer.request()
         self._queue.wake()
 
     def stop_retrying(self) -> None:
-        """Try nothing again; from any thread."""
-        self._given_up.set()
+        """Let pending attempts be the last; from any thread."""
+        self._stopped.set()
 
     def seconds_until_due(self) -> float | None:
-        """Return the seconds until the next look is due; nothing: none is."""
+        """Return the seconds until the next fetch, or None if none is planned."""
         return self._timer.seconds_until_due()
 
     def fetch_if_due(self, known: Snapshot, due: bool) -> bool:
-        """Take in what others published, where it is time to look or it costs nothing.
+        """Fetch if it is time to or costs nothing, and carry out what is new.
 
         Args:
-            known: what was taken in last.
-            due: whether there is something to commit although nobody published anything.
+            known: the newest state that was read.
+            due: whether there is something to commit although nobody pushed.
 
         Returns:
-            Whether the state repo was reached, or need not be.
+            False if the state repo could not be reached.
         """
         try:
             if self._timer.start_if_due():
@@ -91,47 +92,43 @@ class Fetcher:
         return True
 
     def carry_out_changes(self) -> None:
-        """Try again what people changed and could not be carried out: a release may allow it."""
+        """Carry out people's changes up to the newest tip that is known, without a fetch."""
         try:
             self._carry_out_changes()
         except StateRepoError as error:
             self.record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Bring the snapshot to the newest tip, and publish what follows from people's changes.
-
-        Returns:
-            Whether there was something to publish.
-        """
+        """Commit and publish what follows from people's changes; return whether anything did."""
         for _ in range(_TRIES):
             line = self._new_commit_line()
             if line.publish():
                 self._on_published(line)
                 return line.head.commit != line.start.commit
             self._repository.refresh()
-            self._given_up.wait(random.uniform(0, _LONGEST_PAUSE_S))  # noqa: S311 - no secret
-        return False  # others are quicker, and follow people's changes as this generator would
+            self._stopped.wait(random.uniform(0, _LONGEST_PAUSE_S))  # noqa: S311 - not for security
+        return False  # other generators are faster, and they carry out the same changes
 
     def record_reached(self, *, pushed: bool) -> None:
-        """Note that the state repo was reached."""
+        """Record that the state repo was reached."""
         self._queue.blocked = ""
         self.remote.record_reached(pushed=pushed)
         self._timer.finished(reached=True)
 
     def record_unreachable(self, error: StateRepoError) -> None:
-        """Note that the state repo could not be reached, or takes nothing."""
-        if self._given_up.is_set():  # nobody tries again, so it is no news
+        """Record that the state repo cannot be reached or written."""
+        if self._stopped.is_set():  # nobody tries again, so nobody needs to know
             return
         self._queue.blocked = str(error)
         self.remote.record_unreachable(str(error))
         self._timer.finished(reached=False)
 
     def log_problems(self, problems: Iterable[Fault]) -> None:
-        """Log what is not valid, and what is again, once each."""
-        found = list(dict.fromkeys(problems))
-        for one in found:
-            if one not in self._logged:
-                log.error("%s (its last valid version stays in force)", one)
-        for file in sorted({one.file for one in self._logged} - {one.file for one in found}):
-            log.info("%s: what was not valid is mended", file or "the state repo")
-        self._logged = frozenset(found)
+        """Log each fault once, and each file once that is valid again."""
+        current = list(dict.fromkeys(problems))
+        for problem in current:
+            if problem not in self._logged:
+                log.error("%s (its last valid version stays in effect)", problem)
+        for file in sorted({old.file for old in self._logged} - {new.file for new in current}):
+            log.info("%s is valid again", file or "the state repo")
+        self._logged = frozenset(current)

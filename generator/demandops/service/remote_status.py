@@ -1,4 +1,4 @@
-"""Whether the state repo can be reached and is valid, for logs and diagnostics."""
+"""Whether the remote can be reached and the state repo is valid, for logs and diagnostics."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ log = logging.getLogger("demandops")
 
 @dataclass(frozen=True, slots=True)
 class RemoteStatus:
-    """What is known of reaching the state repo.
+    """Whether the remote can be reached.
 
-    ``trouble`` is why it cannot be read or written at the moment, since ``since``; ``denied`` why
-    it took the last push not; ``pushed`` is when something was last published from here.
+    ``unreachable`` is why the remote cannot be read or written now, or empty; ``push_denied`` is
+    why it rejected the last push, or empty.
     """
 
     unreachable: str = ""
@@ -28,10 +28,10 @@ class RemoteStatus:
 
 @dataclass(frozen=True, slots=True)
 class StateRepoStatus:
-    """How it is with the state repo, for diagnostics.
+    """The status of the state repo.
 
-    ``problems`` are what is not valid there, ``waiting`` the demands that are kept in the outbox,
-    ``commit`` the newest commit that was taken in.
+    ``problems`` are the faults in its files, ``unpublished`` the number of demands in the journal
+    that do not await approval, ``commit`` the newest commit that the generator has read.
     """
 
     remote: RemoteStatus
@@ -41,7 +41,7 @@ class StateRepoStatus:
 
 
 class RemoteMonitor:
-    """Whether the state repo can be reached; ``contact`` may be read from any thread."""
+    """Records and logs whether the remote can be reached; any thread may read ``status``."""
 
     def __init__(self, address: str) -> None:
         self._address = address
@@ -49,11 +49,11 @@ class RemoteMonitor:
 
     @property
     def is_unreachable(self) -> bool:
-        """Whether the last that was heard is that it cannot be reached."""
+        """Whether the last attempt to reach the remote failed."""
         return bool(self.status.unreachable)
 
     def record_unreachable(self, reason: str) -> None:
-        """Note that it cannot be reached or takes nothing; logged when it could before."""
+        """Record that the remote cannot be reached; warn if it could be before."""
         if not self.is_unreachable:
             log.warning("%s; trying again until it is back", reason)
             self.status = replace(self.status, unreachable_since=_now())
@@ -62,7 +62,7 @@ class RemoteMonitor:
         self.status = replace(self.status, unreachable=reason)
 
     def record_reached(self, *, pushed: bool = False) -> None:
-        """Note that it was reached; logged when it was away before."""
+        """Record that the remote was reached; log it if it could not be before."""
         now = _now()
         before = self.status
         if before.unreachable:
@@ -75,7 +75,7 @@ class RemoteMonitor:
         )
 
     def record_push_denied(self, reason: str) -> None:
-        """Note that it was reached and took no push; whoever waited for it is told."""
+        """Record that the remote was reached and rejected a push."""
         self.record_reached()
         self.status = replace(self.status, push_denied=reason)
 

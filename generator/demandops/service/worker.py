@@ -1,4 +1,4 @@
-"""Settling: a batch of demands is judged, committed and published, however often the remote moves.
+"""The worker: evaluates, commits and publishes batches of demands, again if the remote has moved.
 
 Belongs to one thread, the only one that writes to the state repo.
 """
@@ -33,14 +33,14 @@ _TIDY_EVERY = 300
 class Worker:
     """Turns batches of demands into published commits.
 
-    ``snapshot`` is the newest published state; it may be read from any thread.
+    ``snapshot`` is the newest published state; any thread may read it.
     """
 
     def __init__(
         self,
         repository: StateRepository,
         snapshot: Snapshot,
-        waiting: DemandQueue,
+        queue: DemandQueue,
         on_published: Callable[[Config], None],
         with_targets: bool,
         approvals: Approvals,
@@ -49,9 +49,9 @@ class Worker:
         self.snapshot = snapshot
         self._approvals = approvals
         self._repository = repository
-        self._queue = waiting
+        self._queue = queue
         self._on_published = on_published
-        self._evaluator = Evaluator(repository, waiting, approvals, with_targets)
+        self._evaluator = Evaluator(repository, queue, approvals, with_targets)
         self._must_fetch = False
         self._tip_is_fresh = False
         self._commits_since_tidy = 0
@@ -61,79 +61,84 @@ class Worker:
         self._stopped_retrying = threading.Event()
         embedded = repository.always_current
         self.fetcher = Fetcher(
-            repository, waiting, fetch_interval, self._new_commit_line, self._set_snapshot
+            repository, queue, fetch_interval, self._new_commit_line, self._set_snapshot
         )
         self._batch_limit = LIMIT_EMBEDDED if embedded else LIMIT_REMOTE
 
     def stop_retrying(self) -> None:
-        """Stop waiting for a remote that is away; from any thread."""
+        """Stop waiting for a remote that cannot be reached; from any thread."""
         self._stopped_retrying.set()
         self.fetcher.stop_retrying()
         self._repository.give_up()
         self._queue.wake()
 
     def take(self, batch: list[Ticket]) -> None:
-        """Move what waits into ``batch``, and behind it the demands whose lease ran out.
+        """Move queued demands into ``batch``, then the releases of ended leases.
 
-        A renewal that waits was received before: it is judged first, or nothing expires yet.
+        No lease ends while demands are queued, because one of them may renew it.
         """
-        self._take(batch)
+        self._take_queued(batch)
         if not self._queue.has_waiting:
             batch += self._lease_expiry.tickets(self.snapshot.state.ledger)
 
-    def _take(self, batch: list[Ticket]) -> None:
+    def _take_queued(self, batch: list[Ticket]) -> None:
         self._queue.take(batch, self._batch_limit)
         self._approvals.resume(batch, self.snapshot.state)
 
     def publish(self, batch: list[Ticket]) -> None:
-        """Bring a batch to an end, with what comes in while the remote moves, and empty it.
+        """Publish a batch, with the demands that arrive during retries, and empty it.
 
         Raises:
-            ShuttingDown: where it was given up; the demands are still in the batch.
-            DemandOpsError: where the state repo cannot be used; likewise.
+            ShuttingDown: after :meth:`stop_retrying`; the demands are still in the batch.
+            DemandOpsError: if the state repo cannot be used; likewise.
         """
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
-        pace = Backoff(self._batch_limit)
+        backoff = Backoff(self._batch_limit)
         while batch:
             try:
-                wait = self._attempt(batch, pace)
+                wait = self._attempt(batch, backoff)
             except RemoteAway as error:
                 _mark_maybe_published(batch, self.snapshot)
                 self.fetcher.record_unreachable(error)
                 self._tip_is_fresh = self._repository.always_current
-                wait = pace.unreachable()
+                wait = backoff.unreachable()
             if wait is None:
                 continue
-            # waited before the fetch: what is judged then is pushed while it is fresh
+            # wait before the fetch, not after it: the push must follow the fetch closely
             self._wait_to_retry(batch, wait)
             if self._stopped_retrying.is_set():
                 raise ShuttingDown(
-                    "the remote is away; the demand stays in the outbox for the next start"
+                    "the remote cannot be reached; the demand stays in the journal and is resumed "
+                    "at the next start"
                 )
-            self._take(batch)
+            self._take_queued(batch)
 
-    def _attempt(self, batch: list[Ticket], pace: Backoff) -> float | None:
-        """Judge and publish a part of a batch; return how long to wait where that was in vain.
+    def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:
+        """Evaluate and publish a part of a batch.
+
+        Returns:
+            The seconds to wait before the next attempt, or None to continue at once.
 
         Raises:
-            RemoteAway: where the remote cannot be reached.
+            RemoteAway: if the remote cannot be reached.
         """
-        # of a remote that is away nothing is judged: what is committed stays in
+        # fetch first: a demand that was committed can no longer be withdrawn
         if self._must_fetch or self.fetcher.remote.is_unreachable:
             self._repository.refresh()
             self._must_fetch, self._tip_is_fresh = False, True
         self._queue.answer_withdrawn(batch)
-        part = batch[: pace.max_demands]
+        part = batch[: backoff.max_demands]
         self._approvals.remove_released(part, self.snapshot.state)
         line = self._new_commit_line()
         began = time.monotonic()
-        arrived = self._evaluator.published_before(line.start, part)
+        published = self._evaluator.published_before(line.start, part)
         results: list[Result] = []
         for ticket in part:
-            results.append((ticket, self._evaluator.evaluate(line, ticket, arrived, results)))
-        judged = time.monotonic()
+            result = self._evaluator.evaluate(line, ticket, published, results)
+            results.append((ticket, result))
+        evaluated = time.monotonic()
         if line.head.commit == line.start.commit and not self._tip_is_fresh:
-            # only a push would have shown that the remote has moved
+            # nothing to push, so only a fetch shows whether the remote has moved
             tip = self._repository.refresh()
             self._tip_is_fresh = True
             if tip != line.start.commit:
@@ -141,23 +146,23 @@ class Worker:
         if self._publish_line(line, results):
             self._answer(results)
             del batch[: len(part)]
-            pace.published()
+            backoff.published()
             return None
-        log.info("the state repo has moved; judging %d demands again", len(part))
+        log.info("the state repo has moved; evaluating %d demands again", len(part))
         _mark_maybe_published(part, line.start)
         self._must_fetch = True
-        return pace.overtaken(len(part), judged - began, time.monotonic() - judged)
+        return backoff.overtaken(len(part), evaluated - began, time.monotonic() - evaluated)
 
     def _answer(self, results: list[Result]) -> None:
-        """Answer what is settled; what needs approval waits on."""
-        told = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
-        self._queue.answer(told)
+        """Answer the demands that have a final result; propose those that need approval."""
+        final = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
+        self._queue.answer(final)
         for ticket, result in results:
             if isinstance(result, Deferred):
                 self._approvals.add(ticket, result.decision)
 
     def check_proposals(self) -> None:
-        """Look after the demands that await approval, with main as it is now."""
+        """Check the demands that await approval against the newest main, if it is time to."""
         if not self._approvals.is_due(str(self.snapshot.commit)):
             return
         try:
@@ -165,55 +170,57 @@ class Worker:
             if heads.main != str(self.snapshot.commit):
                 self._repository.refresh()
                 self.fetcher.carry_out_changes()
-            # a branch that is gone may have been merged: only a newer main tells
+            # a deleted branch may have been merged: only a main at least as new shows that
             if self._repository.includes(str(self.snapshot.commit), heads.main):
                 self._approvals.check(self.snapshot, heads)
         except (RemoteAway, PushDenied) as error:
-            log.warning("%s; the demands that await approval wait on", error)
+            log.warning("%s; the demands that await approval keep waiting", error)
 
     def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
-        """Let a while pass; demands that come in meanwhile are kept, and told why they wait."""
+        """Wait; meanwhile journal new demands and report to them why they wait."""
         end = time.monotonic() + seconds
-        told = list(batch)
+        to_notify = list(batch)
         while not self._stopped_retrying.is_set():
             if self.fetcher.remote.is_unreachable:
-                for ticket in told:
+                for ticket in to_notify:
                     ticket.notify("away", f"waiting: {self.fetcher.remote.status.unreachable}")
             self._queue.answer_withdrawn(batch)
             left = end - time.monotonic()
             if left <= 0:
                 return
-            told = self._queue.journal_arrivals(left)
+            to_notify = self._queue.journal_arrivals(left)
 
     def seconds_until_due(self) -> float:
-        """Return the seconds until leases, overrides, proposals or the state repo are due."""
+        """Return the seconds until a lease, override, proposal or fetch is due."""
         state = self.snapshot.state
-        ends = self._lease_expiry.seconds_until_due(
-            state.ledger, self._approvals.seconds_until_due(LONGEST_WAIT_S)
-        )
-        ends = self._override_expiry.seconds_until_due(state.config, _now(), ends)
-        look = self.fetcher.seconds_until_due()
-        return ends if look is None else min(ends, look)
+        seconds = self._approvals.seconds_until_due(LONGEST_WAIT_S)
+        seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
+        seconds = self._override_expiry.seconds_until_due(state.config, _now(), seconds)
+        fetch = self.fetcher.seconds_until_due()
+        return seconds if fetch is None else min(seconds, fetch)
 
     def retry_changes(self) -> None:
-        """Try again what people changed and could not be carried out: a release may allow it."""
+        """Carry out quarantined changes again, because a release may have made them possible."""
         if self.snapshot.problems:
             self.fetcher.carry_out_changes()
 
     def fetch_if_due(self) -> None:
-        """Take in what others published, while no demand comes, and end overrides."""
+        """Carry out what others pushed and end overrides, while no demand comes."""
         due = self._override_expiry.is_due(self.snapshot.state.config, _now())
         if not self.fetcher.fetch_if_due(self.snapshot, due):
             self._override_expiry.postpone(_now())
 
     def tidy(self) -> None:
-        """Every few hundred commits: a demand leaves some twenty loose objects behind."""
+        """Pack the repository every few hundred commits: each leaves some twenty loose objects."""
         if self._commits_since_tidy >= _TIDY_EVERY:
             self._commits_since_tidy = 0
             self._repository.tidy()
 
     def _publish_line(self, line: commit_line.CommitLine, results: list[Result]) -> bool:
-        """Publish a line; what the remote denies becomes the answer of all that is in it."""
+        """Publish a commit line; return False if another writer was first.
+
+        If the remote rejects the push for another reason, that is the answer of all its demands.
+        """
         try:
             published = line.publish()
         except PushDenied as error:
@@ -229,11 +236,11 @@ class Worker:
 
     def _set_snapshot(self, line: commit_line.CommitLine) -> None:
         before, self.snapshot = self.snapshot, line.head
-        if line.head.commit != before.commit:  # a merge may ask for no commit of our own
+        if line.head.commit != before.commit:  # a merge may need no commit of the generator
             self._on_published(line.head.state.config)
 
     def _new_commit_line(self) -> commit_line.CommitLine:
-        """Start a line on the newest tip that is known, people's changes taken in."""
+        """Return a commit line on the newest known tip, which carries out people's changes."""
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems:

@@ -248,7 +248,7 @@ def test_a_release_of_what_waits_takes_the_branch_away(
         assert [proposed.branch] == branches(bare)
         assert rig.book(generator, leave(1))[0].outcome == "released"
         assert branches(bare) == []
-        with pytest.raises(Withdrawn, match="given up"):
+        with pytest.raises(Withdrawn, match="released by a later request"):
             rig.receipt(proposed.ticket)
         with pytest.raises(Refused):
             rig.book(generator, leave(1))

@@ -30,13 +30,13 @@ def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew()
 def test_a_line_is_as_long_as_can_be_judged_while_it_is_pushed() -> None:
     pace = Backoff(200)
     assert pace.max_demands == 200
-    pace.overtaken(100, judging_s=0.1, pushing_s=0.2)
+    pace.overtaken(100, evaluating_s=0.1, pushing_s=0.2)
     assert pace.max_demands == 100
-    pace.overtaken(100, judging_s=1.0, pushing_s=0.2)
+    pace.overtaken(100, evaluating_s=1.0, pushing_s=0.2)
     assert pace.max_demands == 20
-    pace.overtaken(2, judging_s=100.0, pushing_s=0.2)
+    pace.overtaken(2, evaluating_s=100.0, pushing_s=0.2)
     assert pace.max_demands == 1
-    pace.overtaken(1, judging_s=0.0, pushing_s=0.2)
+    pace.overtaken(1, evaluating_s=0.0, pushing_s=0.2)
     assert pace.max_demands == 1
     pace.published()
     assert pace.max_demands == 200

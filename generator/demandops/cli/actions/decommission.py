@@ -77,7 +77,9 @@ def _held_by_nobody(error: Refused, name: str, snapshot: Snapshot) -> bool:
 
 def _done(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any]:
     with progress("reading the ledger") as tell:
-        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=tell)
+        generator = Generator(
+            state_repo, start_offline=False, signing_key=signing_key, progress=tell
+        )
     try:
         receipt = generator.submit(goal).future.result()
         return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)

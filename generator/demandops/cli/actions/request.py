@@ -152,7 +152,9 @@ def _book(
     documents: list[_Document], state_repo: str, wait: bool, signing_key: Path | None
 ) -> list[dict[str, Any]]:
     with progress("reading the ledger") as tell:
-        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=tell)
+        generator = Generator(
+            state_repo, start_offline=False, signing_key=signing_key, progress=tell
+        )
     try:
         answers = [_handed_in(generator, document, wait) for document in documents]
         rows = []

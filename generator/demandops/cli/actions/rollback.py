@@ -125,7 +125,7 @@ def _consequence(decision: Decision | None) -> dict[str, Any]:
 def _done(state_repo: str, wish: _Wish, key: Path | None, base: str) -> dict[str, Any]:
     """Have a generator roll back; tell what it came to, on whatever it was judged."""
     with progress("reading the ledger") as tell:
-        generator = Generator(state_repo, patient=False, signing_key=key, progress=tell)
+        generator = Generator(state_repo, start_offline=False, signing_key=key, progress=tell)
     try:
         goal = rollbacks.goal(wish.to, drop_newer=wish.drop_newer, reason=wish.reason, who=wish.who)
         receipt = generator.submit(goal).future.result()

@@ -1,7 +1,7 @@
-"""Approval: demands that wait until a person merges their branch, turns them down, or they go.
+"""The proposals that await approval, and what becomes of them.
 
-Belongs to the thread that settles demands. A proposal is complete when main holds what it asks,
-however it came there; until then it is kept such that merging it gives what main would render.
+Belongs to the worker thread. A proposal is complete once main has its claims, however they got
+there. Until then its branch is kept up to date: merging it must give what main would render.
 """
 
 from __future__ import annotations
@@ -41,47 +41,47 @@ log = logging.getLogger("demandops")
 
 CHECK_EMBEDDED_S = 1.0
 CHECK_REMOTE_S = 5.0
-"""Between two looks at the branches: that one was deleted shows nowhere else."""
-_SHARE = 9
-"""Comparing proposals with a main that keeps moving may take a tenth of the time, not more."""
+"""Between two checks of the branches, because nothing else shows that one was deleted."""
+_PAUSE_FACTOR = 9
+"""Each check is followed by a pause nine times as long, so checks take a tenth of the time."""
 
-_UNFINISHED = "trouble"
+_UNFINISHED = "unfinished"
 
-RELEASED = "was given up by a later request before it was approved"
+RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
 
 
 @dataclass(frozen=True, slots=True)
 class Deferred:
-    """What comes of a demand for now: it needs approval."""
+    """The result of a demand that needs approval."""
 
     decision: Decision
 
 
 class Approvals:
-    """The proposals that wait, and what is done about them."""
+    """The proposals that await approval."""
 
     def __init__(
         self,
         repository: StateRepository,
-        waiting: DemandQueue,
+        queue: DemandQueue,
         with_targets: bool,
         token_file: Path | None,
     ) -> None:
         self._repository = repository
-        self._queue = waiting
+        self._queue = queue
         self._with_targets = with_targets
-        self._branch_sync = BranchSync(repository, waiting, token_file, self._on_forge_update)
+        self._branch_sync = BranchSync(repository, queue, token_file, self._on_forge_update)
         self._proposals: dict[Key, Proposal] = {}
         self._releasing: set[str] = set()
         self._interval = CHECK_EMBEDDED_S if repository.always_current else CHECK_REMOTE_S
         self._changed: deque[str] = deque()
         self._checked_at, self._check_began, self._rest_until, self._next_check = "", 0.0, 0.0, 0.0
 
-    # ---- while a batch is judged ----
+    # ---- while a batch is evaluated ----
 
     def resume(self, batch: list[Ticket], state: State) -> None:
-        """Take out of a batch what an earlier run has proposed already."""
+        """Move the demands that an earlier run proposed from the batch to their proposals."""
         for ticket in [ticket for ticket in batch if ticket.proposal is not None]:
             batch.remove(ticket)
             request = admit_or_none(state, ticket.goal)
@@ -92,7 +92,7 @@ class Approvals:
             )
             if proposal is None:
                 key = key_of(request) if request else ("operation", ticket.operation)
-                if key in self._proposals:  # another run's, of the same demand
+                if key in self._proposals:  # an earlier run proposed the same demand
                     key = ("operation", ticket.operation)
                 proposal = self._proposals[key] = Proposal(key, record, searched_to=ticket.base)
             proposal.tickets.append(ticket)
@@ -100,13 +100,13 @@ class Approvals:
             self._changed.append(proposal.branch)
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
-        """Take away proposals that demands of the batch give up, before these are judged.
+        """Remove the proposals that demands of the batch release, before these are evaluated.
 
-        Once its branch is gone nobody can merge it; what was merged before is on the tip that the
-        demands are judged on next.
+        Once its branch is deleted, nobody can merge a proposal. If it was merged before, it is on
+        the tip on which the demands are evaluated next.
 
         Raises:
-            RemoteAway, PushDenied: where the branch could not be taken away.
+            RemoteAway, PushDenied: if the branch could not be deleted.
         """
         for ticket in batch if self._proposals else ():
             request = admit_or_none(state, ticket.goal) if is_release(ticket.goal) else None
@@ -122,26 +122,26 @@ class Approvals:
     def released_in_batch(
         self, ticket: Ticket, state: State, earlier: Iterable[tuple[Ticket, object]]
     ) -> set[str]:
-        """Return the operations of this pass that a demand gives up before they are proposed."""
+        """Return the operation ids of the earlier demands that a demand releases."""
         request = admit_or_none(state, ticket.goal) if is_release(ticket.goal) else None
         if request is None:
             return set()
-        found = {
+        released = {
             other.operation
             for other, result in earlier
             if isinstance(result, Deferred)
-            and _alone(other, result.decision).is_released_by(request)
+            and _proposal_of(other, result.decision).is_released_by(request)
         }
-        if found:
+        if released:
             self._releasing.add(ticket.operation)
-        return found
+        return released
 
     def has_released_a_proposal(self, ticket: Ticket) -> bool:
-        """Tell whether a demand gave a proposal up: then it is no fault that it holds nothing."""
+        """Return whether a demand released a proposal; then it may hold no claims."""
         return ticket.operation in self._releasing
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
-        """Take in a demand that needs approval; one of the same demand waits with it."""
+        """Add a demand that needs approval, to an existing proposal of the same demand if any."""
         request, key = decision.request, key_of(decision.request)
         proposal = self._proposals.get(key)
         if proposal is not None and not proposal.requesters() & set(request.requesters()):
@@ -164,15 +164,15 @@ class Approvals:
         self._changed.append(proposal.branch)
 
     def withdraw_replaced(self, request: DemandRequest) -> None:
-        """Give up the proposal of a demand that was put anew and needs no approval."""
+        """Withdraw the proposal of a demand that was put again and needs no approval now."""
         proposal = self._proposals.get(key_of(request))
         if proposal is not None and request.operation is Operation.PUT:
             self._queue.withdraw_proposed(proposal.tickets, REPLACED)
 
-    # ---- after main was taken in ----
+    # ---- after main was read ----
 
     def is_due(self, tip: str) -> bool:
-        """Tell whether to look at the proposals now, with main at ``tip``."""
+        """Return whether to check the proposals now, with main at ``tip``."""
         if not self._proposals:
             return False
         now = time.monotonic()
@@ -186,26 +186,26 @@ class Approvals:
         return now >= self._next_check or (tip != self._checked_at and now >= self._rest_until)
 
     def seconds_until_due(self, longest: float) -> float:
-        """Return the seconds until the next look is due, ``longest`` where nothing waits."""
+        """Return the seconds until the next check; ``longest`` without proposals."""
         if not self._proposals:
             return longest
         return min(longest, max(self._next_check - time.monotonic(), 0.05))
 
     def fetch_heads(self) -> Heads:
-        """Ask where the branches are; the next look is due after a while, whatever comes."""
+        """Fetch the commits of the branches, and plan the next check even if this one fails."""
         self._check_began = time.monotonic()
         self._next_check, self._checked_at = self._check_began + self._interval, _UNFINISHED
         return self._branch_sync.fetch_heads()
 
     def check(self, snapshot: Snapshot, heads: Heads) -> None:
-        """Look at each proposal: is it decided, does it go, does it still fit main?
+        """Answer the proposals that are decided or withdrawn, and update the others.
 
         Args:
             snapshot: main, no older than ``heads``.
-            heads: where the branches are.
+            heads: the commits of the branches.
 
         Raises:
-            RemoteAway: where the remote does not answer any more; the rest is for the next time.
+            RemoteAway: if the remote cannot be reached; the next check continues.
         """
         while self._changed:
             branch = self._changed.popleft()
@@ -217,11 +217,11 @@ class Approvals:
                 if not proposal.is_unchanged(str(snapshot.commit), heads.branches):
                     self._check(proposal, snapshot, heads)
             except BranchMoved as error:
-                log.info("%s; looking again", error)
+                log.info("%s; checking again", error)
                 self._changed.append(proposal.branch)
             except SigningFailed as error:
-                if proposal.record.pushed:  # it stands as it is, and may be merged
-                    log.warning("%s; %s is not laid anew", error, proposal.branch)
+                if proposal.record.pushed:  # the existing branch can still be merged
+                    log.warning("%s; %s is not rebuilt", error, proposal.branch)
                 else:
                     self._fail(proposal, error)
             except PushDenied as error:
@@ -229,7 +229,7 @@ class Approvals:
         ended = time.monotonic()
         self._checked_at, self._rest_until = (
             str(snapshot.commit),
-            ended + _SHARE * (ended - self._check_began),
+            ended + _PAUSE_FACTOR * (ended - self._check_began),
         )
 
     def _fail(self, proposal: Proposal, error: DemandOpsError) -> None:
@@ -259,7 +259,7 @@ class Approvals:
         if not left:
             self._forget(proposal, close=not done)
             return
-        if done and proposal.branch not in heads.branches:  # what was not merged goes on
+        if done and proposal.branch not in heads.branches:  # only a part was merged
             proposal.record = replace(proposal.record, pushed=False)
         head = heads.branches.get(proposal.branch, "")
         if self._branch_sync.update(proposal, left, snapshot, head):
@@ -270,10 +270,10 @@ class Approvals:
     def _verdict(
         self, ticket: Ticket, snapshot: Snapshot, arrived: dict[str, Arrival]
     ) -> Receipt | DemandOpsError | Decision:
-        """Return what became of a demand: booked, refused, taken back, or how it still stands.
+        """Return the receipt or error of a demand that is decided, else its decision on main.
 
-        It is booked where main's history has its operation, or main's books hold what it asks: a
-        squash may lose the trailer, and never the claims.
+        It is booked if the history of main has its operation id, or if the ledger has its claims:
+        a squash merge may lose the trailer.
         """
         read = commit_line.CommitLine(self._repository, snapshot).read
         decision: Decision | DemandOpsError
@@ -281,9 +281,9 @@ class Approvals:
             decision = decide(snapshot.state, ticket.goal, ticket.received, read)
         except InvalidInput as error:
             decision = error
-        here = arrived.get(ticket.operation)
-        if here is not None or (isinstance(decision, Decision) and not decision.files):
-            commit = here.commit if here else str(snapshot.commit)
+        arrival = arrived.get(ticket.operation)
+        if arrival is not None or (isinstance(decision, Decision) and not decision.files):
+            commit = arrival.commit if arrival else str(snapshot.commit)
             return self._receipt(ticket, decision, snapshot.state, commit)
         if ticket.state == "withdrawn" and ticket.proposal:
             return Withdrawn(ticket.proposal.withdrawn or TAKEN_BACK)
@@ -292,7 +292,7 @@ class Approvals:
     def _receipt(
         self, ticket: Ticket, decision: Decision | DemandOpsError, state: State, commit: str
     ) -> Receipt:
-        if not isinstance(decision, Decision) or decision.files:  # merged, and undone since
+        if not isinstance(decision, Decision) or decision.files:  # merged, and changed since
             goal = ticket.goal if isinstance(ticket.goal, dict) else {}
             name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
             return Receipt(ticket.operation, str(name), "booked", commit)
@@ -313,19 +313,19 @@ class Approvals:
     # ---- the end ----
 
     def _on_forge_update(self, branch: str) -> None:
-        """Have the answer of a forge told; from the desk's thread."""
+        """Check a branch again, because the forge answered; from the forge worker's thread."""
         self._changed.append(branch)
         self._queue.wake()
 
     def suspend(self) -> None:
-        """Answer all that waits; the journal keeps it for the next start."""
-        error = ShuttingDown("awaits approval; it is taken up again at the next start")
+        """Answer all demands that await approval; the journal keeps them for the next start."""
+        error = ShuttingDown("awaits approval; it is resumed at the next start")
         for proposal in self._proposals.values():
             self._queue.fail(proposal.tickets, error, keep=True)
         self._proposals = {}
 
 
-def _alone(ticket: Ticket, decision: Decision) -> Proposal:
-    """Return the proposal that a demand would be by itself."""
+def _proposal_of(ticket: Ticket, decision: Decision) -> Proposal:
+    """Return a proposal with one demand."""
     request = decision.request
     return Proposal(key_of(request), ProposalRecord(""), [ticket], [request])

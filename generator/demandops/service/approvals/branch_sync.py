@@ -1,7 +1,7 @@
-"""Keeping proposals: their branches and the requests to merge them, as main moves on.
+"""Keeps the branches and pull requests of proposals up to date while main moves on.
 
-Belongs to the thread that settles demands; knows how a proposal stands, not what is to become of
-it (:mod:`demandops.service.approvals.approvals`).
+Belongs to the worker thread. What becomes of a proposal is decided in
+:mod:`demandops.service.approvals.approvals`.
 """
 
 from __future__ import annotations
@@ -33,30 +33,30 @@ log = logging.getLogger("demandops")
 
 
 class BranchSync:
-    """Puts proposals where a person finds them, and takes them away again."""
+    """Creates, updates and deletes the branches of proposals."""
 
     def __init__(
         self,
         repository: StateRepository,
-        waiting: DemandQueue,
+        queue: DemandQueue,
         token_file: Path | None,
-        on_news: Callable[[str], None],
+        on_update: Callable[[str], None],
     ) -> None:
         self._repository = repository
-        self._queue = waiting
+        self._queue = queue
         self._branches = Branches(repository)
-        self._forge = ForgeWorker(token_file, on_news)
+        self._forge = ForgeWorker(token_file, on_update)
 
     def fetch_heads(self) -> Heads:
-        """Ask where the branches are.
+        """Fetch the commits of main and of the branches.
 
         Raises:
-            RemoteAway: where the remote does not answer.
+            RemoteAway: if the remote cannot be reached.
         """
         return self._branches.heads()
 
     def turned_down_because(self, proposal: Proposal, heads: Heads) -> str:
-        """Return how a person turned a proposal down that is not on main; empty where none did."""
+        """Return how a person turned a proposal down that is not on main, or empty."""
         request = self._forge.pull_request(proposal.branch)
         if proposal.record.pushed and proposal.branch not in heads.branches:
             return f"was turned down: {proposal.branch} is gone and was not merged"
@@ -65,17 +65,17 @@ class BranchSync:
         return ""
 
     def delete(self, proposal: Proposal, heads: Heads, *, if_unchanged: bool = False) -> None:
-        """Delete the branch; ``if_unchanged``: not where somebody else has worked on it.
+        """Delete the branch; ``if_unchanged``: unless a person committed to it.
 
         Raises:
-            BranchMoved, RemoteAway, PushDenied: where it could not be deleted.
+            BranchMoved, RemoteAway, PushDenied: if it could not be deleted.
         """
         head = heads.branches.get(proposal.branch)
         if head and (not if_unchanged or head in proposal.record.commits):
             self._branches.remove(proposal.branch, head)
 
     def forget(self, proposal: Proposal, *, close: bool) -> None:
-        """Ask nobody any more; ``close`` the request where it is open."""
+        """Stop watching the pull request; ``close``: also close it if it is open."""
         self._forge.forget(proposal.branch, close=close)
 
     def update(
@@ -85,19 +85,19 @@ class BranchSync:
         snapshot: Snapshot,
         head: str,
     ) -> bool:
-        """Put the branch where merging it gives what main would render now.
+        """Update the branch, so that merging it gives what main would render now.
 
         Args:
-            left: the demands that still need approval, and how each stands on main.
-            head: where the branch is; empty where there is none yet.
+            left: the demands that still need approval, each with its decision on main.
+            head: the commit of the branch; empty if there is no branch yet.
 
         Returns:
-            False where a demand was taken back meanwhile: look again.
+            False if a demand was withdrawn meanwhile and the proposal must be checked again.
 
         Raises:
-            BranchMoved, RemoteAway, PushDenied: where the branch could not be put there.
+            BranchMoved, RemoteAway, PushDenied: if the branch could not be pushed.
         """
-        proposal.reasons = tuple(dict.fromkeys(who for _, d in left for who in d.approval))
+        proposal.reasons = tuple(dict.fromkeys(reason for _, d in left for reason in d.approval))
         proposal.requests = [decision.request for _, decision in left]
         record = proposal.record
         if head and head not in record.commits:
@@ -110,9 +110,9 @@ class BranchSync:
             if not steps:
                 return False
             files = {path: text for _, d in steps for path, text in d.files.items()}
-            made = self._branches.tree(snapshot.commit, files)
-            stands = head and self._branches.is_fresh(snapshot.commit, head, record.base, made)
-            if not stands and not self._commit_and_push(proposal, steps, snapshot, head):
+            tree = self._branches.tree(snapshot.commit, files)
+            is_fresh = head and self._branches.is_fresh(snapshot.commit, head, record.base, tree)
+            if not is_fresh and not self._commit_and_push(proposal, steps, snapshot, head):
                 return False
         forge = snapshot.state.config.repository.proposals
         message = self._branches.message(proposal.record.commits[-1])
@@ -120,7 +120,7 @@ class BranchSync:
         if forge.forge in ("github", "gitea"):
             self._forge.open(forge, proposal.branch, title, body)
             if not self._forge.has_answered(proposal.branch):
-                return True  # told together with the link
+                return True  # the requester is notified once the link is known
         self._notify(proposal)
         return True
 
@@ -133,13 +133,13 @@ class BranchSync:
 
     def _mark_edited(self, proposal: Proposal) -> None:
         if not proposal.edited:
-            log.info("%s was changed by somebody else and is left to them", proposal.branch)
+            log.info("%s has commits by a person and is left as it is", proposal.branch)
         proposal.edited = True
 
     def _decide(
         self, left: list[tuple[Ticket, Decision]], snapshot: Snapshot
     ) -> tuple[list[tuple[Ticket, Decision]], list[tuple[Ticket, DemandOpsError]]]:
-        """Judge what is left one after the other, with leases that count from the approval."""
+        """Decide the demands one after the other, with leases that start at the approval."""
         line = commit_line.CommitLine(self._repository, snapshot)
         state, written = snapshot.state, dict[str, str | None]()
         steps, faulty = list[tuple[Ticket, Decision]](), list[tuple[Ticket, DemandOpsError]]()
@@ -167,34 +167,36 @@ class BranchSync:
         snapshot: Snapshot,
         head: str,
     ) -> bool:
-        """Commit the demands on main as it is and put the branch there; false where one goes."""
+        """Commit the demands on main and push the branch; return False if one was withdrawn."""
         line = commit_line.CommitLine(self._repository, snapshot)
         now = datetime.now(timezone.utc)
         for ticket, step in steps:
             if step.files:
                 line.commit(step, ticket.operation, ticket.received, now, proposal.branch)
-        made, old = str(line.head.commit), proposal.record
-        record = replace(old, commits=(head, made) if head else (made,), base=str(snapshot.commit))
+        commit, old = str(line.head.commit), proposal.record
+        record = replace(
+            old, commits=(head, commit) if head else (commit,), base=str(snapshot.commit)
+        )
         if not self._journal(proposal, record):
             return False
-        options = self._options(proposal, snapshot, made)
+        options = self._options(proposal, snapshot, commit)
         link = self._branches.put(proposal.branch, line.head.commit, head, options)
         self._journal(proposal, replace(record, pushed=True, link=link or old.link))
-        log.info("%s %s", proposal.branch, "is laid anew" if head else "awaits approval")
+        log.info("%s %s", proposal.branch, "was rebuilt" if head else "awaits approval")
         return True
 
-    def _options(self, proposal: Proposal, snapshot: Snapshot, made: str) -> list[str]:
+    def _options(self, proposal: Proposal, snapshot: Snapshot, commit: str) -> list[str]:
         forge = snapshot.state.config.repository.proposals
         if forge.forge != "gitlab":
             return []
-        message = self._branches.message(made)
+        message = self._branches.message(commit)
         title = message.split("\n", 1)[0]
         return gitlab_options(
             title, push_option_description(message, proposal.reasons), forge.labels
         )
 
     def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
-        """Keep a record in the journal, for each demand; false where one was taken back."""
+        """Journal a record for each demand; return False if one was withdrawn."""
         proposal.record = record
-        kept = [self._queue.set_proposal(ticket, record) for ticket in proposal.tickets]
-        return all(kept)
+        waiting = [self._queue.set_proposal(ticket, record) for ticket in proposal.tickets]
+        return all(waiting)

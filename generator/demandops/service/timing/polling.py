@@ -1,7 +1,6 @@
-"""When to look whether others changed the state repo, and what is known of reaching it.
+"""When to fetch from the state repo while no demand comes.
 
-Pure but for the clock that it is given. Knows nothing of Git: told of each look, it says when the
-next is due, and logs once that the remote went away and once that it is back.
+Knows no Git: it is given a clock, and its user reports the end of each fetch.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
 _SHORTEST_GAP_S = 0.5
 _EMBEDDED_S = 1.0
-"""A repository on this disk is looked at this often at least: it is one file that is read."""
+"""The longest interval for a repository on this disk, where a check reads one file."""
 
 
 def parse_interval(text: str) -> float:
     """Return the seconds of a fetch interval: a duration like ``30s``, or seconds; 0: never.
 
     Raises:
-        ValueError: where it is none.
+        ValueError: if it is neither.
     """
     if re.fullmatch(r"[0-9]{1,8}(\.[0-9]{1,6})?", text):
         return float(text)
@@ -33,14 +32,14 @@ def parse_interval(text: str) -> float:
 
 
 def _jittered(interval: float) -> float:
-    """Return a little less than the interval: a change is to be seen within it."""
-    return interval * random.uniform(0.8, 1.0)  # noqa: S311 - no secret
+    """Return a little less than the interval, so that a change is seen within it."""
+    return interval * random.uniform(0.8, 1.0)  # noqa: S311 - not for security
 
 
 class PollTimer:
-    """The times of the looks: at an interval, seldomer while the remote is away, and when told.
+    """The times of the fetches: on request and at an interval that grows while fetches fail.
 
-    ``nudge`` may be called from any thread, the rest belongs to one.
+    Any thread may call :meth:`request`; everything else belongs to one thread.
     """
 
     def __init__(
@@ -51,13 +50,13 @@ class PollTimer:
         steady: Callable[[], float] = time.monotonic,
         jittered: Callable[[float], float] = _jittered,
     ) -> None:
-        """Begin; the first look is due at once.
+        """Start the timer; the first fetch is due at once.
 
         Args:
-            interval: seconds between two looks; 0: only those that :meth:`nudge` asks for.
-            embedded: whether a look costs next to nothing.
-            steady: gives the time in seconds.
-            jittered: shortens a pause by chance, so that generators do not all look at once.
+            interval: seconds between two fetches; 0: only on :meth:`request`.
+            embedded: whether the repository is on this disk.
+            steady: returns the time in seconds.
+            jittered: shortens a pause at random, so that generators do not fetch all at once.
         """
         self._interval = min(interval, _EMBEDDED_S) if embedded else interval
         self._steady, self._jittered = steady, jittered
@@ -67,25 +66,25 @@ class PollTimer:
         self._requested = threading.Event()
 
     def request(self) -> None:
-        """Have a look taken at once; however often it is asked for meanwhile, it is one."""
+        """Make a fetch due now; requests before it starts lead to one fetch."""
         self._requested.set()
 
     def seconds_until_due(self) -> float | None:
-        """Return the seconds until the next look is due; nothing: none is."""
+        """Return the seconds until the next fetch, or None if none is planned."""
         times = [] if self._next is None else [self._next]
         if self._requested.is_set():
             times.append(self._last + _SHORTEST_GAP_S)
         return max(min(times) - self._steady(), 0.0) if times else None
 
     def start_if_due(self) -> bool:
-        """Tell whether a look is due; what is asked for from now on is another one."""
+        """Return whether a fetch is due; a request from now on leads to another fetch."""
         due = self.seconds_until_due() == 0.0
         if due:
             self._requested.clear()
         return due
 
     def finished(self, *, reached: bool) -> None:
-        """Note that the state repo was asked for what is new, here or by a push."""
+        """Plan the next fetch after a fetch or a push, which shows what is new as well."""
         longest = max(_LONGEST_BACKOFF_S, self._interval)
         self._last = self._steady()
         if self._next is not None:
@@ -93,5 +92,5 @@ class PollTimer:
             self._next = self._last + self._jittered(self._pause)
 
     def interrupted(self) -> None:
-        """Note that a look was cut short: it is still due."""
+        """Keep the fetch due, because it was cut short."""
         self._requested.set()
