@@ -202,8 +202,8 @@ class DemandNode(Node):  # type: ignore[misc]
         health = await done
         if health.reaches(level):
             return receipt
-        where = f"{health.object}: " if health.object else ""
-        return NotReached(level, f"{where}{health.reason}; it is booked in {receipt.commit}")
+        prefix = f"{health.object}: " if health.object else ""
+        return NotReached(level, f"{prefix}{health.reason}; it is booked in {receipt.commit}")
 
     def _feedback(
         self, adapter: ActionAdapter, handle: ServerGoalHandle, stage: str, text: str

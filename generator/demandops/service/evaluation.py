@@ -12,10 +12,10 @@ from typing import TypeAlias
 
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand import decommission_goal
-from demandops.demand.demand_request import Operation
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
 from demandops.service.approvals.approvals import RELEASED, Approvals, Deferred
+from demandops.service.approvals.proposal import is_release
 from demandops.service.demand_queue import TAKEN_BACK, DemandQueue
 from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import Receipt, Ticket
@@ -139,8 +139,7 @@ def _receipt_of_published(ticket: Ticket, arrival: commit_log.Arrival) -> Receip
         message = "was refused, but the reason was lost with the connection; send it again"
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal if isinstance(ticket.goal, dict) else {}
-    releases = goal.get("shutdown") or goal.get("operation") == Operation.RELEASE.value
-    releases = releases or decommission_goal.is_decommission(goal)
+    releases = is_release(goal) or decommission_goal.is_decommission(goal)
     outcome: Outcome = "released" if releases else "booked"
     if rollback_goal.is_rollback(goal):
         outcome = "restored"

@@ -1,7 +1,7 @@
 """Fetches what others push to the state repo while no demand comes, and commits what follows.
 
 Everything but :meth:`Fetcher.fetch_now` and ``Fetcher.remote`` belongs to the worker thread.
-Demands go first: a fetch stops when one arrives, whose push shows what is new as well.
+Demands go first: a fetch stops when a demand arrives, because its push shows what is new too.
 """
 
 from __future__ import annotations
@@ -68,7 +68,9 @@ class Fetcher:
         return self._timer.seconds_until_due()
 
     def fetch_if_due(self, known: Snapshot, due: bool) -> bool:
-        """Fetch if it is time to or costs nothing, and carry out what is new.
+        """Fetch if it is time to, and carry out what others pushed.
+
+        A repository on this disk is read each time, because that costs nothing.
 
         Args:
             known: the newest state that was read.
@@ -117,7 +119,7 @@ class Fetcher:
 
     def record_unreachable(self, error: StateRepoError) -> None:
         """Record that the state repo cannot be reached or written."""
-        if self._stopped.is_set():  # nobody tries again, so nobody needs to know
+        if self._stopped.is_set():  # there is no retry to report
             return
         self._queue.blocked = str(error)
         self.remote.record_unreachable(str(error))

@@ -1,4 +1,4 @@
-"""The releases that a demand needs or removes, to be looked for on the clusters."""
+"""The releases that a demand needs or removes, whose rollout the clusters report."""
 
 from __future__ import annotations
 

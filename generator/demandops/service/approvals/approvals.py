@@ -240,13 +240,13 @@ class Approvals:
         objects = self._repository.objects
         arrived = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
         proposal.searched_to = str(snapshot.commit)
-        verdicts = [(t, self._verdict(t, snapshot, arrived)) for t in proposal.tickets]
-        done = [(t, v) for t, v in verdicts if isinstance(v, Receipt)]
+        results = [(t, self._result(t, snapshot, arrived)) for t in proposal.tickets]
+        done = [(t, v) for t, v in results if isinstance(v, Receipt)]
         self._queue.answer(done)
-        proposal.tickets = [t for t, v in verdicts if not isinstance(v, Receipt)]
-        errors = [(t, v) for t, v in verdicts if isinstance(v, DemandOpsError)]
-        left = [(t, v) for t, v in verdicts if isinstance(v, Decision) and v.approval]
-        free = [t for t, v in verdicts if isinstance(v, Decision) and not v.approval]
+        proposal.tickets = [t for t, v in results if not isinstance(v, Receipt)]
+        errors = [(t, v) for t, v in results if isinstance(v, DemandOpsError)]
+        left = [(t, v) for t, v in results if isinstance(v, Decision) and v.approval]
+        free = [t for t, v in results if isinstance(v, Decision) and not v.approval]
         why_not = "" if done else self._branch_sync.turned_down_because(proposal, heads)
         if why_not:
             errors += [(ticket, TurnedDown(why_not)) for ticket, _ in left]
@@ -267,7 +267,7 @@ class Approvals:
         else:
             self._changed.append(proposal.branch)
 
-    def _verdict(
+    def _result(
         self, ticket: Ticket, snapshot: Snapshot, arrived: dict[str, Arrival]
     ) -> Receipt | DemandOpsError | Decision:
         """Return the receipt or error of a demand that is decided, else its decision on main.
@@ -310,7 +310,7 @@ class Approvals:
         self._proposals = {k: p for k, p in self._proposals.items() if p is not proposal}
         self._branch_sync.forget(proposal, close=close)
 
-    # ---- the end ----
+    # ---- updates and the end ----
 
     def _on_forge_update(self, branch: str) -> None:
         """Check a branch again, because the forge answered; from the forge worker's thread."""

@@ -91,9 +91,9 @@ def admit_or_none(state: State, goal: object) -> DemandRequest | None:
 
 def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
     """Return the feedback for a requester while the demand awaits approval."""
-    where = f"{branch} {link}" if link else branch
+    branch_and_link = f"{branch} {link}" if link else branch
     why = ", ".join(reasons)
-    return f"{_PREFIX}{where}" + (f" (asked for by {why})" if why else "")
+    return f"{_PREFIX}{branch_and_link}" + (f" (asked for by {why})" if why else "")
 
 
 def parse_waiting_text(text: str) -> dict[str, str]:
