@@ -14,7 +14,7 @@ import rclpy
 import yaml
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
-from demandops_ros.messages import from_data
+from demandops_ros.messages import fill_message
 from rclpy.action import ActionClient
 
 _WAIT_S = 20.0
@@ -35,7 +35,9 @@ def main() -> int:
         return 1
     _print_json(status="ready")
     for line in sys.stdin:
-        goal = from_data(DeploymentRequest.Goal(), yaml.safe_load(Path(line.strip()).read_text()))
+        goal = fill_message(
+            DeploymentRequest.Goal(), yaml.safe_load(Path(line.strip()).read_text())
+        )
         acceptance = client.send_goal_async(
             goal,
             feedback_callback=lambda message: _print_json(feedback=message.feedback.message),

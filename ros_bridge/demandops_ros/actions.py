@@ -1,6 +1,6 @@
-"""The two actions that a demand can come by, as the node needs them: one form for each.
+"""The two actions that carry demands, with one adapter for each.
 
-What a form knows is how its goal becomes plain data and how stages and outcomes become messages.
+An adapter turns goals into plain data, and stages and outcomes into messages.
 """
 
 from __future__ import annotations
@@ -23,47 +23,47 @@ from demandops.errors import (
 from demandops.service import Receipt
 from demandops_interfaces.action import Demand
 
-from demandops_ros.messages import as_data, demand_data
+from demandops_ros.messages import demand_goal_to_data, message_to_data
 
-LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
+ANSWER_LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
 
 
-class Form(Protocol):
-    """One action."""
+class ActionAdapter(Protocol):
+    """What the node needs to know of one action."""
 
     action: Any
 
-    def data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
+    def to_data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
         """Return a goal as plain data."""
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
-        """Return what the log calls a goal."""
+        """Return the name of a goal for the log."""
 
-    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return when a goal is to be answered, or nothing where it cannot say."""
+    def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
+        """Return the level at which to answer a goal, or None if the goal names none."""
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         """Return the feedback for a stage."""
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return the result for what came of a goal, and how far it is."""
+        """Return the result for the outcome of a goal and the level that it reached."""
 
 
-class DeploymentRequestForm:
-    """The reference's action: all it can say is one line of text."""
+class DeploymentRequestAdapter:
+    """The reference's action, whose results and feedback are plain text."""
 
     action = DeploymentRequest
 
-    def data(self, goal: Any) -> Any:  # noqa: ANN401
+    def to_data(self, goal: Any) -> Any:  # noqa: ANN401
         """Return a goal as plain data."""
-        return as_data(goal)
+        return message_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         """Return the request's id."""
         return str(goal.id)
 
-    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return nothing: the message has no field for it."""
+    def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
+        """Return None, because the message has no field for it."""
         return None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
@@ -75,35 +75,38 @@ class DeploymentRequestForm:
         return DeploymentRequest.Result(message=_text(outcome))
 
 
-class DemandForm:
-    """Our own action."""
+class DemandAdapter:
+    """DemandOps' own action."""
 
     action = Demand
 
-    def data(self, goal: Any) -> Any:  # noqa: ANN401
+    def to_data(self, goal: Any) -> Any:  # noqa: ANN401
         """Return a goal as plain data."""
-        return demand_data(goal)
+        return demand_goal_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         """Return the demand's id."""
         return str(goal.demand_id)
 
-    def level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return the level that the goal asks for."""
-        return LEVELS[goal.answer] if goal.answer < len(LEVELS) else None
+    def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
+        """Return the level that the goal names."""
+        return ANSWER_LEVELS[goal.answer] if goal.answer < len(ANSWER_LEVELS) else None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         """Return stage and text."""
         return Demand.Feedback(stage=stage, message=text)
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return code and text, and for a demand that was honoured what it came to."""
+        """Return code and text, and the receipt's fields if there is a receipt."""
         result = Demand.Result(code=_code(outcome), message=_text(outcome))
         if isinstance(outcome, Receipt):
             result.outcome = outcome.outcome
             result.commit = outcome.commit
             result.lease = Duration(sec=outcome.lease_s or 0)
-            result.warnings = [*outcome.warnings, *(f"not held: {x}" for x in outcome.not_held)]
+            result.warnings = [
+                *outcome.warnings,
+                *(f"not held: {item}" for item in outcome.not_held),
+            ]
             result.reached = reached
         return result
 

@@ -1,4 +1,4 @@
-"""The bookkeeping over ROS 2, as the command line prints it: a service and a latched topic."""
+"""The bookkeeping over ROS 2: a service and a latched topic, with the command line's JSON."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
 
-def answer(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
-    """Fill the response with the bookkeeping at ``request.at``; the newest where it is empty."""
+def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
+    """Fill and return the response: the bookkeeping at ``request.at``, or at the tip if empty."""
     try:
         if request.at:
             with reader.opened(generator.given_address) as repo:
@@ -42,14 +42,14 @@ _LATCHED = QoSProfile(
     reliability=QoSReliabilityPolicy.RELIABLE,
 )
 _SHORTEST_PAUSE_S = 1.0
-_SHARE = 20
+_PAUSE_FACTOR = 20
 
 
 class BookkeepingTopic:
-    """Publishes the bookkeeping on ``~/bookkeeping`` after it changed; latecomers get the last.
+    """Publishes the bookkeeping on ``~/bookkeeping`` after each change; late joiners get the last.
 
-    Writing it down costs as much as there is, so it is done beside the worker, and no more often
-    than keeps it to a twentieth of the time.
+    The cost grows with the ledger, so a thread of its own does it, for at most a twentieth of the
+    time.
     """
 
     def __init__(
@@ -60,26 +60,26 @@ class BookkeepingTopic:
         self._publisher = node.create_publisher(BookkeepingMessage, "~/bookkeeping", _LATCHED)
         self._changed, self._closed = Event(), Event()
         self._changed.set()
-        generator.watch(lambda config: self._changed.set())
+        generator.on_publish(lambda config: self._changed.set())
         Thread(target=self._run, name="demandops-bookkeeping-topic", daemon=True).start()
 
     def close(self) -> None:
-        """Publish no more."""
+        """Stop publishing."""
         self._closed.set()
         self._changed.set()
 
     def _run(self) -> None:
         while self._changed.wait() and not self._closed.is_set():
             self._changed.clear()
-            start = time.monotonic()
+            began = time.monotonic()
             snapshot = self._generator.snapshot
             books = bookkeeping(snapshot.state.ledger, snapshot.state.config)
             commit = str(snapshot.commit)
             text = json.dumps(as_data(books, commit), ensure_ascii=False)
             message = BookkeepingMessage(commit=commit, bookkeeping_json=text)
             self._in_executor(partial(self._publish, message))
-            took = time.monotonic() - start
-            self._closed.wait(max(_SHORTEST_PAUSE_S, took * _SHARE))
+            took = time.monotonic() - began
+            self._closed.wait(max(_SHORTEST_PAUSE_S, took * _PAUSE_FACTOR))
 
     def _publish(self, message: Any) -> None:  # noqa: ANN401
         if not self._closed.is_set():

@@ -1,14 +1,14 @@
-"""Demanding from a program: put a demand, keep it renewed, give it up.
+"""The client for programs: puts a demand, keeps it renewed and releases it.
 
     with DemandClient("vehicle01") as client:
         with client.demand("v1-recording", applications=[{
             "id": "edge/recorder", "type": "recorder", "node": "edge",
             "inputs": {"points": [{"topic": "/points", "source": "vehicle01"}]},
         }]) as demand:
-            print(demand.commit)     # it runs from here on, and is given up at the end
+            print(demand.commit)     # published; released at the end of the block
 
-What an application or a connection holds is written as in a YAML document of the kind ``Demand``
-(docs/demand.md). Works beside the caller's own rclpy: it has a context and a thread of its own.
+Applications and connections have the fields of a YAML document of the kind ``Demand``
+(docs/demand.md). The client works beside the caller's own rclpy: it has its own context and thread.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
-from demandops_ros.messages import demand_goal
+from demandops_ros.messages import demand_goal_from_data
 
 log = logging.getLogger("demandops.client")
 
-Told = Callable[[str, str], None]
-"""Called with stage and text as a demand goes along, from the client's thread."""
+StageListener = Callable[[str, str], None]
+"""Called with each stage and its text, in the client's thread."""
 
 _DEPTH = 100
 _RENEW_AFTER = 1 / 3
-"""Of its lease; two more attempts fit before it ends."""
+"""The part of the lease after which it is renewed; two more attempts fit before its end."""
 _RETRY_S = 5.0
 _UNHEARD_S = 5.0
-"""A goal is accepted within milliseconds; nobody heard one that is not within this."""
+"""A goal is accepted within milliseconds; after this time it must have been lost."""
 
 
 class DemandError(Exception):
-    """A demand that was not honoured. ``code`` is a word for programs (``unknown-node``)."""
+    """Raised when a demand fails. ``code`` is a word for programs, such as ``unknown-node``."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -53,10 +53,10 @@ class DemandError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What came of a goal.
+    """The result of a goal.
 
-    ``outcome`` is booked, released or unchanged, ``lease_s`` 0 for no end, ``reached`` pushed,
-    reconciled or healthy.
+    ``outcome`` is booked, released or unchanged. ``lease_s`` is 0 without a lease. ``reached`` is
+    pushed, reconciled or healthy.
     """
 
     outcome: str
@@ -67,7 +67,7 @@ class Answer:
 
 
 class DemandClient:
-    """Sends demands in the name of ``requesters`` to one node."""
+    """Sends demands of ``requesters`` to one node."""
 
     def __init__(
         self,
@@ -80,11 +80,11 @@ class DemandClient:
         """Start the client.
 
         Args:
-            requesters: in whose name everything is asked.
-            action_name: where the node takes demands.
-            node_name: of the client's own ROS node.
+            requesters: the requesters of every demand.
+            action_name: the node's action.
+            node_name: the name of the client's own ROS node.
             timeout_s: how long to wait for the node, and for each answer.
-            domain_id: the ROS domain; that of the environment where it is left out.
+            domain_id: the ROS domain; the environment's if left out.
         """
         self.requesters = requesters
         self.timeout_s = timeout_s
@@ -116,11 +116,11 @@ class DemandClient:
         return self
 
     def __exit__(self, *reason: object) -> None:
-        """Close it; demands that are held are not given up by this."""
+        """Close the client; this releases no demand."""
         self.close()
 
     def close(self) -> None:
-        """End the client's thread and node."""
+        """Stop the client's thread and destroy its node."""
         self._executor.shutdown(timeout_sec=1)
         self._spinner.join(5)
         self._node.destroy_node()
@@ -135,21 +135,21 @@ class DemandClient:
         lease: float | str | None = None,
         answer: str = "pushed",
         request: str = "",
-        told: Told = lambda stage, text: None,
+        on_stage: StageListener = lambda stage, text: None,
     ) -> Answer:
-        """Make a demand what is listed, and return once it is published.
+        """Set what a demand consists of, and return once that is published.
 
         Args:
             demand: the demand's id.
             applications, connections: as in a YAML document of the kind ``Demand``.
             answer: when to return: pushed, reconciled or healthy.
-            lease: seconds, or a duration like ``10m``; the access domain's where left out.
+            lease: seconds, or a duration like ``10m``; the access domain's if left out.
             request: free text for the commit.
-            told: called with each stage.
+            on_stage: called with each stage and its text.
 
         Raises:
-            DemandError: with the code, where it is not honoured or nobody answers in time.
-            ValueError, TypeError: for fields that the message does not have.
+            DemandError: if the demand fails or no answer arrives in time.
+            ValueError, TypeError: for a field or a value that the message cannot carry.
         """
         data: dict[str, Any] = {
             "demand": demand,
@@ -158,57 +158,68 @@ class DemandClient:
             "applications": list(applications),
             "connections": list(connections),
         }
-        return self.send(data | ({"lease": lease} if lease is not None else {}), told)
+        return self.send(data | ({"lease": lease} if lease is not None else {}), on_stage)
 
     def renew(self, demand: str) -> Answer:
         """Renew a demand's leases.
 
         Raises:
-            DemandError: as :meth:`put`; ``not-held`` where it has ended.
+            DemandError: as :meth:`put`; ``not-held`` if it has ended.
         """
         return self.send({"operation": "renew", "demand": demand})
 
     def release(self, demand: str) -> Answer:
-        """Give up all that a demand holds.
+        """Release all that a demand holds.
 
         Raises:
-            DemandError: as :meth:`put`; ``not-held`` where it holds nothing.
+            DemandError: as :meth:`put`; ``not-held`` if it holds nothing.
         """
         return self.send({"operation": "release", "demand": demand})
 
     def demand(self, demand: str, *args: Any, **options: Any) -> HeldDemand:  # noqa: ANN401
-        """Return a demand to be held for a ``with`` block; takes what :meth:`put` takes."""
+        """Return a demand for a ``with`` block; takes the arguments of :meth:`put`."""
         return HeldDemand(self, demand, lambda: self.put(demand, *args, **options))
 
-    def send(self, data: Mapping[str, Any], told: Told = lambda stage, text: None) -> Answer:
+    def send(
+        self, data: Mapping[str, Any], on_stage: StageListener = lambda stage, text: None
+    ) -> Answer:
         """Send a document of the kind ``Demand`` and wait for the answer; see :meth:`put`."""
-        goal = demand_goal({"requesters": list(self.requesters), **data})
+        goal = demand_goal_from_data({"requesters": list(self.requesters), **data})
         deadline = time.monotonic() + self.timeout_s
         if not self._client.wait_for_server(timeout_sec=self.timeout_s):
-            raise DemandError("no-server", f"nobody takes demands on {self._action_name}")
-        handle, lost = self._accepted(goal, told, deadline)
+            raise DemandError(
+                "no-server", f"no node serves {self._action_name}; start one with demandops serve"
+            )
+        handle, lost = self._send_until_heard(goal, on_stage, deadline)
         if not handle.accepted:
-            raise DemandError("rejected", "the node takes no demands now; send it again later")
+            raise DemandError("rejected", "the node accepts no demands now; send it again later")
         answer = self._await(handle.get_result_async(), deadline)
         result = answer.result
         if lost and result.code == "not-held" and goal.operation == Demand.Goal.OPERATION_RELEASE:
-            return Answer("released", "", 0.0, ("released by an attempt that got lost",), "pushed")
+            return Answer(
+                "released", "", 0.0, ("released by an attempt whose answer was lost",), "pushed"
+            )
         if answer.status != GoalStatus.STATUS_SUCCEEDED:
             raise DemandError(result.code or "aborted", result.message)
         lease_s = result.lease.sec + result.lease.nanosec / 1e9
         warnings = tuple(result.warnings)
         return Answer(result.outcome, result.commit, lease_s, warnings, result.reached)
 
-    def _accepted(self, goal: Any, told: Told, deadline: float) -> tuple[Any, bool]:  # noqa: ANN401
-        """Send a goal until the node has heard it; tell whether an attempt got lost.
+    def _send_until_heard(
+        self,
+        goal: Any,  # noqa: ANN401
+        on_stage: StageListener,
+        deadline: float,
+    ) -> tuple[Any, bool]:
+        """Send a goal until the node responds; return its handle and whether an attempt was lost.
 
-        A node that has not yet found this client loses its response. Sending again does no harm:
-        a demand that is put twice counts once.
+        The response is lost if the node has not discovered this client yet. Sending again is
+        harmless: a demand that is put twice counts once.
         """
         lost = False
         while True:
             sent = self._client.send_goal_async(
-                goal, feedback_callback=lambda fb: told(fb.feedback.stage, fb.feedback.message)
+                goal, feedback_callback=lambda fb: on_stage(fb.feedback.stage, fb.feedback.message)
             )
             try:
                 return self._await(sent, min(deadline, time.monotonic() + _UNHEARD_S)), lost
@@ -228,7 +239,7 @@ class DemandClient:
 
 
 class HeldDemand:
-    """A demand that is put at the start of a block, renewed meanwhile and given up at its end."""
+    """A demand that is put when a block starts, renewed while it runs and released at its end."""
 
     def __init__(self, client: DemandClient, demand: str, put: Callable[[], Answer]) -> None:
         self.id = demand
@@ -237,24 +248,27 @@ class HeldDemand:
         self._client = client
         self._put = put
         self._over = Event()
-        self._keeper: Thread | None = None
+        self._renewer: Thread | None = None
 
     def __enter__(self) -> HeldDemand:
-        """Put the demand and keep it."""
+        """Put the demand and start to renew it."""
         self.answer = self._put()
         self.commit = self.answer.commit
         if self.answer.lease_s:
-            self._keeper = Thread(
-                target=self._keep, args=(self.answer.lease_s,), name="demandops-lease", daemon=True
+            self._renewer = Thread(
+                target=self._renew_until_over,
+                args=(self.answer.lease_s,),
+                name="demandops-lease",
+                daemon=True,
             )
-            self._keeper.start()
+            self._renewer.start()
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        """Give the demand up."""
+        """Release the demand."""
         self._over.set()
-        if self._keeper is not None:
-            self._keeper.join()
+        if self._renewer is not None:
+            self._renewer.join()
         try:
             self._client.release(self.id)
         except DemandError as problem:
@@ -262,14 +276,14 @@ class HeldDemand:
                 raise
             log.warning("demand %s was not released: %s", self.id, problem)
 
-    def _keep(self, lease_s: float) -> None:
+    def _renew_until_over(self, lease_s: float) -> None:
         pause = lease_s * _RENEW_AFTER
         while not self._over.wait(pause):
             pause = lease_s * _RENEW_AFTER
             try:
                 self._client.renew(self.id)
             except DemandError as problem:
-                if problem.code == "not-held":  # it ended while the link was down
+                if problem.code == "not-held":  # it ended while the network was down
                     self._put_again()
                 else:
                     log.warning("demand %s was not renewed: %s", self.id, problem)

@@ -1,4 +1,4 @@
-"""``demandops demand``: send a demand over ROS 2, and hold it if asked to."""
+"""``demandops demand``: send a demand over ROS 2, and hold it with ``--hold``."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from demandops_ros.client import Answer, DemandClient, DemandError
 
 @click.command()
 @click.argument("file", metavar="FILE")
-@click.option("--hold", is_flag=True, help="Keep it until Ctrl-C, renewed, and then give it up.")
-@click.option("--release", is_flag=True, help="Give the demand of the file up instead.")
+@click.option("--hold", is_flag=True, help="Keep it renewed until Ctrl-C, then release it.")
+@click.option("--release", is_flag=True, help="Release the demand of the file instead.")
 @click.option("--renew", is_flag=True, help="Renew the demand of the file instead.")
 @click.option(
     "--action",
     default=DEFAULT_DEMAND_ACTION_NAME,
     show_default=True,
     metavar="NAME",
-    help="Where the node takes demands.",
+    help="The node's action.",
 )
 @click.option(
     "--timeout",
@@ -43,29 +43,29 @@ def demand(
 ) -> None:
     """Send a demand to a running node.
 
-    FILE is a YAML document of the kind Demand (docs/demand.md), or - for standard input. Exit code
-    1 where it is not honoured, with the node's reason.
+    FILE is a YAML document of the kind Demand (docs/demand.md), or - for standard input. If the
+    demand fails, prints the node's reason and exits with 1.
     """
     if hold + release + renew > 1:
         raise click.UsageError("--hold, --release and --renew exclude each other")
-    data = _document(file)
+    data = _read_document(file)
     if release or renew:
-        kept = ("demand", "requesters", "request")
-        data = {name: value for name, value in data.items() if name in kept}
+        names = ("demand", "requesters", "request")
+        data = {name: value for name, value in data.items() if name in names}
         data["operation"] = "release" if release else "renew"
     with DemandClient(action_name=action, timeout_s=timeout) as client:
         try:
             if hold:
                 _hold(client, data, output)
             else:
-                _told(client.send(data, _stage(output)), output)
+                _print_answer(client.send(data, _print_stages(output)), output)
         except DemandError as error:
             raise InvalidInput([fault("", str(error), code=error.code).within(file)]) from None
         except (ValueError, TypeError, AssertionError, AttributeError) as error:
-            raise InvalidInput([fault("", f"is no demand: {error}").within(file)]) from None
+            raise InvalidInput([fault("", f"is not a demand: {error}").within(file)]) from None
 
 
-def _document(file: str) -> dict[str, Any]:
+def _read_document(file: str) -> dict[str, Any]:
     name = "standard input" if file == "-" else file
     try:
         text = sys.stdin.read() if file == "-" else Path(file).read_text()
@@ -80,12 +80,12 @@ def _document(file: str) -> dict[str, Any]:
     return data
 
 
-def _stage(output: str) -> Any:  # noqa: ANN401
+def _print_stages(output: str) -> Any:  # noqa: ANN401
     quiet = output == "json"
     return lambda stage, text: None if quiet else errors.print(text)
 
 
-def _told(answer: Answer, output: str) -> None:
+def _print_answer(answer: Answer, output: str) -> None:
     if output == "json":
         print_json(
             {
@@ -97,7 +97,7 @@ def _told(answer: Answer, output: str) -> None:
             }
         )
         return
-    lease = f", holds for {answer.lease_s:g} s unless renewed" if answer.lease_s else ""
+    lease = f", for {answer.lease_s:g} s unless renewed" if answer.lease_s else ""
     console().print(f"{answer.outcome} in {answer.commit}{lease}")
     for warning in answer.warnings:
         errors.print(f"warning: {warning}")
@@ -113,13 +113,13 @@ def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
         str(data.get("demand", "")),
         data.get("applications", ()),
         data.get("connections", ()),
-        told=_stage(output),
+        on_stage=_print_stages(output),
         **options,
     ) as held:
         if held.answer is not None:
-            _told(held.answer, output)
+            _print_answer(held.answer, output)
         if output != "json":
             errors.print("held until Ctrl-C")
         over.wait()
     if output != "json":
-        errors.print("given up")
+        errors.print("released")

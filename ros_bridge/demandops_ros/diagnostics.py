@@ -1,8 +1,7 @@
-"""How the node does, on ``/diagnostics``, as ROS 2's own tools read it.
+"""The node's status on ``/diagnostics``, for ROS 2's own tools.
 
-Two states, once a second: of the state repo (can it be reached, does it take pushes, how much
-waits for it), and of its configuration (is all of it valid). The generator knows both; this only
-words them.
+Publishes two statuses once a second: whether the state repo can be reached and written, and
+whether its configuration is valid.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from demandops.service import Generator
-from demandops.service.follower import Condition
+from demandops.service.remote_status import StateRepoStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
@@ -19,7 +18,7 @@ _MOST_PROBLEMS = 20
 
 
 class Diagnostics:
-    """Publishes the condition of a generator."""
+    """Publishes the status of a generator's state repo."""
 
     def __init__(self, node: Node, generator: Generator) -> None:
         self._node, self._generator = node, generator
@@ -29,41 +28,41 @@ class Diagnostics:
     def _publish(self) -> None:
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        message.status = statuses(self._generator.condition, self._generator.address)
+        message.status = statuses(self._generator.state_repo_status, self._generator.address)
         self._publisher.publish(message)
 
 
-def statuses(condition: Condition, address: str) -> list[DiagnosticStatus]:
-    """Return the two states that a condition comes to."""
-    return [_of_state_repo(condition, address), _of_configuration(condition, address)]
+def statuses(status: StateRepoStatus, address: str) -> list[DiagnosticStatus]:
+    """Return the two diagnostic statuses of a state repo."""
+    return [_of_state_repo(status, address), _of_configuration(status, address)]
 
 
-def _of_state_repo(condition: Condition, address: str) -> DiagnosticStatus:
-    contact = condition.contact
+def _of_state_repo(status: StateRepoStatus, address: str) -> DiagnosticStatus:
+    remote = status.remote
     level, text = DiagnosticStatus.OK, "reachable"
-    if contact.denied:
-        level, text = DiagnosticStatus.ERROR, contact.denied
-    if contact.trouble:
-        # while nobody waits for it only people's changes are late
-        level = DiagnosticStatus.ERROR if condition.waiting else DiagnosticStatus.WARN
-        text = contact.trouble
+    if remote.push_denied:
+        level, text = DiagnosticStatus.ERROR, remote.push_denied
+    if remote.unreachable:
+        # while no demand waits, only people's changes are late
+        level = DiagnosticStatus.ERROR if status.unpublished else DiagnosticStatus.WARN
+        text = remote.unreachable
     values = {
-        "reachable": str(not contact.trouble).lower(),
-        "away since": _moment(contact.since),
-        "last reached": _moment(contact.reached),
-        "last push": _moment(contact.pushed),
-        "demands in the outbox": str(condition.waiting),
-        "commit": condition.commit,
+        "reachable": str(not remote.unreachable).lower(),
+        "away since": _time(remote.unreachable_since),
+        "last reached": _time(remote.last_reached),
+        "last push": _time(remote.last_push),
+        "demands in the outbox": str(status.unpublished),
+        "commit": status.commit,
     }
     return _status("demandops: state repo", address, level, text, values)
 
 
-def _of_configuration(condition: Condition, address: str) -> DiagnosticStatus:
-    problems = [str(problem) for problem in condition.problems]
+def _of_configuration(status: StateRepoStatus, address: str) -> DiagnosticStatus:
+    problems = [str(problem) for problem in status.problems]
     level, text = DiagnosticStatus.OK, "all files are valid"
     if problems:
         level = DiagnosticStatus.WARN
-        text = f"{len(problems)} problems; the last valid version is in force"
+        text = f"{len(problems)} problems; the last valid version is in effect"
     values = {
         f"problem {number}": problem
         for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1)
@@ -79,5 +78,5 @@ def _status(
     return DiagnosticStatus(level=level, name=name, message=text, hardware_id=address, values=pairs)
 
 
-def _moment(moment: datetime | None) -> str:
-    return moment.isoformat(timespec="seconds") if moment else "never"
+def _time(time: datetime | None) -> str:
+    return time.isoformat(timespec="seconds") if time else "never"

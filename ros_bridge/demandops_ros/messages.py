@@ -1,4 +1,4 @@
-"""Messages as plain data, and back. Knows no rclpy: messages are all it takes."""
+"""Converts ROS messages to plain data and back; needs the messages only, not rclpy."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from demandops_interfaces import msg as messages
 from demandops_interfaces.action import Demand as DemandMessage
 
 
-def as_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
-    """Return a message as mappings, lists and plain values, as its YAML form would parse.
+def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
+    """Return a message as mappings, lists and plain values, as its YAML form parses.
 
-    ``DeploymentRequest.Goal`` becomes what
-    :func:`demandops.demand.deployment_request_goal.parse` takes, so that a goal over ROS 2 and the
-    same goal in a file are one thing.
+    A ``DeploymentRequest.Goal`` becomes what
+    :func:`demandops.demand.deployment_request_goal.parse` takes, so that a goal over ROS 2 equals
+    the same goal in a file.
     """
     fields = getattr(message, "get_fields_and_field_types", None)
     if fields is not None:
-        return {name: as_data(getattr(message, name)) for name in fields()}
+        return {name: message_to_data(getattr(message, name)) for name in fields()}
     if isinstance(message, str | bool | int | float):
         return message
-    return [as_data(item) for item in message]
+    return [message_to_data(item) for item in message]
 
 
 _OPERATIONS = ("put", "release", "renew")
@@ -37,10 +37,10 @@ _OPTIONS = tuple(RouteOptions.model_fields)
 _ANSWERS = ("pushed", "reconciled", "healthy")
 
 
-def demand_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
+def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return a ``Demand.Goal`` as what :func:`demandops.demand.demand_goal.parse` takes.
 
-    A number that the message does not define is passed on as text, to be refused with its field.
+    A number that the message does not define becomes text, which the parser refuses by field.
     """
     data = {
         "apiVersion": API_VERSION,
@@ -58,17 +58,17 @@ def demand_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
     return data
 
 
-def demand_goal(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
+def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return the ``Demand.Goal`` for a document of the kind ``Demand``.
 
     Raises:
-        ValueError: for a field or a word that it does not have.
-        TypeError, AssertionError: for a value of another type.
+        ValueError: for an unknown field or word.
+        TypeError, AssertionError: for a value of the wrong type.
     """
     goal = DemandMessage.Goal()
     known = {"apiVersion", "kind", "lease", "operation", "answer", "applications", "connections"}
     names = {"demand": "demand_id", "request": "request_id", "requesters": "requester_ids"}
-    _only(data, {*known, *names}, "a demand")
+    _reject_unknown(data, {*known, *names}, "a demand")
     for name, field in names.items():
         if name in data:
             setattr(goal, field, data[name])
@@ -78,14 +78,14 @@ def demand_goal(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     seconds = seconds_of(lease) if isinstance(lease, str) else lease
     goal.lease = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
     goal.applications = [_application_message(app) for app in data.get("applications", ())]
-    goal.connections = [_connection_message(one) for one in data.get("connections", ())]
+    goal.connections = [_connection_message(item) for item in data.get("connections", ())]
     return goal
 
 
 def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     known = {"inputs", "parameters", "parameters_json", "connect"}
     names = {"id": "id", "type": "type", "node": "node_id", "version": "version"}
-    _only(data, {*known, *names}, "an application")
+    _reject_unknown(data, {*known, *names}, "an application")
     values = {name: json.dumps(value) for name, value in data.get("parameters", {}).items()}
     values |= data.get("parameters_json", {})
     return messages.Application(
@@ -112,7 +112,7 @@ def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
         "target": "target_node_id",
         "broker": "broker_node_id",
     }
-    _only(data, {"type", "topics", *names}, "a connection")
+    _reject_unknown(data, {"type", "topics", *names}, "a connection")
     return messages.Connection(
         **{field: data[name] for name, field in names.items() if name in data},
         type=_number(_TYPES[:-1], data.get("type", "auto"), "type"),
@@ -121,7 +121,7 @@ def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
 
 
 def _route_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    _only(data, {"source", "target", *_OPTIONS}, "a topic of a connection")
+    _reject_unknown(data, {"source", "target", *_OPTIONS}, "a topic of a connection")
     options = {name: data[name] for name in _OPTIONS if name in data}
     if "rate" in options:
         options["rate"] = float(options["rate"])
@@ -129,15 +129,15 @@ def _route_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     return messages.Route(**names, **options)
 
 
-def _only(data: Mapping[str, Any], known: set[str], what: str) -> None:
+def _reject_unknown(data: Mapping[str, Any], known: set[str], what: str) -> None:
     for name in data:
         if name not in known:
-            raise ValueError(f"'{name}' is no field of {what}{near(name, known)}")
+            raise ValueError(f"'{name}' is not a field of {what}{near(name, known)}")
 
 
 def _number(words: tuple[str, ...], word: str, field: str) -> int:
     if word not in words:
-        raise ValueError(f"{field}: '{word}' is none of {', '.join(words)}")
+        raise ValueError(f"{field}: '{word}' is not one of {', '.join(words)}")
     return words.index(word)
 
 
@@ -176,30 +176,30 @@ def _connection(connection: Any) -> dict[str, Any]:  # noqa: ANN401
     }
 
 
-def from_data(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
-    """Fill a message from plain data and return it; absent fields keep ROS's defaults.
+def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
+    """Fill a message from plain data and return it; missing fields keep ROS's defaults.
 
     Raises:
-        AttributeError: for a field that the message has not.
-        AssertionError, TypeError: for a value of another type.
+        AttributeError: for a field that the message does not have.
+        AssertionError, TypeError: for a value of the wrong type.
     """
     types = message.get_fields_and_field_types()
     for name, value in data.items():
         if name not in types:
             raise AttributeError(f"{type(message).__name__} has no field '{name}'")
-        setattr(message, name, _valued(getattr(message, name), types[name], value))
+        setattr(message, name, _converted(getattr(message, name), types[name], value))
     return message
 
 
-def _valued(default: Any, type_name: str, value: Any) -> Any:  # noqa: ANN401
+def _converted(default: Any, type_name: str, value: Any) -> Any:  # noqa: ANN401
     if isinstance(value, dict):
-        return from_data(default, value)
+        return fill_message(default, value)
     if isinstance(value, list) and "/" in type_name:
-        return [from_data(_new(type_name), item) for item in value]
+        return [fill_message(_new(type_name), item) for item in value]
     return value
 
 
 def _new(type_name: str) -> Any:  # noqa: ANN401
-    """Return a message of a sequence's type: ``sequence<pkg/Name>``."""
+    """Return a new message of the type in ``sequence<pkg/Name>``."""
     package, name = type_name.removeprefix("sequence<").split(">")[0].split(",")[0].split("/")
     return getattr(import_module(f"{package}.msg"), name)()

@@ -1,8 +1,8 @@
-"""The ROS 2 node: action servers that hand demands to the generator.
+"""The ROS 2 node: action servers that submit demands to the generator.
 
-Many goals may be under way: each waits for its receipt without holding the executor. What the
-generator's worker thread tells (stages, receipts) is queued and handled in the executor's own
-thread, woken by a guard condition.
+Many goals may be open: each waits for its receipt without blocking the executor. Stages and
+receipts from the generator's worker thread are queued, and a guard condition wakes the executor to
+handle them.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.task import Future
 
-from demandops_ros.actions import DemandForm, DeploymentRequestForm, Form
-from demandops_ros.bookkeeping_topic import BookkeepingTopic, answer
+from demandops_ros.actions import ActionAdapter, DemandAdapter, DeploymentRequestAdapter
+from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
 QUEUE_DEPTH = 2000
-"""Depth of the services' queues. With ROS's default of 10, goals that arrive together are lost."""
+"""Depth of the services' queues: with ROS's default of 10, goals that arrive at once are lost."""
 
-DEEP = QoSProfile(
+DEEP_QOS = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST,
     depth=QUEUE_DEPTH,
     reliability=QoSReliabilityPolicy.RELIABLE,
@@ -42,10 +42,10 @@ DEEP = QoSProfile(
 
 
 @dataclass(frozen=True, slots=True)
-class Answers:
-    """When goals are answered: those that cannot say at ``level``, none later than ``timeout_s``.
+class AnswerSettings:
+    """When to answer goals: at ``level`` if the goal names none, after ``timeout_s`` at the latest.
 
-    ``status`` tells what came of a demand, nothing without access to the clusters.
+    ``status`` watches rollouts; None without access to the clusters.
     """
 
     level: Level = "pushed"
@@ -61,22 +61,22 @@ class DemandNode(Node):  # type: ignore[misc]
         generator: Generator,
         action_name: str,
         demand_action_name: str,
-        answers: Answers,
+        answers: AnswerSettings,
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__("demandops", **options)
         self._generator = generator
-        self._answers = answers
+        self._answer_settings = answers
         self._open: dict[str, ServerGoalHandle] = {}
         self._events: deque[Callable[[], None]] = deque()
         self._stopping = False
-        # a group of its own: a service that waits for an event must not keep events from coming
+        # a group of its own, so that a service that waits for an event does not block events
         self._wake = self.create_guard_condition(
             self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
         )
         self._servers = [
-            self._serve(DeploymentRequestForm(), action_name),
-            self._serve(DemandForm(), demand_action_name),
+            self._serve(DeploymentRequestAdapter(), action_name),
+            self._serve(DemandAdapter(), demand_action_name),
         ]
         self.create_service(
             GetBookkeeping,
@@ -84,26 +84,26 @@ class DemandNode(Node):  # type: ignore[misc]
             self._bookkeeping,
             callback_group=ReentrantCallbackGroup(),
         )
-        self._topic = BookkeepingTopic(self, generator, self._from_worker)
+        self._bookkeeping_topic = BookkeepingTopic(self, generator, self._from_worker)
         self._diagnostics = Diagnostics(self, generator)
 
-    def _serve(self, form: Form, name: str) -> ActionServer:
+    def _serve(self, adapter: ActionAdapter, name: str) -> ActionServer:
         return ActionServer(
             self,
-            form.action,
+            adapter.action,
             name,
-            execute_callback=partial(self._execute, form),
-            goal_callback=partial(self._admit, form),
+            execute_callback=partial(self._execute, adapter),
+            goal_callback=partial(self._accept_or_reject, adapter),
             cancel_callback=self._cancel,
-            goal_service_qos_profile=DEEP,
-            result_service_qos_profile=DEEP,
-            cancel_service_qos_profile=DEEP,
-            feedback_pub_qos_profile=DEEP,
+            goal_service_qos_profile=DEEP_QOS,
+            result_service_qos_profile=DEEP_QOS,
+            cancel_service_qos_profile=DEEP_QOS,
+            feedback_pub_qos_profile=DEEP_QOS,
         )
 
     def close(self) -> None:
-        """Stop what runs beside the executor."""
-        self._topic.close()
+        """Stop the threads beside the executor."""
+        self._bookkeeping_topic.close()
 
     @property
     def open_goals(self) -> int:
@@ -111,7 +111,7 @@ class DemandNode(Node):  # type: ignore[misc]
         return len(self._open)
 
     def stop_accepting(self) -> None:
-        """Reject further goals; those under way go on."""
+        """Reject further goals; open goals continue."""
         self._stopping = True
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
@@ -119,7 +119,7 @@ class DemandNode(Node):  # type: ignore[misc]
         done = Future(executor=self.executor)
 
         def work() -> None:
-            filled = answer(self._generator, request, response)
+            filled = fill_response(self._generator, request, response)
             self._from_worker(partial(done.set_result, filled))
 
         Thread(target=work, name="demandops-bookkeeping", daemon=True).start()
@@ -127,71 +127,75 @@ class DemandNode(Node):  # type: ignore[misc]
 
     # ---- callbacks of the action server, in the executor's thread ----
 
-    def _admit(self, form: Form, goal: Any) -> GoalResponse:  # noqa: ANN401
-        """Accept whatever can be decoded: a goal response carries no text to say why not."""
+    def _accept_or_reject(self, adapter: ActionAdapter, goal: Any) -> GoalResponse:  # noqa: ANN401
+        """Accept every goal unless overloaded: a rejection cannot carry a reason, a result can."""
         reason = "shutting down" if self._stopping else ""
         if len(self._open) >= self._generator.queue_limit:
             reason = "too many are waiting"
-            trouble = self._generator.condition.contact.trouble
-            reason += f" for the state repo: {trouble}" if trouble else ""
+            unreachable = self._generator.state_repo_status.remote.unreachable
+            reason += f" for the state repo: {unreachable}" if unreachable else ""
         if reason:
-            self.get_logger().warning(f"goal '{form.name(goal)}' rejected: {reason}")
+            self.get_logger().warning(f"goal '{adapter.name(goal)}' rejected: {reason}")
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        """A demand can be taken back until it is committed."""
+        """Withdraw a demand, which is possible until it is committed."""
         if self._generator.withdraw(_operation(handle)):
             return CancelResponse.ACCEPT
         return CancelResponse.REJECT
 
-    async def _execute(self, form: Form, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
+    async def _execute(self, adapter: ActionAdapter, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
         operation = _operation(handle)
         self._open[operation] = handle
         done = Future(executor=self.executor)
         try:
             ticket = self._generator.submit(
-                form.data(handle.request),
+                adapter.to_data(handle.request),
                 operation,
                 lambda stage, text: self._from_worker(
-                    partial(self._feedback, form, handle, stage, text)
+                    partial(self._feedback, adapter, handle, stage, text)
                 ),
             )
         except (ShuttingDown, QueueFull) as error:
-            return self._finish(form, handle, error)
+            return self._finish(adapter, handle, error)
         ticket.future.add_done_callback(
             lambda future: self._from_worker(partial(done.set_result, future))
         )
         outcome = (await done).exception() or ticket.future.result()
-        level = form.level(handle.request) or self._answers.level
+        level = adapter.answer_level(handle.request) or self._answer_settings.level
         if not isinstance(outcome, Receipt) or level == "pushed":
-            return self._finish(form, handle, outcome)
-        problem = self._unfollowed(outcome)
+            return self._finish(adapter, handle, outcome)
+        problem = self._cannot_watch(outcome)
         if problem:
             outcome = replace(outcome, warnings=(*outcome.warnings, problem))
-            return self._finish(form, handle, outcome)
-        return self._finish(form, handle, await self._followed(form, handle, outcome, level), level)
+            return self._finish(adapter, handle, outcome)
+        return self._finish(
+            adapter, handle, await self._wait_for_rollout(adapter, handle, outcome, level), level
+        )
 
-    def _unfollowed(self, receipt: Receipt) -> str:
-        """Return why it cannot be told what comes of a demand; empty where it can."""
-        if self._answers.status is None:
+    def _cannot_watch(self, receipt: Receipt) -> str:
+        """Return why the rollout of a demand cannot be watched, or empty."""
+        if self._answer_settings.status is None:
             return "answered at pushed: this node has no access to the clusters"
-        problem = self._answers.status.why_unreachable(target.domain for target in receipt.targets)
+        problem = self._answer_settings.status.why_unreachable(
+            target.domain for target in receipt.targets
+        )
         return f"answered at pushed: {problem}" if problem else ""
 
-    async def _followed(
-        self, form: Form, handle: ServerGoalHandle, receipt: Receipt, level: Level
+    async def _wait_for_rollout(
+        self, adapter: ActionAdapter, handle: ServerGoalHandle, receipt: Receipt, level: Level
     ) -> Receipt | NotReached:
-        """Wait until a demand is as far as asked, or its time is over."""
-        assert self._answers.status is not None  # noqa: S101 - the caller has looked
+        """Wait until a rollout reaches a level, or for the time limit."""
+        assert self._answer_settings.status is not None  # noqa: S101 - the caller has checked
         done = Future(executor=self.executor)
-        followed = self._answers.status.follow(
+        followed = self._answer_settings.status.follow(
             receipt.commit,
             receipt.targets,
             level,
-            self._answers.timeout_s,
+            self._answer_settings.timeout_s,
             lambda stage, text: self._from_worker(
-                partial(self._feedback, form, handle, stage, text)
+                partial(self._feedback, adapter, handle, stage, text)
             ),
         )
         followed.add_done_callback(
@@ -200,32 +204,34 @@ class DemandNode(Node):  # type: ignore[misc]
         health = await done
         if health.reaches(level):
             return receipt
-        where = f"{health.object}: " if health.object else ""
-        return NotReached(level, f"{where}{health.reason}; it is booked in {receipt.commit}")
+        prefix = f"{health.object}: " if health.object else ""
+        return NotReached(level, f"{prefix}{health.reason}; it is booked in {receipt.commit}")
 
-    def _feedback(self, form: Form, handle: ServerGoalHandle, stage: str, text: str) -> None:
+    def _feedback(
+        self, adapter: ActionAdapter, handle: ServerGoalHandle, stage: str, text: str
+    ) -> None:
         if handle.is_active:
-            handle.publish_feedback(form.feedback(stage, text))
+            handle.publish_feedback(adapter.feedback(stage, text))
 
     def _finish(
         self,
-        form: Form,
+        adapter: ActionAdapter,
         handle: ServerGoalHandle,
         outcome: Receipt | BaseException,
         reached: Level = "pushed",
     ) -> Any:  # noqa: ANN401
         self._open.pop(_operation(handle), None)
-        result = form.result(outcome, reached)
-        told = f"goal '{form.name(handle.request)}': "
+        result = adapter.result(outcome, reached)
+        prefix = f"goal '{adapter.name(handle.request)}': "
         if isinstance(outcome, Receipt):
             handle.succeed()
-            self.get_logger().info(told + result.message)
+            self.get_logger().info(prefix + result.message)
         elif isinstance(outcome, Withdrawn) and handle.is_cancel_requested:
             handle.canceled()
-            self.get_logger().info(told + "cancelled")
+            self.get_logger().info(prefix + "cancelled")
         else:
             handle.abort()
-            self.get_logger().error(told + result.message)
+            self.get_logger().error(prefix + result.message)
         return result
 
     # ---- from the worker thread into the executor's ----

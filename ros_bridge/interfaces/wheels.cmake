@@ -1,10 +1,9 @@
-# What building over the ROS 2 wheels of PyPI needs beyond a ROS installation. A package includes
-# this between find_package() and rosidl_generate_interfaces(), and does without it where it stands
-# alone.
+# Adapts the build to the ROS 2 wheels of PyPI. A package includes this file between find_package()
+# and rosidl_generate_interfaces(); a package that is copied elsewhere builds without it.
 
-# The wheels export targets that name include folders of the machine they were built on, and CMake
-# generates nothing for a project that links such a target. Dropping the folders that do not exist
-# changes nothing in a ROS installation, where CMake would insist on them too.
+# The wheels export targets with include folders of the machine where they were built, and CMake
+# rejects a project that links such a target. Dropping missing folders changes nothing in a ROS
+# installation, where CMake requires them to exist as well.
 function(demandops_drop_missing_includes)
   get_property(targets DIRECTORY PROPERTY IMPORTED_TARGETS)
   foreach(target IN LISTS targets)
@@ -22,11 +21,11 @@ function(demandops_drop_missing_includes)
   endforeach()
 endfunction()
 
-# The targets that matter are imported by rosidl_generate_interfaces(), so this waits for its end.
+# Deferred, because rosidl_generate_interfaces() imports these targets.
 cmake_language(DEFER CALL demandops_drop_missing_includes)
 
-# rclpy never loads the C++ support, which takes half of the build. Where ament keeps its list of
-# generators under another name, this leaves it out of nothing and the build is complete, but slow.
+# rclpy never loads the C++ support, which takes half of the build time. If ament renames its list
+# of generators, this has no effect: the build is complete but slow.
 option(DEMANDOPS_WITHOUT_CPP "Generate no C++ support for the interfaces" OFF)
 if(DEMANDOPS_WITHOUT_CPP)
   list(FILTER AMENT_EXTENSIONS_rosidl_generate_idl_interfaces EXCLUDE REGEX "_cpp:")

@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 
 import pytest
 from demandops.errors import InvalidInput
-from demandops.service import push_listener
-from demandops.service.push_listener import Webhook, read_secret
+from demandops.service import push_webhook
+from demandops.service.push_webhook import PushWebhook, read_secret
 
 SECRET = b"s3cret-of-the-hook"
 BODY = b'{"ref": "refs/heads/main"}'
@@ -37,21 +37,21 @@ def heard() -> Heard:
 
 
 @pytest.fixture
-def signed(heard: Heard) -> Iterator[Webhook]:
-    hook = Webhook("127.0.0.1:0", SECRET, heard)
+def signed(heard: Heard) -> Iterator[PushWebhook]:
+    hook = PushWebhook("127.0.0.1:0", SECRET, heard)
     yield hook
     hook.close()
 
 
 @pytest.fixture
-def unsigned(heard: Heard) -> Iterator[Webhook]:
-    hook = Webhook("127.0.0.1:0", b"", heard)
+def unsigned(heard: Heard) -> Iterator[PushWebhook]:
+    hook = PushWebhook("127.0.0.1:0", b"", heard)
     yield hook
     hook.close()
 
 
 def send(
-    hook: Webhook,
+    hook: PushWebhook,
     headers: dict[str, str] | None = None,
     *,
     method: str = "POST",
@@ -92,14 +92,14 @@ FORGED = {
 
 
 @pytest.mark.parametrize("server", GENUINE)
-def test_who_knows_the_secret_is_heard(signed: Webhook, heard: Heard, server: str) -> None:
-    assert send(signed, GENUINE[server]) == (202, "looking")
+def test_who_knows_the_secret_is_heard(signed: PushWebhook, heard: Heard, server: str) -> None:
+    assert send(signed, GENUINE[server]) == (202, "fetching")
     assert heard.times == 1
 
 
 @pytest.mark.parametrize("case", FORGED)
 def test_who_does_not_is_refused_and_the_log_holds_nothing_of_it(
-    signed: Webhook, heard: Heard, case: str, caplog: pytest.LogCaptureFixture
+    signed: PushWebhook, heard: Heard, case: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
     for _ in range(3):
@@ -112,19 +112,19 @@ def test_who_does_not_is_refused_and_the_log_holds_nothing_of_it(
 
 
 def test_without_a_secret_whoever_is_on_this_machine_is_heard(
-    unsigned: Webhook, heard: Heard
+    unsigned: PushWebhook, heard: Heard
 ) -> None:
-    assert send(unsigned) == (202, "looking")
+    assert send(unsigned) == (202, "fetching")
     assert send(unsigned, body=None, headers={"Content-Length": "0"})[0] == 202
     assert heard.times == 2
 
 
-def test_what_else_is_asked_is_answered_and_does_nothing(signed: Webhook, heard: Heard) -> None:
+def test_what_else_is_asked_is_answered_and_does_nothing(signed: PushWebhook, heard: Heard) -> None:
     github = GENUINE["github"]
     assert send(signed, method="GET", path="/", body=None) == (200, "ok")
     assert send(signed, method="HEAD", path="/", body=None) == (200, "")
     assert send(signed, method="GET", path="/push", body=None)[0] == 405
-    assert send(signed, method="GET", path="/admin", body=None) == (404, "nothing is here")
+    assert send(signed, method="GET", path="/admin", body=None) == (404, "not found")
     assert send(signed, github, path="/") == (404, "notifications go to /push")
     assert send(signed, github, path="/push/../push")[0] == 404
     assert send(signed, github, method="PUT")[0] == 501
@@ -136,7 +136,7 @@ def test_what_else_is_asked_is_answered_and_does_nothing(signed: Webhook, heard:
     [("26214401", 413), ("9" * 400, 413), ("-1", 411), ("many", 411), ("\u00b2", 411)],
 )
 def test_a_body_without_bounds_is_not_read(
-    signed: Webhook, heard: Heard, length: str, status: int
+    signed: PushWebhook, heard: Heard, length: str, status: int
 ) -> None:
     with _connected(signed) as raw:
         raw.sendall(f"POST /push HTTP/1.1\r\nContent-Length: {length}\r\n\r\n".encode("latin-1"))
@@ -145,9 +145,9 @@ def test_a_body_without_bounds_is_not_read(
 
 
 def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
-    signed: Webhook, heard: Heard, monkeypatch: pytest.MonkeyPatch
+    signed: PushWebhook, heard: Heard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(push_listener, "_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(push_webhook, "_TIMEOUT_S", 0.3)
     slow = [_connected(signed) for _ in range(40)]
     for raw in slow:
         raw.sendall(b"POST /push HTTP/1.1\r\nContent-Length: 100\r\n\r\nx")
@@ -158,7 +158,7 @@ def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
     assert heard.times == 1
 
 
-def test_many_at_once_are_all_answered(unsigned: Webhook, heard: Heard) -> None:
+def test_many_at_once_are_all_answered(unsigned: PushWebhook, heard: Heard) -> None:
     answers: list[int] = []
     threads = [threading.Thread(target=lambda: answers.append(send(unsigned)[0])) for _ in range(8)]
     for thread in threads:
@@ -168,7 +168,7 @@ def test_many_at_once_are_all_answered(unsigned: Webhook, heard: Heard) -> None:
     assert answers == [202] * 8
 
 
-def _connected(hook: Webhook) -> socket.socket:
+def _connected(hook: PushWebhook) -> socket.socket:
     parts = urlsplit(hook.url)
     return socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=10)
 
@@ -179,32 +179,32 @@ def _connected(hook: Webhook) -> socket.socket:
 @pytest.mark.parametrize(
     ("address", "message"),
     [
-        ("8090", "'8090' is no address to listen on; write one like 127.0.0.1:8090"),
-        (":8090", "':8090' is no address to listen on; write one like 127.0.0.1:8090"),
-        ("localhost:http", "'localhost:http' is no address to listen on; write one like "
+        ("8090", "'8090' is not an address to listen on; write one like 127.0.0.1:8090"),
+        (":8090", "':8090' is not an address to listen on; write one like 127.0.0.1:8090"),
+        ("localhost:http", "'localhost:http' is not an address to listen on; write one like "
          "127.0.0.1:8090"),
-        ("127.0.0.1:65536", "'127.0.0.1:65536' is no address to listen on; write one like "
+        ("127.0.0.1:65536", "'127.0.0.1:65536' is not an address to listen on; write one like "
          "127.0.0.1:8090"),
         ("0.0.0.0:0", "'0.0.0.0:0' can be reached from other machines, so notifications must be "
          "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1"),
-        ("nowhere.invalid:0", "'nowhere.invalid:0': the host 'nowhere.invalid' is not known here; "
+        ("nowhere.invalid:0", "'nowhere.invalid:0': host 'nowhere.invalid' cannot be resolved; "
          "write an address of this machine"),
     ],
 )  # fmt: skip
 def test_an_address_that_will_not_do_is_told(address: str, message: str) -> None:
     with pytest.raises(InvalidInput) as error:
-        Webhook(address, b"", lambda: None)
+        PushWebhook(address, b"", lambda: None)
     assert str(error.value) == f"--webhook: {message}"
 
 
-def test_a_port_in_use_is_told(unsigned: Webhook) -> None:
+def test_a_port_in_use_is_told(unsigned: PushWebhook) -> None:
     taken = urlsplit(unsigned.url).netloc
     with pytest.raises(InvalidInput, match=f"'{taken}' cannot be listened on: Address already"):
-        Webhook(taken, b"", lambda: None)
+        PushWebhook(taken, b"", lambda: None)
 
 
 def test_with_a_secret_others_may_be_listened_to(heard: Heard) -> None:
-    hook = Webhook("0.0.0.0:0", SECRET, heard)
+    hook = PushWebhook("0.0.0.0:0", SECRET, heard)
     hook.close()
 
 

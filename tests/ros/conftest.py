@@ -18,8 +18,8 @@ import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
-from demandops_ros.messages import from_data
-from demandops_ros.node import DEEP
+from demandops_ros.messages import fill_message
+from demandops_ros.node import DEEP_QOS
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from unique_identifier_msgs.msg import UUID
@@ -140,7 +140,7 @@ class Client:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         qos = (
-            {f"{service}_service_qos_profile": DEEP for service in ("goal", "result", "cancel")}
+            {f"{service}_service_qos_profile": DEEP_QOS for service in ("goal", "result", "cancel")}
             if deep
             else {}
         )
@@ -148,7 +148,10 @@ class Client:
         # an action client forgets a goal's feedback once it has the result; a subscription does not
         self._sent: dict[bytes, Sent] = {}
         self.node.create_subscription(
-            DeploymentRequest.Impl.FeedbackMessage, f"{action}/_action/feedback", self._hear, DEEP
+            DeploymentRequest.Impl.FeedbackMessage,
+            f"{action}/_action/feedback",
+            self._hear,
+            DEEP_QOS,
         )
 
     def wait(self, condition: Callable[[], bool], seconds: float = DEADLINE_S) -> None:
@@ -166,7 +169,7 @@ class Client:
         sent, id = Sent(), uuid.uuid4().bytes
         self._sent[id] = sent
         future = self._client.send_goal_async(
-            from_data(DeploymentRequest.Goal(), goal), goal_uuid=UUID(uuid=list(id))
+            fill_message(DeploymentRequest.Goal(), goal), goal_uuid=UUID(uuid=list(id))
         )
         future.add_done_callback(lambda done: self._on_response(sent, done.result()))
         return sent

@@ -19,7 +19,7 @@ from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops.staterepo.git import tree as trees
 from demandops_interfaces.action import Demand
 from demandops_interfaces.msg import Bookkeeping
-from demandops_ros.client import DemandClient, DemandError
+from demandops_ros import DemandClient, DemandError
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
@@ -105,7 +105,7 @@ def test_a_third_type_of_application_is_demanded_with_yaml_alone(
     served = serve(str(state))
     stages: list[str] = []
     with client.demand(
-        "v0/recording", [RECORDER], told=lambda stage, _: stages.append(stage)
+        "v0/recording", [RECORDER], on_stage=lambda stage, _: stages.append(stage)
     ) as it:
         assert it.answer is not None and it.answer.outcome == "booked"
         assert it.answer.warnings == ()
@@ -129,7 +129,9 @@ def test_a_refusal_names_code_field_and_remedy(serve: Serve, client: DemandClien
     with pytest.raises(DemandError) as caught:
         client.release("d")
     assert caught.value.code == "not-held"
-    with pytest.raises(ValueError, match="'node_id' is no field of an application; did you mean"):
+    with pytest.raises(
+        ValueError, match="'node_id' is not a field of an application; did you mean"
+    ):
         client.put("d", [{"node_id": "edge"}])
     assert client.put("d", connections=[LINK]).outcome == "booked"
     assert served.bookkeeping()["connections"]["link"]["topics"] == ["/a", "/b"]
@@ -250,7 +252,7 @@ def test_the_command_line_sends_holds_and_gives_up(serve: Serve, tmp_path: Path)
     holding.send_signal(signal.SIGINT)
     out, told = holding.communicate(timeout=60)
     assert holding.returncode == 0, told
-    assert out.startswith("booked in ") and told.endswith("given up\n")
+    assert out.startswith("booked in ") and told.endswith("released\n")
     assert operations(state)[-1] == "release"
 
 

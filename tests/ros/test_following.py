@@ -106,9 +106,9 @@ def test_a_push_that_the_webhook_hears_of_is_followed_at_once(
     assert client.call(connection(1)).status == "succeeded"
     brokers = read(bare, "inventory/brokers.yaml")
     commit(bare, "inventory/brokers.yaml", brokers.replace("broker-edge", "broker-moved"))
-    client.wait(lambda: "hearing of pushes at " in served.log.read_text())
+    client.wait(lambda: "listening for pushes at " in served.log.read_text())
     found = re.search(
-        r"hearing of pushes at (http://127.0.0.1:[0-9]+/push)", served.log.read_text()
+        r"listening for pushes at (http://127.0.0.1:[0-9]+/push)", served.log.read_text()
     )
     assert found is not None
     with urllib.request.urlopen(found[1], data=b"{}", timeout=10) as answer:  # noqa: S310

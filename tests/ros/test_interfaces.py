@@ -264,7 +264,7 @@ def test_a_build_folder_inside_the_sources_is_refused() -> None:
     result = run_build("--build-dir", str(INTERFACES / "build"))
     assert result.returncode == 2
     assert result.stderr.endswith(
-        f"error: --build-dir {INTERFACES / 'build'} lies inside the sources; name another\n"
+        f"error: --build-dir {INTERFACES / 'build'} is inside the sources; choose another\n"
     )
 
 
@@ -446,7 +446,7 @@ def test_missing_wheels_are_named(script: ModuleType, capsys: pytest.CaptureFixt
         (script.SITE / f"{wheel}-1.0.dist-info").rmdir()
     assert script.main([]) == 1
     assert capsys.readouterr().err == (
-        f"{script.PREFIX} lacks Python packages\n"
+        f"Python packages are missing in {script.PREFIX}\n"
         f"install with: {sys.executable} -m pip install "
         "catkin-pkg ros-ament-cmake 'ros-rclpy[fastrtps]'\n"
     )

@@ -243,7 +243,7 @@ class World:
 
     def look(self) -> list[str]:
         """Release what has expired, one commit for each demand; return the demands."""
-        now, claims = self._lease_clock.ended(self.state.ledger)
+        now, claims = self._lease_clock.ended_claims(self.state.ledger)
         done = []
         for demand in dict.fromkeys(claim.demand for claim in claims):
             request = DemandRequest(id=demand, operation=Operation.EXPIRE, demand=demand)

@@ -1,8 +1,7 @@
-"""The one use case: submit a demand, get a receipt when it is published.
+"""The generator as a service: submit a demand and get a receipt once it is published.
 
-One worker thread owns the state repo. Demands that arrive together are committed one by one and
-published once; a lone one at once. Everything received is in the outbox first, so a crash loses
-nothing, and when the remote has moved the demands themselves are judged again on the new tip.
+Any thread may submit. One worker thread owns the state repo: it journals what arrived, commits
+each demand and publishes the commits together. After a crash it resumes from the journal.
 """
 
 from demandops.service.generator import Generator

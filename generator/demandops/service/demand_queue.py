@@ -1,7 +1,7 @@
-"""The demands that wait to be settled: handed in from any thread, taken up by one.
+"""The queue of demands: any thread adds, the worker thread takes.
 
-Every state of a ticket changes under one lock, so a demand is taken back before it is committed or
-not at all. What is taken up is in the outbox before anything is done with it.
+A ticket's state changes under one lock, so a demand is withdrawn before it is committed or not at
+all. A demand is in the journal before the worker evaluates it.
 """
 
 from __future__ import annotations
@@ -13,49 +13,50 @@ from contextlib import suppress
 from dataclasses import replace
 
 from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
-from demandops.service.ticket import Receipt, Record, Ticket, left_over
+from demandops.service.ticket import ProposalRecord, Receipt, Ticket, ticket_from_journal
 from demandops.staterepo.write.journal import Journal
 
 TAKEN_BACK = "the demand was taken back before it was committed"
 
 
 class DemandQueue:
-    """A bounded queue over an outbox.
+    """A bounded queue with a journal.
 
-    ``blocked`` says why nothing gets on, for whoever finds the queue full; empty where it does.
+    ``blocked`` is why no demand can be published now, or empty; it is part of the error when the
+    queue is full.
     """
 
-    def __init__(self, outbox: Journal, limit: int) -> None:
-        self._outbox = outbox
+    def __init__(self, journal: Journal, limit: int) -> None:
+        self._journal = journal
         self._limit = limit
         self._changed = threading.Condition()
-        self._queue = deque(left_over(entry) for entry in outbox.pending.values())
+        self._queue = deque(ticket_from_journal(entry) for entry in journal.pending.values())
         self._tickets = {ticket.operation: ticket for ticket in self._queue}
-        self._unkept: list[Ticket] = []
+        self._not_journaled: list[Ticket] = []
         self._closed = self._woken = False
         self.blocked = ""
 
     @property
     def operations(self) -> tuple[str, ...]:
-        """The demands that have no answer yet."""
+        """The operation ids of the demands that have no answer yet."""
         with self._changed:
             return tuple(self._tickets)
 
     @property
-    def anything(self) -> bool:
-        """Whether a demand waits to be taken up."""
+    def has_waiting(self) -> bool:
+        """Whether a demand waits to be taken."""
         return bool(self._queue)
 
     @property
     def unpublished(self) -> int:
-        """How many demands the outbox holds, but for those that await approval."""
-        return sum(1 for entry in self._outbox.pending.values() if entry.proposal is None)
+        """How many demands are in the journal and do not await approval."""
+        return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
 
     def add(self, ticket: Ticket) -> None:
-        """Put a demand in.
+        """Add a demand.
 
         Raises:
-            ShuttingDown, QueueFull: where it is not taken.
+            ShuttingDown, QueueFull: if the queue is closed or full.
         """
         with self._changed:
             if self._closed:
@@ -66,18 +67,18 @@ class DemandQueue:
                     f"{self._limit} demands are waiting already{why}; send it again later"
                 )
             self._queue.append(ticket)
-            self._unkept.append(ticket)
+            self._not_journaled.append(ticket)
             self._tickets[ticket.operation] = ticket
             self._changed.notify()
 
     def close(self) -> None:
-        """Take no more."""
+        """Accept no more demands."""
         with self._changed:
             self._closed = True
             self._changed.notify()
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait until something is there or ``timeout`` has passed; false once all is settled."""
+        """Wait for a demand, :meth:`wake` or ``timeout``; return False once closed and empty."""
         with self._changed:
             if not self._queue and not self._closed and not self._woken:
                 self._changed.wait(timeout)
@@ -85,141 +86,137 @@ class DemandQueue:
             return bool(self._queue) or not self._closed
 
     def wake(self) -> None:
-        """End a wait although nothing came; from any thread."""
+        """End a wait although no demand came; from any thread."""
         with self._changed:
             self._woken = True
             self._changed.notify()
 
     @property
-    def urgent(self) -> bool:
-        """Whether something is to do that must not wait for a look at the remote."""
+    def must_not_wait(self) -> bool:
+        """Whether there is something to do that must not wait for a fetch."""
         return bool(self._queue) or self._closed
 
-    def keep(self, timeout: float) -> list[Ticket]:
-        """Wait for demands that come in and journal them, for nothing gets on at the moment.
+    def journal_arrivals(self, timeout: float) -> list[Ticket]:
+        """Wait for new demands and journal them, while nothing can be published.
 
         Returns:
-            Those that came; none where ``timeout`` seconds passed, one was taken back, or it was
-            woken.
+            The new demands; none after ``timeout`` seconds, a withdrawal or :meth:`wake`.
         """
         with self._changed:
-            if not self._unkept and not self._woken:
+            if not self._not_journaled and not self._woken:
                 self._changed.wait(timeout)
             self._woken = False
-            return self._journal()
+            return self._journal_new()
 
-    def _journal(self) -> list[Ticket]:
-        """Put what came in since the last time into the outbox."""
-        fresh = [
+    def _journal_new(self) -> list[Ticket]:
+        new = [
             ticket
-            for ticket in self._unkept
-            if ticket.state == "waiting" and ticket.operation not in self._outbox.pending
+            for ticket in self._not_journaled
+            if ticket.state == "waiting" and ticket.operation not in self._journal.pending
         ]
-        self._outbox.append(ticket.entry() for ticket in fresh)
-        self._unkept = []
-        return fresh
+        self._journal.append(ticket.journal_entry() for ticket in new)
+        self._not_journaled = []
+        return new
 
-    def propose(self, ticket: Ticket, record: Record) -> bool:
-        """Keep on the disk what a demand awaits approval on; false where it was taken back.
+    def set_proposal(self, ticket: Ticket, record: ProposalRecord) -> bool:
+        """Journal the proposal that a demand waits for; return False if it was withdrawn.
 
-        Until it is booked, a demand that awaits approval can be taken back.
+        A demand that awaits approval can still be withdrawn.
         """
         with self._changed:
             if ticket.state == "withdrawn":
                 return False
             ticket.state, ticket.proposal = "waiting", record
-            self._outbox.append([ticket.entry()])
+            self._journal.append([ticket.journal_entry()])
         return True
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Put demands in again that need no approval any more."""
+        """Queue demands again that no longer need approval."""
         with self._changed:
             for ticket in tickets:
                 ticket.proposal = None
-                self._outbox.append([ticket.entry()])
+                self._journal.append([ticket.journal_entry()])
                 self._queue.append(ticket)
             self._changed.notify()
 
-    def take_up(self, batch: list[Ticket], limit: int) -> None:
-        """Move what waits into the batch, up to ``limit`` in all; all that waits is journaled."""
-        with self._changed:  # held while journaling: a demand is taken back before it or after
+    def take(self, batch: list[Ticket], limit: int) -> None:
+        """Move demands into ``batch``, up to ``limit`` in all, and journal all that wait."""
+        with self._changed:  # keep the lock while journaling, so that none is withdrawn in between
             room = limit - len(batch)
-            fresh = [self._queue.popleft() for _ in range(min(room, len(self._queue)))]
-            batch += fresh
-            self._journal()
+            batch += [self._queue.popleft() for _ in range(min(room, len(self._queue)))]
+            self._journal_new()
 
     def withdraw(self, operation: str) -> bool:
-        """Take a demand back. False once it is committed, or was never known."""
+        """Withdraw a demand; return False if it is committed or unknown."""
         with self._changed:
             ticket = self._tickets.get(operation)
             if ticket is None or ticket.state != "waiting":
                 return ticket is not None and ticket.state == "withdrawn"
             if ticket.proposal is not None:
-                self._mark(ticket, TAKEN_BACK)
+                self._withdraw_proposed(ticket, TAKEN_BACK)
                 return True
             ticket.state = "withdrawn"
-            self._outbox.mark_done([operation], durably=True)  # nor may a restart take it up
+            self._journal.mark_done([operation], durably=True)  # a restart must not resume it
             self._woken = True
-            self._changed.notify()  # it is answered although nothing gets on
+            self._changed.notify()  # the worker answers it even while nothing can be published
         return True
 
-    def retract(self, tickets: Iterable[Ticket], reason: str) -> None:
-        """Mark demands that await approval as ones to go; a restart knows it as well."""
+    def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
+        """Withdraw demands that await approval; a restart knows it as well."""
         with self._changed:
             for ticket in tickets:
-                self._mark(ticket, reason)
+                self._withdraw_proposed(ticket, reason)
 
-    def _mark(self, ticket: Ticket, reason: str) -> None:
-        """Kept in the outbox until the branch is gone: nobody may merge what was taken back."""
+    def _withdraw_proposed(self, ticket: Ticket, reason: str) -> None:
+        """Keep the demand in the journal until its branch is deleted, so that none merges it."""
         if ticket.proposal is None or ticket.state != "waiting":
             return
         ticket.state = "withdrawn"
         ticket.proposal = replace(ticket.proposal, withdrawn=reason)
-        self._outbox.append([ticket.entry()])
+        self._journal.append([ticket.journal_entry()])
         self._woken = True
         self._changed.notify()
 
-    def hold(self, ticket: Ticket) -> bool:
-        """Make a demand one that cannot be taken back any more; false where it was."""
+    def mark_committed(self, ticket: Ticket) -> bool:
+        """Refuse further withdrawals of a demand; return False if it was withdrawn before."""
         with self._changed:
             if ticket.state != "withdrawn":
                 ticket.state = "committed"
             return ticket.state == "committed"
 
-    def dismiss_withdrawn(self, batch: list[Ticket]) -> None:
-        """Answer those that were taken back at once: the remote may be away for long.
+    def answer_withdrawn(self, batch: list[Ticket]) -> None:
+        """Answer withdrawn demands at once, because the remote may be unreachable for long.
 
-        Not one that was proposed: its branch has to go first.
+        A withdrawn proposal is answered later: its branch is deleted first.
         """
         with self._changed:
-            gone = [ticket for ticket in self._queue if _is_dismissed(ticket)]
-            if gone:
-                self._queue = deque(one for one in self._queue if not _is_dismissed(one))
-        withdrawn = [ticket for ticket in batch if _is_dismissed(ticket)]
-        batch[:] = [ticket for ticket in batch if not _is_dismissed(ticket)]
-        for ticket in [*withdrawn, *gone]:
+            withdrawn = [ticket for ticket in [*batch, *self._queue] if _is_withdrawn(ticket)]
+            if withdrawn:
+                self._queue = deque(t for t in self._queue if not _is_withdrawn(t))
+                batch[:] = [ticket for ticket in batch if not _is_withdrawn(ticket)]
+        for ticket in withdrawn:
             self._forget(ticket)
             ticket.future.set_exception(Withdrawn(TAKEN_BACK))
 
     def answer(self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]]) -> None:
-        """Tell each what came of it; the outbox forgets them."""
+        """Answer each demand with its result and remove it from the journal."""
         results = list(results)
         with self._changed:
-            self._outbox.mark_done(ticket.operation for ticket, _ in results)
+            self._journal.mark_done(ticket.operation for ticket, _ in results)
         for ticket, result in results:
             self._forget(ticket)
             if isinstance(result, Receipt):
-                ticket.tell("pushed", f"pushed {result.commit}")
+                ticket.notify("pushed", f"pushed {result.commit}")
                 ticket.future.set_result(result)
             else:
                 ticket.future.set_exception(result)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
-        """Answer every demand of a batch with an error; ``keep`` leaves them in the outbox."""
+        """Answer every demand of a batch with an error; ``keep`` leaves them in the journal."""
         batch = list(batch)
         if not keep:
-            with self._changed, suppress(OSError):  # a full disk must not withhold the answer
-                self._outbox.mark_done(ticket.operation for ticket in batch)
+            with self._changed, suppress(OSError):  # a full disk must not prevent the answer
+                self._journal.mark_done(ticket.operation for ticket in batch)
         for ticket in batch:
             self._forget(ticket)
             ticket.future.set_exception(error)
@@ -230,5 +227,5 @@ class DemandQueue:
             self._tickets.pop(ticket.operation, None)
 
 
-def _is_dismissed(ticket: Ticket) -> bool:
+def _is_withdrawn(ticket: Ticket) -> bool:
     return ticket.state == "withdrawn" and ticket.proposal is None

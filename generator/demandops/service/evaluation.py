@@ -1,6 +1,6 @@
-"""Judging: what becomes of one demand on top of a line of commits, or became of it before.
+"""Evaluates one demand on top of the commits of its batch.
 
-Whatever is wrong with a demand is its answer; nothing that it holds stops the others.
+Every error of a demand is its own answer: it stops no other demand.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import TypeAlias
 
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand import decommission_goal
-from demandops.demand.demand_request import Operation
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
-from demandops.service.approvals.approvals import GIVEN_UP, Approvals, Deferred
+from demandops.service.approvals.approvals import RELEASED, Approvals, Deferred
+from demandops.service.approvals.proposal import is_release
 from demandops.service.demand_queue import TAKEN_BACK, DemandQueue
-from demandops.service.rollout_targets import of_decision as targets_of
+from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import Receipt, Ticket
 from demandops.service.timing.rate_limit import RateLimit
 from demandops.staterepo.git.repository import StateRepository
@@ -32,93 +32,93 @@ Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Deferred]
 
 
 class Evaluator:
-    """Judges demands, in the thread that owns the state repo."""
+    """Evaluates demands in the worker thread."""
 
     def __init__(
         self,
         repository: StateRepository,
-        waiting: DemandQueue,
+        queue: DemandQueue,
         approvals: Approvals,
         with_targets: bool,
     ) -> None:
-        self._repository, self._waiting, self._approvals = repository, waiting, approvals
+        self._repository, self._queue, self._approvals = repository, queue, approvals
         self._with_targets = with_targets
-        self._throttle = RateLimit()
+        self._rate_limit = RateLimit()
 
-    def __call__(
+    def evaluate(
         self,
         line: commit_batch.CommitBatch,
         ticket: Ticket,
-        arrived: dict[str, commit_log.RecordedOutcome],
+        published: dict[str, commit_log.RecordedOutcome],
         earlier: list[Result],
     ) -> Receipt | DemandOpsError | Deferred:
-        """Decide a demand on top of the line and commit it there.
+        """Decide a demand, commit it on the commit line and return its result.
 
         Args:
-            arrived: what :meth:`arrived` told of its batch.
-            earlier: what became of the demands of the batch before it; those that it gives up
-                while they await approval are withdrawn there.
+            published: what :meth:`published_before` returned for the batch.
+            earlier: the results of the earlier demands of the batch. A demand that releases one of
+                them before it is proposed replaces its result with ``Withdrawn``.
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
-        if ticket.operation in arrived:
-            return _published_before(ticket, arrived[ticket.operation])
+        if ticket.operation in published:
+            return _receipt_of_published(ticket, published[ticket.operation])
         try:
-            gone = self._approvals.gave_up(ticket, line.head.state, earlier)
+            released = self._approvals.released_in_batch(ticket, line.head.state, earlier)
             earlier[:] = [
-                (t, Withdrawn(GIVEN_UP) if t.operation in gone else r) for t, r in earlier
+                (t, Withdrawn(RELEASED) if t.operation in released else r) for t, r in earlier
             ]
             goal = ticket.goal
             if rollback_goal.is_rollback(goal):
-                goal = rollback_goal.understood(goal, self._repository, line.start)
+                goal = rollback_goal.to_restoration(goal, self._repository, line.start)
             decision = decide(
                 line.head.state,
                 goal,
                 ticket.received,
                 line.read,
-                lambda stage: ticket.tell(stage, stage),
-                lambda request, config: self._throttle.faults(
+                lambda stage: ticket.notify(stage, stage),
+                lambda request, config: self._rate_limit.faults(
                     request, config, ticket.operation, ticket.received
                 ),
             )
             if decision.approval:
                 return Deferred(decision)
-            if not self._waiting.hold(ticket):
+            if not self._queue.mark_committed(ticket):
                 return Withdrawn(TAKEN_BACK)
-            self._approvals.replaced_by(decision.request)
+            self._approvals.withdraw_replaced(decision.request)
             before = line.head.state.ledger
-            targets = targets_of(before, decision) if self._with_targets else ()
+            targets = targets_of_decision(before, decision) if self._with_targets else ()
             return replace(_commit(line, ticket, decision), targets=targets)
         except InvalidInput as error:
-            if self._approvals.released(ticket):  # what was proposed, and nothing else
+            if self._approvals.has_released_a_proposal(ticket):  # which held no claims yet
                 line.note_settled(ticket.operation, "Unchanged")
-                return _released(ticket, str(line.head.commit))
+                return _receipt_of_released(ticket, str(line.head.commit))
             line.note_settled(ticket.operation, "Refused")
             return error
         except SigningFailed as error:
             return error
-        except Exception as error:  # one demand that the program cannot handle stops no other
-            log.exception("a fault of the generator, at demand %s", ticket.operation)
-            return StateRepoError(f"a fault of the generator: {error!r}; its log says more")
+        except Exception as error:  # a bug that one demand triggers must not stop the others
+            log.exception("internal error while evaluating demand %s", ticket.operation)
+            return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
-    def arrived(
+    def published_before(
         self, start: Snapshot, batch: list[Ticket]
     ) -> dict[str, commit_log.RecordedOutcome]:
-        """Return operation id → arrival of demands that were published although nobody was told.
+        """Return, by operation id, the demands that are published although nobody was answered.
 
-        The connection may have been cut, or the process killed, after the remote took the push.
+        The connection was cut, or the process was killed, after the remote accepted the push.
         """
         bases = {ticket.base for ticket in batch if ticket.maybe_published}
-        found: dict[str, commit_log.RecordedOutcome] = {}
+        published: dict[str, commit_log.RecordedOutcome] = {}
         for base in bases:
-            found |= commit_log.operations_since(self._repository.objects, start.commit, base)
-        return found
+            published |= commit_log.operations_since(self._repository.objects, start.commit, base)
+        return published
 
 
 def _commit(line: commit_batch.CommitBatch, ticket: Ticket, decision: Decision) -> Receipt:
     if decision.files:
         commit = line.commit(decision, ticket.operation, ticket.received, _now())
-        ticket.tell("committed", f"committed {commit}")
+        ticket.notify("committed", f"committed {commit}")
     else:
         commit = str(line.head.commit)
         line.note_settled(ticket.operation, "Unchanged")
@@ -134,16 +134,15 @@ def _commit(line: commit_batch.CommitBatch, ticket: Ticket, decision: Decision) 
     )
 
 
-def _published_before(
+def _receipt_of_published(
     ticket: Ticket, arrival: commit_log.RecordedOutcome
 ) -> Receipt | DemandOpsError:
     if arrival.outcome == "refused":
-        message = "was refused when the connection was cut; send it again to hear why"
+        message = "was refused, but the reason was lost with the connection; send it again"
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal if isinstance(ticket.goal, dict) else {}
-    gives_up = goal.get("shutdown") or goal.get("operation") == Operation.RELEASE.value
-    gives_up = gives_up or decommission_goal.is_decommission(goal)
-    outcome: Outcome = "released" if gives_up else "booked"
+    releases = is_release(goal) or decommission_goal.is_decommission(goal)
+    outcome: Outcome = "released" if releases else "booked"
     if rollback_goal.is_rollback(goal):
         outcome = "restored"
     if arrival.outcome == "unchanged":
@@ -152,7 +151,7 @@ def _published_before(
     return Receipt(ticket.operation, str(name), outcome, arrival.commit)
 
 
-def _released(ticket: Ticket, commit: str) -> Receipt:
+def _receipt_of_released(ticket: Ticket, commit: str) -> Receipt:
     goal = ticket.goal
     name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
     return Receipt(ticket.operation, str(name), "released", commit)

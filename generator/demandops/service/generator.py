@@ -1,4 +1,4 @@
-"""The generator: takes demands from any thread, and runs the one that settles them."""
+"""The generator: accepts demands from any thread and runs the worker thread."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 from demandops import settings
 from demandops.config.config import Config
 from demandops.errors import DemandOpsError, ShuttingDown, StateRepoError
-from demandops.service import follower
 from demandops.service.approvals.approvals import Approvals
 from demandops.service.demand_queue import DemandQueue
-from demandops.service.ticket import Listener, Ticket, handed_in
+from demandops.service.remote_status import StateRepoStatus
+from demandops.service.ticket import Listener, Ticket, new_ticket
 from demandops.service.worker import Worker
 from demandops.staterepo.git import connect
 from demandops.staterepo.git.signing import Signer
@@ -28,41 +28,41 @@ _STOP_TIMEOUT_S = 20.0
 
 
 class Generator:
-    """Takes demands from any thread and turns them into commits of one state repo."""
+    """Turns demands from any thread into commits of one state repo."""
 
-    def __init__(  # noqa: PLR0913 - one for each thing that a caller may set
+    def __init__(  # noqa: PLR0913 - each is a setting of its own
         self,
         state_repo: str,
         *,
         data: Path | None = None,
         queue_limit: int = settings.QUEUE_LIMIT,
-        patient: bool = True,
+        start_offline: bool = True,
         with_targets: bool = False,
         fetch_interval: float = 0.0,
         signing_key: Path | None = None,
         progress: Progress = lambda done, total: None,
     ) -> None:
-        """Open the state repo and start the worker; what an earlier run left over comes first.
+        """Open the state repo, start the worker and resume what is in the journal.
 
         Args:
             state_repo: a folder with a bare repository, or a URL that git clones.
-            data: where outbox and clone are kept; by default :func:`settings.data_home`.
-            queue_limit: how many demands may wait.
-            patient: whether to start while the remote is away, from what was fetched last.
-            with_targets: whether receipts say which releases a demand needs.
-            fetch_interval: seconds between two looks at what others published, while no demand
-                comes; 0: a repository on this disk only, and seldom.
+            data: the folder for journal and clone; by default :func:`settings.data_home`.
+            queue_limit: how many demands may be queued.
+            start_offline: whether to start from the last fetch if the remote cannot be reached.
+            with_targets: whether receipts list the releases that a demand needs.
+            fetch_interval: seconds between two fetches while no demand comes; 0: never, except
+                that a repository on this disk is checked every minute.
             signing_key: an SSH key that signs the commits (:mod:`demandops.staterepo.git.signing`).
-            progress: told (files read, files in all) while the ledger is loaded.
+            progress: called with (files read, files in all) while the ledger is loaded.
 
         Raises:
-            StateRepoError, InvalidInput: where the state repo or the key cannot be used.
+            StateRepoError, InvalidInput: if the state repo or the key cannot be used.
         """
         signer = Signer(signing_key) if signing_key else None
         self._slot = Slot(data or settings.data_home(state_repo))
         try:
             repository = connect.connect(
-                state_repo, self._slot.folder, log.info, allow_offline=patient
+                state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
             repository.signer = signer
             snapshot = commit_batch.first_snapshot(repository, progress)
@@ -73,40 +73,46 @@ class Generator:
         self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
-        self._waiting = DemandQueue(self._slot.journal, queue_limit)
-        self._watchers: list[Callable[[Config], None]] = []
+        self._queue = DemandQueue(self._slot.journal, queue_limit)
+        self._listeners: list[Callable[[Config], None]] = []
         self._approvals = Approvals(
-            repository, self._waiting, with_targets, settings.forge_token_file()
+            repository, self._queue, with_targets, settings.forge_token_file()
         )
-        self._settler = Worker(
+        self._worker = Worker(
             repository,
             snapshot,
-            self._waiting,
-            self._tell_watchers,
+            self._queue,
+            self._call_listeners,
             with_targets,
             self._approvals,
             fetch_interval,
         )
         self._finished: Future[bool] | None = None
         self._stop_lock = threading.Lock()
-        for operation in self._waiting.operations:
-            log.info("taking up demand %s from the outbox", operation)
-        self._worker = threading.Thread(target=self._run, name="demandops-writer", daemon=True)
-        self._worker.start()
+        for operation in self._queue.operations:
+            log.info("resuming demand %s from the journal", operation)
+        self._thread = threading.Thread(target=self._run, name="demandops-writer", daemon=True)
+        self._thread.start()
 
     @property
     def snapshot(self) -> Snapshot:
-        """The newest published state; safe to read from any thread."""
-        return self._settler.snapshot
+        """The newest published state; any thread may read it."""
+        return self._worker.snapshot
 
     @property
-    def condition(self) -> follower.Condition:
-        """How it is with the state repo; safe to read from any thread."""
-        return follower.condition(self._settler.follower.link, self.snapshot, self._waiting)
+    def state_repo_status(self) -> StateRepoStatus:
+        """The status of the state repo; any thread may read it."""
+        snapshot = self.snapshot
+        return StateRepoStatus(
+            self._worker.fetcher.remote.status,
+            snapshot.problems,
+            self._queue.unpublished,
+            str(snapshot.commit),
+        )
 
-    def look(self) -> None:
-        """Have the state repo looked at now, for somebody pushed to it; from any thread."""
-        self._settler.follower.nudge()
+    def fetch_now(self) -> None:
+        """Fetch from the state repo now, because a push was reported; from any thread."""
+        self._worker.fetcher.fetch_now()
 
     def submit(
         self,
@@ -114,109 +120,109 @@ class Generator:
         operation: str | None = None,
         listener: Listener = lambda stage, text: None,
     ) -> Ticket:
-        """Hand in a demand; returns at once.
+        """Queue a demand and return its ticket at once.
 
         Args:
             goal: the goal as plain data (:mod:`demandops.demand.deployment_request_goal`).
-            operation: a unique id for this hand-in; one is made where it is left out.
-            listener: told each stage, from the worker thread.
+            operation: a unique id of this submission; generated if left out.
+            listener: called with each stage and its text, in the worker thread.
 
         Returns:
-            A ticket whose future gives the :class:`Receipt`, or raises ``Refused`` with every
+            A ticket whose future returns the :class:`Receipt`, or raises ``Refused`` with every
             fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``.
 
         Raises:
-            ShuttingDown, QueueFull: where the demand is not taken at all.
+            ShuttingDown, QueueFull: if the demand is not accepted at all.
         """
-        ticket = handed_in(goal, operation, listener)
+        ticket = new_ticket(goal, operation, listener)
         if not ticket.future.done():
             ticket.base = str(self.snapshot.commit)
-            self._waiting.add(ticket)
+            self._queue.add(ticket)
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:
-        """Tell whether ``commit`` is ``other`` or comes after it; from any thread."""
+        """Return whether ``commit`` is ``other`` or a descendant of it; from any thread."""
         return self._repository.includes(commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Tell whether two commits hold the same under ``path``; from any thread."""
+        """Return whether two commits have the same content at ``path``; from any thread."""
         return self._repository.unchanged(commit, other, path)
 
-    def changed(self, since: str) -> tuple[str, list[str] | None]:
-        """Return the newest published commit and which paths changed since another.
+    def changes_since(self, since: str) -> tuple[str, list[str] | None]:
+        """Return the newest published commit and the paths that changed since another.
 
-        The paths are None where that other is not known. From any thread.
+        The paths are None if the other commit is unknown. From any thread.
         """
         commit = str(self.snapshot.commit)
         return commit, self._repository.changed_paths(since, commit)
 
     def withdraw(self, operation: str) -> bool:
-        """Take a demand back. False once it is committed, or was never known."""
-        return self._waiting.withdraw(operation)
+        """Withdraw a demand; return False if it is committed or unknown."""
+        return self._queue.withdraw(operation)
 
-    def watch(self, on_published: Callable[[Config], None]) -> None:
-        """Have ``on_published`` called after every push, in the worker thread.
+    def on_publish(self, listener: Callable[[Config], None]) -> None:
+        """Call ``listener`` in the worker thread after every publication.
 
-        It is given the configuration in force and must return at once.
+        It gets the configuration in effect and must return at once.
         """
-        self._watchers.append(on_published)
+        self._listeners.append(listener)
 
-    def _tell_watchers(self, config: Config) -> None:
-        for watcher in self._watchers:
-            watcher(config)
+    def _call_listeners(self, config: Config) -> None:
+        for listener in self._listeners:
+            listener(config)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
-        """Refuse further demands, finish what is in hand and stop; returns at once.
+        """Refuse further demands, finish the queued ones and stop; returns at once.
 
         Args:
-            timeout: seconds to wait for a remote that is away; then what is left stays in the
-                outbox for the next start, and its futures raise ``ShuttingDown``.
+            timeout: seconds to wait for a remote that cannot be reached. What is left then stays
+                in the journal for the next start, and its futures raise ``ShuttingDown``.
 
         Returns:
-            A future that tells, when all has ended, whether everything was published.
+            A future that returns, once the worker has ended, whether everything was published.
         """
         with self._stop_lock:
             if self._finished is not None:
                 return self._finished
             self._finished = finished = Future[bool]()
-        self._waiting.close()
+        self._queue.close()
         threading.Thread(
             target=self._end, args=(timeout, finished), name="demandops-stop", daemon=True
         ).start()
         return finished
 
     def _end(self, timeout: float, finished: Future[bool]) -> None:
-        self._worker.join(timeout)
-        if self._worker.is_alive():
-            self._settler.give_up()
-        self._worker.join()
-        left = self._waiting.unpublished
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            self._worker.stop_retrying()
+        self._thread.join()
+        unpublished = self._queue.unpublished
         self._slot.close()
-        finished.set_result(not left)
+        finished.set_result(not unpublished)
 
     def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
-        """Stop and wait for the end; return whether everything was published."""
+        """Stop, wait for the worker to end, and return whether everything was published."""
         return self.stop(timeout).result()
 
     def _run(self) -> None:
-        """Settle what comes until all is settled and no more is taken; in the worker thread."""
-        while self._waiting.wait(self._settler.pause()):
+        """Process demands until the queue is closed and empty; in the worker thread."""
+        while self._queue.wait(self._worker.seconds_until_due()):
             batch: list[Ticket] = []
             try:
-                self._settler.take_up(batch)
+                self._worker.take(batch)
                 if not batch:
-                    self._settler.notice()
+                    self._worker.fetch_if_due()
                 else:
-                    self._settler.settle(batch)
-                    self._settler.catch_up()
-                    self._settler.tidy()
-                self._settler.attend()
+                    self._worker.publish(batch)
+                    self._worker.retry_changes()
+                    self._worker.tidy()
+                self._worker.check_proposals()
             except ShuttingDown as error:
-                self._waiting.fail(batch, error, keep=True)
+                self._queue.fail(batch, error, keep=True)
             except DemandOpsError as error:
-                self._waiting.fail(batch, error)
+                self._queue.fail(batch, error)
             except Exception as error:
-                log.exception("a fault of the generator")
-                told = StateRepoError(f"a fault of the generator: {error!r}; its log says more")
-                self._waiting.fail(batch, told)
+                log.exception("internal error")
+                answer = StateRepoError(f"internal error of the generator: {error!r}; see its log")
+                self._queue.fail(batch, answer)
         self._approvals.suspend()

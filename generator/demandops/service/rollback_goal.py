@@ -1,7 +1,7 @@
-"""A rollback on its way through queue and outbox: plain data that only this program makes.
+"""A rollback as a goal: plain data that passes through queue and journal like a demand.
 
-No goal of an action and no request file has this form. It is judged like a demand, on the newest
-tip, so it works while others write: what they booked meanwhile counts as newer.
+Only the command line makes it: no action and no request file has this form. It is evaluated on the
+newest tip, so it works while others write; what they booked meanwhile counts as newer.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _KIND = "Rollback"
 
 
 def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dict[str, Any]:
-    """Return the goal to go back to a commit, in the name of ``who`` (name, e-mail address)."""
+    """Return the goal to go back to a commit; ``who`` is the person's name and e-mail address."""
     return {
         "apiVersion": API_VERSION,
         "kind": _KIND,
@@ -31,16 +31,18 @@ def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dic
 
 
 def is_rollback(goal: object) -> bool:
-    """Tell whether a goal is one of these."""
+    """Return whether a goal is a rollback."""
     return isinstance(goal, dict) and goal.get("kind") == _KIND
 
 
-def understood(goal: dict[str, Any], repository: StateRepository, head: Snapshot) -> Restoration:
-    """Return the request behind a goal.
+def to_restoration(
+    goal: dict[str, Any], repository: StateRepository, head: Snapshot
+) -> Restoration:
+    """Return the request that a rollback goal stands for.
 
     Raises:
-        Refused: where its commit is none that the state repo went through.
-        InvalidInput: where that commit's ledger is not valid.
+        Refused: if its commit is not in the history of the state repo.
+        InvalidInput: if that commit's ledger is not valid.
     """
     to = str(goal["to"])
     if not repository.includes(str(head.commit), to):

@@ -1,4 +1,4 @@
-"""What a demand is to come to on the clusters: the releases that it needs, or gives up."""
+"""The releases that a demand needs or removes, whose rollout the clusters report."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, key
 from demandops.render.gitops.argocd import project_of
 
 
-def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
-    """Return every release that a demand needs, and those that run no more because of it."""
+def targets_of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
+    """Return the releases that a demand needs, and those that it removes."""
     after, config = decision.state.ledger, decision.state.config
-    subjects = [*_asked(decision.request, after), *decision.changes.subjects()]
+    subjects = [*_requested_subjects(decision.request, after), *decision.changes.subjects()]
     keys: dict[ReleaseKey, None] = {}
     for subject in dict.fromkeys(subjects):
         keys |= dict.fromkeys(keys_of(after, config, subject))
     keys |= dict.fromkeys(affected_keys(before, after, config, decision.changes.subjects()))
-    found = []
+    targets = []
     for key in keys:
         new = plan(after, config, key)
         old = None
@@ -34,32 +34,32 @@ def of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
                 continue
         release = new or old
         if release is not None:
-            found.append(_target(release, config.repository, wanted=new is not None))
-    return tuple(dict.fromkeys(found))
+            targets.append(_target(release, config.repository, wanted=new is not None))
+    return tuple(dict.fromkeys(targets))
 
 
-def of_state(state: State) -> list[tuple[Release, Target]]:
-    """Return every release that the state asks for, by name, and what it is to come to."""
-    found = []
+def targets_of_state(state: State) -> list[tuple[Release, Target]]:
+    """Return every release of a state with its target, sorted by cluster and name."""
+    releases = []
     for key in all_keys(state.ledger, state.config):
         release = plan(state.ledger, state.config, key)
         if release is not None:
             target = _target(release, state.config.repository, wanted=True)
-            found.append((release, target))
-    return sorted(found, key=lambda pair: (pair[1].domain.cluster, pair[1].name))
+            releases.append((release, target))
+    return sorted(releases, key=lambda pair: (pair[1].domain.cluster, pair[1].name))
 
 
-def _asked(request: DemandRequest, ledger: Ledger) -> list[Subject]:
+def _requested_subjects(request: DemandRequest, ledger: Ledger) -> list[Subject]:
     subjects = [claim.subject for claim in ledger.claims_of_demand(request.demand)]
     if request.operation.asks:
         subjects += [Subject(SubjectKind.APPLICATION, app.id) for app in request.applications]
-        subjects += [Subject(SubjectKind.CONNECTION, one.id) for one in request.connections]
+        subjects += [Subject(SubjectKind.CONNECTION, link.id) for link in request.connections]
     return subjects
 
 
 def _target(release: Release, repository: RepoSettings, *, wanted: bool) -> Target:
-    domain, over = release.domain, None
+    domain, application = release.domain, None
     if repository.gitops == "argocd" and repository.argocd:
-        over = ObjectName(repository.argocd.namespace, project_of(domain, repository))
-    place = ClusterDomain(release.node.cluster, domain.name, domain.namespace, over)
+        application = ObjectName(repository.argocd.namespace, project_of(domain, repository))
+    place = ClusterDomain(release.node.cluster, domain.name, domain.namespace, application)
     return Target(place, release.name, isinstance(release, ServiceRelease), wanted)

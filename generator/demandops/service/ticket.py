@@ -1,4 +1,4 @@
-"""A demand under way, from the hand-in to its receipt."""
+"""A demand under way, from its submission to its receipt."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from demandops.staterepo.write.journal import JournalEntry
 log = logging.getLogger("demandops")
 
 Stage = Literal["away", "admitted", "booked", "committed", "proposed", "pushed"]
-"""``away``: the state repo cannot be reached or takes nothing for now; the text says why."""
+"""``away``: the state repo cannot be reached or written; the text says why."""
 Listener = Callable[[Stage, str], None]
 
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
@@ -29,12 +29,11 @@ _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """What came of a demand: the commit that holds it is published and durable.
+    """The outcome of a demand whose commit is published and durable.
 
-    ``commit`` is the tip where the demand changed nothing. ``lease_s`` is for how many seconds
-    it holds unless it is renewed, nothing where it has no end. ``targets`` are the releases that
-    it needs or gave up, where the generator was asked to say so. ``changes`` are the claims that it
-    changed; none where that was published before and nobody could be told.
+    ``commit`` is the tip if the demand changed nothing. ``lease_s`` is the lease in seconds, None
+    without one. ``targets`` are the releases that the demand needs or removes, if the generator was
+    asked for them. ``changes`` are the changed claims; empty if an earlier run published them.
     """
 
     operation: str
@@ -49,12 +48,12 @@ class Receipt:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
-    """What the journal keeps of a proposal: enough to take it up again.
+class ProposalRecord:
+    """What the journal keeps of a proposal, enough to resume it.
 
-    ``commits`` are those that the branch was put to or is about to be, the newest last, and
-    ``base`` the main below the newest. ``pushed`` tells that the branch was there once, ``link``
-    where the server says that a person finds it, ``withdrawn`` why it is to go, where it is.
+    ``commits`` are those that the branch was set to or is about to be, the newest last; ``base`` is
+    the commit of main below the newest. ``pushed``: the branch existed once. ``link``: where a
+    person finds it. ``withdrawn``: why it is to be deleted, or empty.
     """
 
     branch: str
@@ -67,10 +66,10 @@ class Record:
 
 @dataclass(eq=False)
 class Ticket:
-    """A demand under way. ``future`` gives its receipt, or raises why there is none.
+    """A demand under way. ``future`` returns its receipt or raises its error.
 
-    ``base`` is the tip that was known when it came in, ``maybe_published`` whether a push that
-    held it may have been taken although nobody heard so.
+    ``base`` is the tip that was known when it arrived. ``maybe_published``: the remote may have
+    accepted a push of it although no answer arrived.
     """
 
     operation: str
@@ -81,57 +80,62 @@ class Ticket:
     base: str = ""
     maybe_published: bool = False
     state: Literal["waiting", "committed", "withdrawn", "done"] = "waiting"
-    told: set[str] = field(default_factory=set)
-    proposal: Record | None = None
+    notified: set[str] = field(default_factory=set)
+    proposal: ProposalRecord | None = None
 
     def __post_init__(self) -> None:
-        self.future.set_running_or_notify_cancel()  # `withdraw` takes a demand back, not cancel
+        self.future.set_running_or_notify_cancel()  # a demand is withdrawn, not canceled
 
-    def tell(self, stage: Stage, text: str) -> None:
-        """Tell a stage once, also where the demand is judged again; of a proposal each news."""
-        news = text if stage == "proposed" else stage
-        if news in self.told:
+    def notify(self, stage: Stage, text: str) -> None:
+        """Report each stage once, even if the demand is evaluated again.
+
+        A proposal's text is reported each time it changes.
+        """
+        key = text if stage == "proposed" else stage
+        if key in self.notified:
             return
-        self.told.add(news)
+        self.notified.add(key)
         try:
             self.listener(stage, text)
         except Exception:
             log.exception("a listener failed")
 
-    def doubt(self, base: str) -> None:
-        """Note that a push on top of ``base`` may have been taken although it seemed to fail."""
+    def mark_maybe_published(self, base: str) -> None:
+        """Note that a push on top of ``base`` may have succeeded although it seemed to fail."""
         if not self.maybe_published:
             self.base, self.maybe_published = base, True
 
-    def entry(self) -> JournalEntry:
-        """Return what the outbox keeps of it."""
-        kept = asdict(self.proposal) if self.proposal else None
-        return JournalEntry(self.operation, self.goal, self.received.isoformat(), self.base, kept)
+    def journal_entry(self) -> JournalEntry:
+        """Return what the journal keeps of the demand."""
+        proposal = asdict(self.proposal) if self.proposal else None
+        return JournalEntry(
+            self.operation, self.goal, self.received.isoformat(), self.base, proposal
+        )
 
 
-def handed_in(goal: object, operation: str | None, listener: Listener) -> Ticket:
-    """Return a ticket for a goal; its future has failed already where the goal is no plain data.
+def new_ticket(goal: object, operation: str | None, listener: Listener) -> Ticket:
+    """Return a ticket for a goal; its future has failed already if the goal is not plain data.
 
     Raises:
-        ValueError: for an operation id that a trailer could not carry.
+        ValueError: for an operation id that a commit trailer cannot carry.
     """
     operation = operation or str(uuid.uuid4())
     if not _OPERATION.fullmatch(operation):
-        raise ValueError(f"{operation!r} is no operation id; use letters, digits and dashes")
+        raise ValueError(f"{operation!r} is not an operation id; use letters, digits and dashes")
     ticket = Ticket(operation, goal, datetime.now(timezone.utc), listener)
     try:
         ticket.goal = json.loads(json.dumps(goal))
     except (TypeError, ValueError, RecursionError):
-        ticket.future.set_exception(Refused([fault("", "the goal is no plain data")]))
+        ticket.future.set_exception(Refused([fault("", "the goal is not plain data")]))
     return ticket
 
 
-def left_over(entry: JournalEntry) -> Ticket:
-    """Return a ticket for a demand that an earlier run left in the outbox."""
+def ticket_from_journal(entry: JournalEntry) -> Ticket:
+    """Return a ticket for a demand that an earlier run left in the journal."""
     received = datetime.fromisoformat(entry.received)
     ticket = Ticket(entry.operation, entry.goal, received, lambda stage, text: None)
-    ticket.doubt(entry.base)
+    ticket.mark_maybe_published(entry.base)
     if entry.proposal is not None:
-        kept = entry.proposal
-        ticket.proposal = Record(**{**kept, "commits": tuple(kept["commits"])})
+        record = entry.proposal
+        ticket.proposal = ProposalRecord(**{**record, "commits": tuple(record["commits"])})
     return ticket

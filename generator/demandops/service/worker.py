@@ -1,4 +1,4 @@
-"""Settling: a batch of demands is judged, committed and published, however often the remote moves.
+"""The worker: evaluates, commits and publishes batches of demands, again if the remote has moved.
 
 Belongs to one thread, the only one that writes to the state repo.
 """
@@ -16,11 +16,11 @@ from demandops.errors import ShuttingDown
 from demandops.service.approvals.approvals import Approvals, Deferred
 from demandops.service.demand_queue import DemandQueue
 from demandops.service.evaluation import Evaluator, Result
-from demandops.service.follower import Follower
+from demandops.service.fetcher import Fetcher
 from demandops.service.ticket import Receipt, Ticket
 from demandops.service.timing.backoff import LIMIT_EMBEDDED, LIMIT_REMOTE, Backoff
-from demandops.service.timing.lease_expiry import LONGEST_WAIT_S, Expiries
-from demandops.service.timing.override_expiry import OverrideClock
+from demandops.service.timing.lease_expiry import LONGEST_WAIT_S, LeaseExpiry
+from demandops.service.timing.override_expiry import OverrideExpiry
 from demandops.staterepo.git.repository import PushDenied, RemoteAway, StateRepository
 from demandops.staterepo.load.snapshot import ReadAhead, Snapshot
 from demandops.staterepo.write import commit_batch
@@ -33,14 +33,14 @@ _TIDY_EVERY = 300
 class Worker:
     """Turns batches of demands into published commits.
 
-    ``snapshot`` is the newest published state; it may be read from any thread.
+    ``snapshot`` is the newest published state; any thread may read it.
     """
 
     def __init__(
         self,
         repository: StateRepository,
         snapshot: Snapshot,
-        waiting: DemandQueue,
+        queue: DemandQueue,
         on_published: Callable[[Config], None],
         with_targets: bool,
         approvals: Approvals,
@@ -49,204 +49,215 @@ class Worker:
         self.snapshot = snapshot
         self._approvals = approvals
         self._repository = repository
-        self._waiting = waiting
+        self._queue = queue
         self._on_published = on_published
-        self._judge = Evaluator(repository, waiting, approvals, with_targets)
-        self._stale = False
-        self._verdict_is_current = False
-        self._since_tidy = 0
-        self._expiries = Expiries()
-        self._overrides = OverrideClock()
+        self._evaluator = Evaluator(repository, queue, approvals, with_targets)
+        self._must_fetch = False
+        self._tip_is_fresh = False
+        self._commits_since_tidy = 0
+        self._lease_expiry = LeaseExpiry()
+        self._override_expiry = OverrideExpiry()
         self._ahead = ReadAhead()
-        self._giving_up = threading.Event()
+        self._stopped_retrying = threading.Event()
         embedded = repository.always_current
-        self.follower = Follower(repository, waiting, fetch_interval, self._line, self._taken)
+        self.fetcher = Fetcher(
+            repository, queue, fetch_interval, self._new_commit_line, self._set_snapshot
+        )
         self._batch_limit = LIMIT_EMBEDDED if embedded else LIMIT_REMOTE
 
-    def give_up(self) -> None:
-        """Stop waiting for a remote that is away; from any thread."""
-        self._giving_up.set()
-        self.follower.give_up()
+    def stop_retrying(self) -> None:
+        """Stop waiting for a remote that cannot be reached; from any thread."""
+        self._stopped_retrying.set()
+        self.fetcher.stop_retrying()
         self._repository.abort()
-        self._waiting.wake()
+        self._queue.wake()
 
-    def take_up(self, batch: list[Ticket]) -> None:
-        """Move what waits into ``batch``, and behind it the demands whose lease ran out.
+    def take(self, batch: list[Ticket]) -> None:
+        """Move queued demands into ``batch``, then the releases of ended leases.
 
-        A renewal that waits was received before: it is judged first, or nothing expires yet.
+        No lease ends while demands are queued, because one of them may renew it.
         """
-        self._take_up(batch)
-        if not self._waiting.anything:
-            batch += self._expiries.tickets(self.snapshot.state.ledger)
+        self._take_queued(batch)
+        if not self._queue.has_waiting:
+            batch += self._lease_expiry.tickets(self.snapshot.state.ledger)
 
-    def _take_up(self, batch: list[Ticket]) -> None:
-        self._waiting.take_up(batch, self._batch_limit)
+    def _take_queued(self, batch: list[Ticket]) -> None:
+        self._queue.take(batch, self._batch_limit)
         self._approvals.resume(batch, self.snapshot.state)
 
-    def settle(self, batch: list[Ticket]) -> None:
-        """Bring a batch to an end, with what comes in while the remote moves, and empty it.
+    def publish(self, batch: list[Ticket]) -> None:
+        """Publish a batch, with the demands that arrive during retries, and empty it.
 
         Raises:
-            ShuttingDown: where it was given up; the demands are still in the batch.
-            DemandOpsError: where the state repo cannot be used; likewise.
+            ShuttingDown: after :meth:`stop_retrying`; the demands are still in the batch.
+            DemandOpsError: if the state repo cannot be used; likewise.
         """
-        self._stale, self._verdict_is_current = False, self._repository.always_current
-        pace = Backoff(self._batch_limit)
+        self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
+        backoff = Backoff(self._batch_limit)
         while batch:
             try:
-                wait = self._tried(batch, pace)
+                wait = self._attempt(batch, backoff)
             except RemoteAway as error:
-                _doubt(batch, self.snapshot)
-                self.follower.out_of_touch(error)
-                self._verdict_is_current = self._repository.always_current
-                wait = pace.away()
+                _mark_maybe_published(batch, self.snapshot)
+                self.fetcher.record_unreachable(error)
+                self._tip_is_fresh = self._repository.always_current
+                wait = backoff.unreachable()
             if wait is None:
                 continue
-            # waited before the fetch: what is judged then is pushed while it is fresh
-            self._linger(batch, wait)
-            if self._giving_up.is_set():
+            # wait before the fetch, not after it: the push must follow the fetch closely
+            self._wait_to_retry(batch, wait)
+            if self._stopped_retrying.is_set():
                 raise ShuttingDown(
-                    "the remote is away; the demand stays in the outbox for the next start"
+                    "the remote cannot be reached; the demand stays in the journal and is resumed "
+                    "at the next start"
                 )
-            self._take_up(batch)
+            self._take_queued(batch)
 
-    def _tried(self, batch: list[Ticket], pace: Backoff) -> float | None:
-        """Judge and publish a part of a batch; return how long to wait where that was in vain.
+    def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:
+        """Evaluate and publish a part of a batch.
+
+        Returns:
+            The seconds to wait before the next attempt, or None to continue at once.
 
         Raises:
-            RemoteAway: where the remote cannot be reached.
+            RemoteAway: if the remote cannot be reached.
         """
-        # of a remote that is away nothing is judged: what is committed stays in
-        if self._stale or self.follower.link.is_away:
+        # fetch first: a demand that was committed can no longer be withdrawn
+        if self._must_fetch or self.fetcher.remote.is_unreachable:
             self._repository.refresh()
-            self._stale, self._verdict_is_current = False, True
-        self._waiting.dismiss_withdrawn(batch)
-        part = batch[: pace.share]
-        self._approvals.give_up(part, self.snapshot.state)
-        line = self._line()
+            self._must_fetch, self._tip_is_fresh = False, True
+        self._queue.answer_withdrawn(batch)
+        part = batch[: backoff.max_demands]
+        self._approvals.remove_released(part, self.snapshot.state)
+        line = self._new_commit_line()
         began = time.monotonic()
-        arrived = self._judge.arrived(line.start, part)
+        published = self._evaluator.published_before(line.start, part)
         results: list[Result] = []
         for ticket in part:
-            results.append((ticket, self._judge(line, ticket, arrived, results)))
-        judged = time.monotonic()
-        if line.head.commit == line.start.commit and not self._verdict_is_current:
-            # only a push would have shown that the remote has moved
+            result = self._evaluator.evaluate(line, ticket, published, results)
+            results.append((ticket, result))
+        evaluated = time.monotonic()
+        if line.head.commit == line.start.commit and not self._tip_is_fresh:
+            # nothing to push, so only a fetch shows whether the remote has moved
             tip = self._repository.refresh()
-            self._verdict_is_current = True
+            self._tip_is_fresh = True
             if tip != line.start.commit:
                 return None
-        if self._publish(line, results):
+        if self._publish_line(line, results):
             self._answer(results)
             del batch[: len(part)]
-            pace.published()
+            backoff.published()
             return None
-        log.info("the state repo has moved; judging %d demands again", len(part))
-        _doubt(part, line.start)
-        self._stale = True
-        return pace.overtaken(len(part), judged - began, time.monotonic() - judged)
+        log.info("the state repo has moved; evaluating %d demands again", len(part))
+        _mark_maybe_published(part, line.start)
+        self._must_fetch = True
+        return backoff.overtaken(len(part), evaluated - began, time.monotonic() - evaluated)
 
     def _answer(self, results: list[Result]) -> None:
-        """Answer what is settled; what needs approval waits on."""
-        told = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
-        self._waiting.answer(told)
+        """Answer the demands that have a final result; propose those that need approval."""
+        final = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
+        self._queue.answer(final)
         for ticket, result in results:
             if isinstance(result, Deferred):
-                self._approvals.take(ticket, result.decision)
+                self._approvals.add(ticket, result.decision)
 
-    def attend(self) -> None:
-        """Look after the demands that await approval, with main as it is now."""
+    def check_proposals(self) -> None:
+        """Check the demands that await approval against the newest main, if it is time to."""
         if not self._approvals.is_due(str(self.snapshot.commit)):
             return
         try:
-            heads = self._approvals.heads()
+            heads = self._approvals.fetch_heads()
             if heads.main != str(self.snapshot.commit):
                 self._repository.refresh()
-                self.follower.catch_up()
-            # a branch that is gone may have been merged: only a newer main tells
+                self.fetcher.carry_out_changes()
+            # a deleted branch may have been merged: only a main at least as new shows that
             if self._repository.includes(str(self.snapshot.commit), heads.main):
-                self._approvals.look(self.snapshot, heads)
+                self._approvals.check(self.snapshot, heads)
         except (RemoteAway, PushDenied) as error:
-            log.warning("%s; the demands that await approval wait on", error)
+            log.warning("%s; the demands that await approval keep waiting", error)
 
-    def _linger(self, batch: list[Ticket], seconds: float) -> None:
-        """Let a while pass; demands that come in meanwhile are kept, and told why they wait."""
+    def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
+        """Wait; meanwhile journal new demands and report to them why they wait."""
         end = time.monotonic() + seconds
-        told = list(batch)
-        while not self._giving_up.is_set():
-            if self.follower.link.is_away:
-                for ticket in told:
-                    ticket.tell("away", f"waiting: {self.follower.link.contact.trouble}")
-            self._waiting.dismiss_withdrawn(batch)
+        to_notify = list(batch)
+        while not self._stopped_retrying.is_set():
+            if self.fetcher.remote.is_unreachable:
+                for ticket in to_notify:
+                    ticket.notify("away", f"waiting: {self.fetcher.remote.status.unreachable}")
+            self._queue.answer_withdrawn(batch)
             left = end - time.monotonic()
             if left <= 0:
                 return
-            told = self._waiting.keep(left)
+            to_notify = self._queue.journal_arrivals(left)
 
-    def pause(self) -> float:
-        """Return the seconds until leases, overrides, proposals or the state repo are due."""
+    def seconds_until_due(self) -> float:
+        """Return the seconds until a lease, override, proposal or fetch is due."""
         state = self.snapshot.state
-        ends = self._expiries.pause(state.ledger, self._approvals.pause(LONGEST_WAIT_S))
-        ends = self._overrides.pause(state.config, _now(), ends)
-        look = self.follower.pause()
-        return ends if look is None else min(ends, look)
+        seconds = self._approvals.seconds_until_due(LONGEST_WAIT_S)
+        seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
+        seconds = self._override_expiry.seconds_until_due(state.config, _now(), seconds)
+        fetch = self.fetcher.seconds_until_due()
+        return seconds if fetch is None else min(seconds, fetch)
 
-    def catch_up(self) -> None:
-        """Try again what people changed and could not be carried out: a release may allow it."""
+    def retry_changes(self) -> None:
+        """Carry out quarantined changes again, because a release may have made them possible."""
         if self.snapshot.problems:
-            self.follower.catch_up()
+            self.fetcher.carry_out_changes()
 
-    def notice(self) -> None:
-        """Take in what others published, while no demand comes, and end overrides."""
-        due = self._overrides.anything(self.snapshot.state.config, _now())
-        if not self.follower.notice(self.snapshot, due):
-            self._overrides.put_off(_now())
+    def fetch_if_due(self) -> None:
+        """Carry out what others pushed and end overrides, while no demand comes."""
+        due = self._override_expiry.is_due(self.snapshot.state.config, _now())
+        if not self.fetcher.fetch_if_due(self.snapshot, due):
+            self._override_expiry.postpone(_now())
 
     def tidy(self) -> None:
-        """Every few hundred commits: a demand leaves some twenty loose objects behind."""
-        if self._since_tidy >= _TIDY_EVERY:
-            self._since_tidy = 0
+        """Pack the repository every few hundred commits: each leaves some twenty loose objects."""
+        if self._commits_since_tidy >= _TIDY_EVERY:
+            self._commits_since_tidy = 0
             self._repository.tidy()
 
-    def _publish(self, line: commit_batch.CommitBatch, results: list[Result]) -> bool:
-        """Publish a line; what the remote denies becomes the answer of all that is in it."""
+    def _publish_line(self, line: commit_batch.CommitBatch, results: list[Result]) -> bool:
+        """Publish a commit line; return False if another writer was first.
+
+        If the remote rejects the push for another reason, that is the answer of all its demands.
+        """
         try:
             published = line.publish()
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
-            self.follower.link.denied(str(error))
+            self.fetcher.remote.record_push_denied(str(error))
             return True
         if not published:
             return False
-        self.follower.in_touch(pushed=line.head.commit != line.start.commit)
-        self._taken(line)
-        self._since_tidy += len(results)
+        self.fetcher.record_reached(pushed=line.head.commit != line.start.commit)
+        self._set_snapshot(line)
+        self._commits_since_tidy += len(results)
         return True
 
-    def _taken(self, line: commit_batch.CommitBatch) -> None:
+    def _set_snapshot(self, line: commit_batch.CommitBatch) -> None:
         before, self.snapshot = self.snapshot, line.head
-        if line.head.commit != before.commit:  # a merge may ask for no commit of our own
+        if line.head.commit != before.commit:  # a merge may need no commit of the generator
             self._on_published(line.head.state.config)
 
-    def _line(self) -> commit_batch.CommitBatch:
-        """Start a line on the newest tip that is known, people's changes taken in."""
+    def _new_commit_line(self) -> commit_batch.CommitBatch:
+        """Return a commit line on the newest known tip, which carries out people's changes."""
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems:
             line = commit_batch.CommitBatch(self._repository, before)
-            self._overrides.end(line, _now())
+            self._override_expiry.end_due(line, _now())
             return line
         advance = self._ahead.advance(self._repository.objects, before, tip)
         line = commit_batch.CommitBatch(self._repository, advance.snapshot)
         line.follow(advance, before, _now())
-        self.follower.tell(line.head.problems)
-        self._overrides.end(line, _now())
+        self.fetcher.log_problems(line.head.problems)
+        self._override_expiry.end_due(line, _now())
         return line
 
 
-def _doubt(batch: list[Ticket], start: Snapshot) -> None:
+def _mark_maybe_published(batch: list[Ticket], start: Snapshot) -> None:
     for ticket in batch:
-        ticket.doubt(str(start.commit))
+        ticket.mark_maybe_published(str(start.commit))
 
 
 def _now() -> datetime:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from demandops.cluster import controller_webhook
-from demandops_ros.client import DemandClient
+from demandops_ros import DemandClient
 
 from tests.e2e.common.access import access_file, documented_roles, limited
 from tests.e2e.common.answers import TIMEOUT_S, fusion, restarted, with_chart

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import pytest
-from demandops_ros.client import DemandClient, DemandError
+from demandops_ros import DemandClient, DemandError
 
 from tests.e2e.common.namespace import Namespace, fusion_inputs, name_of
 from tests.e2e.common.staterepo import Generator, demandops
@@ -125,7 +125,7 @@ class Answers:
         domain = world.domain
         told: list[str] = []
         with asker.demand(
-            "d", [FUSION], answer="healthy", told=lambda stage, _: told.append(stage)
+            "d", [FUSION], answer="healthy", on_stage=lambda stage, _: told.append(stage)
         ) as held:
             names = {name_of(item) for item in domain.find("Deployment")}
             assert unavailable(domain) == []
@@ -175,7 +175,7 @@ class Answers:
                 reconciled.set()
 
         with ThreadPoolExecutor(1) as pool:
-            waiting = pool.submit(asker.put, "d", [FUSION], answer="healthy", told=told)
+            waiting = pool.submit(asker.put, "d", [FUSION], answer="healthy", on_stage=told)
             assert reconciled.wait(TIMEOUT_S)
             rig.kube.wait("all Deployments", lambda: len(world.domain.find("Deployment")) == 4)
             self.all_applied(world)
@@ -238,7 +238,7 @@ class Answers:
                     "d",
                     [FUSION],
                     answer="healthy",
-                    told=lambda stage, _: pushed.set() if stage == "pushed" else None,
+                    on_stage=lambda stage, _: pushed.set() if stage == "pushed" else None,
                 )
                 assert pushed.wait(TIMEOUT_S)
                 time.sleep(1)

@@ -15,8 +15,8 @@ import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.settings import DEFAULT_ACTION_NAME
-from demandops_ros.messages import from_data
-from demandops_ros.node import DEEP
+from demandops_ros.messages import fill_message
+from demandops_ros.node import DEEP_QOS
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 
@@ -63,7 +63,9 @@ class Client:
         self._node = rclpy.create_node("e2e_client", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        deep = {f"{service}_service_qos_profile": DEEP for service in ("goal", "result", "cancel")}
+        deep = {
+            f"{service}_service_qos_profile": DEEP_QOS for service in ("goal", "result", "cancel")
+        }
         self._client = ActionClient(self._node, DeploymentRequest, DEFAULT_ACTION_NAME, **deep)
         self._thread = threading.Thread(target=self._executor.spin, daemon=True)
         self._thread.start()
@@ -76,7 +78,7 @@ class Client:
         """Send a goal and return at once."""
         sent = Sent(time.monotonic())
         future = self._client.send_goal_async(
-            from_data(DeploymentRequest.Goal(), goal),
+            fill_message(DeploymentRequest.Goal(), goal),
             feedback_callback=lambda told: _hear(sent, told.feedback.message),
         )
         future.add_done_callback(lambda done: self._on_response(sent, done.result()))

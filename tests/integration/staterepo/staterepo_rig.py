@@ -263,7 +263,12 @@ class Drivers:
             [sys.executable, str(_DRIVER)],
             stdin=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONPATH": f"{_CHECKOUT}/generator"},
+            env={
+                **os.environ,
+                "PYTHONPATH": ":".join(
+                    str(_CHECKOUT / part) for part in (".", "generator", "ros_bridge")
+                ),
+            },
         )
 
     def start(

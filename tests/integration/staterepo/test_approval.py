@@ -25,8 +25,8 @@ from staterepo_rig import git, goal, leave
 @pytest.fixture(autouse=True)
 def _eager(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have branches looked at often."""
-    monkeypatch.setattr(approvals, "ASK_EMBEDDED_S", 0.05)
-    monkeypatch.setattr(approvals, "ASK_REMOTE_S", 0.1)
+    monkeypatch.setattr(approvals, "CHECK_EMBEDDED_S", 0.05)
+    monkeypatch.setattr(approvals, "CHECK_REMOTE_S", 0.1)
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
     petra.delete(no)
     with rig.running(address) as generator:
         rig.wait_until(lambda: branches(bare) == [], "the merged branch is taken away")
-        rig.wait_until(lambda: generator._waiting.operations == (), "both are answered")
+        rig.wait_until(lambda: generator._queue.operations == (), "both are answered")
     assert rig.books(bare) == rig.books_after([goal(1)])
     assert branches(bare) == []
 
@@ -248,7 +248,7 @@ def test_a_release_of_what_waits_takes_the_branch_away(
         assert [proposed.branch] == branches(bare)
         assert rig.book(generator, leave(1))[0].outcome == "released"
         assert branches(bare) == []
-        with pytest.raises(Withdrawn, match="given up"):
+        with pytest.raises(Withdrawn, match="released by a later request"):
             rig.receipt(proposed.ticket)
         with pytest.raises(Refused):
             rig.book(generator, leave(1))
@@ -486,7 +486,7 @@ def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the
     drivers.start(address, lanes, opening=opening, die_at="retracting").listen()
     with rig.running(address) as generator:
         rig.wait_until(lambda: not branches(bare), "the branch is deleted")
-        rig.wait_until(lambda: generator._waiting.operations == (), "both are answered")
+        rig.wait_until(lambda: generator._queue.operations == (), "both are answered")
     assert rig.claims(bare) == []
 
 
@@ -567,7 +567,7 @@ def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Petra) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1))
         branch = proposed.branch
-        generator.watch(lambda config: heard.set())
+        generator.on_publish(lambda config: heard.set())
         petra.merge(branch, "--ff-only")
         assert proposed.outcome() == "booked"
         assert heard.wait(rig.PATIENCE_S)

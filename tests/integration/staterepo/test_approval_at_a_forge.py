@@ -87,8 +87,8 @@ def hub() -> Iterator[Hub]:
 
 @pytest.fixture
 def petra(hub: Hub, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Petra:
-    monkeypatch.setattr(approvals, "ASK_EMBEDDED_S", 0.05)
-    monkeypatch.setattr(approvals, "ASK_REMOTE_S", 0.1)
+    monkeypatch.setattr(approvals, "CHECK_EMBEDDED_S", 0.05)
+    monkeypatch.setattr(approvals, "CHECK_REMOTE_S", 0.1)
     monkeypatch.setattr(forge_worker, "POLL_S", 0.05)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     (tmp_path / "token").write_text(TOKEN)

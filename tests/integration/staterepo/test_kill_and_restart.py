@@ -113,12 +113,12 @@ def test_a_demand_that_was_taken_up_again_is_not_taken_up_a_third_time(
     drivers.start(address, [[demand("join-1", goal(1))]], die_at=point).listen()
     with caplog.at_level("INFO", "demandops"):
         assert rig.restart(address) is True
-    assert "taking up demand op-join-1 from the outbox" in caplog.text
+    assert "resuming demand op-join-1 from the journal" in caplog.text
     tip = rig.tip(bare)
     caplog.clear()
     with caplog.at_level("INFO", "demandops"):
         assert rig.restart(address) is True
-    assert "from the outbox" not in caplog.text
+    assert "from the journal" not in caplog.text
     assert rig.tip(bare) == tip
 
 

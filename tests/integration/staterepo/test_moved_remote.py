@@ -178,7 +178,7 @@ def test_an_invalid_inventory_leaves_its_last_valid_version_in_force_and_is_logg
     assert _kinds(bare) == ["join", "person", "follow", "join", "person", "follow", "join"]
     errors = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
     assert any(
-        text.startswith(f"{NODES}: ") and text.endswith("(its last valid version stays in force)")
+        text.startswith(f"{NODES}: ") and text.endswith("(its last valid version stays in effect)")
         for text in errors
     ), errors
     assert rig.books(bare) == rig.books_after([goal(1), goal(2), goal(3)])

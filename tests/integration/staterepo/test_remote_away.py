@@ -63,7 +63,7 @@ def test_closing_while_the_remote_is_away_leaves_the_demands_to_the_next_start(
         tickets = [generator.submit(goal(number), f"op-{number}") for number in range(3)]
         assert generator.close(timeout=0.3) is False
         for ticket in tickets:
-            with pytest.raises(ShuttingDown, match="stays in the outbox"):
+            with pytest.raises(ShuttingDown, match="stays in the journal"):
                 ticket.future.result(0)
     assert rig.operations(bare) == []
     assert rig.restart(url) is True
@@ -82,7 +82,7 @@ def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
         assert generator.close(timeout=0.3) is False
         assert isinstance(left.future.exception(0), ShuttingDown)
         with pytest.raises(StateRepoError, match="cannot be fetched"):
-            Generator(url, patient=False)
+            Generator(url, start_offline=False)
         generator = Generator(url)
         assert "continuing with what was fetched last" in caplog.text
         fresh = generator.submit(goal(2), "op-2")

@@ -48,7 +48,7 @@ def clock(clocks: Clocks) -> LeaseClock:
 
 
 def ended(clock: LeaseClock, ledger: Ledger) -> list[str]:
-    return [claim.demand for claim in clock.ended(ledger)[1]]
+    return [claim.demand for claim in clock.ended_claims(ledger)[1]]
 
 
 def test_nothing_ends_before_its_slack_has_passed(clocks: Clocks, clock: LeaseClock) -> None:
@@ -61,7 +61,7 @@ def test_nothing_ends_before_its_slack_has_passed(clocks: Clocks, clock: LeaseCl
     assert ended(clock, ledger) == ["a"]
     clocks.pass_(0.5)
     assert ended(clock, ledger) == ["a", "b"]
-    assert clock.ended(ledger)[0] == clocks.now
+    assert clock.ended_claims(ledger)[0] == clocks.now
 
 
 def test_it_is_set_back_and_nothing_goes_early(clocks: Clocks, clock: LeaseClock) -> None:
@@ -69,7 +69,7 @@ def test_it_is_set_back_and_nothing_goes_early(clocks: Clocks, clock: LeaseClock
     clocks.set_by(-86_400)
     clocks.pass_(3600)
     assert ended(clock, ledger) == []
-    assert clock.pause(ledger, 60.0) == 60.0
+    assert clock.seconds_until_due(ledger, 60.0) == 60.0
 
 
 @pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
@@ -118,7 +118,7 @@ def test_a_clock_that_is_drawn_on_slowly_is_no_step(
     for _ in range(31):
         clocks.pass_(1)
         clocks.set_by(1)
-        clock.pause(ledger, 60.0)
+        clock.seconds_until_due(ledger, 60.0)
     assert ended(clock, ledger) == ["a"]
     assert caplog.text == ""
 
@@ -137,10 +137,12 @@ def test_none_of_a_demand_goes_while_a_part_is_granted_more(
 
 def test_it_looks_again_when_the_first_lease_ends(clocks: Clocks, clock: LeaseClock) -> None:
     ledger = leased(("a", 20, 10), ("b", 600, 0))
-    assert clock.pause(ledger, 60.0) == pytest.approx(30.01)
+    assert clock.seconds_until_due(ledger, 60.0) == pytest.approx(30.01)
     clocks.pass_(29.5)
-    assert clock.pause(ledger, 60.0) == 1.0
+    assert clock.seconds_until_due(ledger, 60.0) == 1.0
     clocks.pass_(100)
-    assert clock.pause(ledger, 60.0) == 1.0, "what cannot be released does not keep it busy"
-    assert clock.pause(Ledger(), 60.0) == 60.0
-    assert clock.pause(leased(("b", 86_400, 0)), 60.0) == 60.0
+    assert clock.seconds_until_due(ledger, 60.0) == 1.0, (
+        "what cannot be released does not keep it busy"
+    )
+    assert clock.seconds_until_due(Ledger(), 60.0) == 60.0
+    assert clock.seconds_until_due(leased(("b", 86_400, 0)), 60.0) == 60.0

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 
 import pytest
-from demandops.service.timing.polling import Link, PollTimer, interval_s
+from demandops.service.remote_status import RemoteMonitor
+from demandops.service.timing.polling import PollTimer, parse_interval
 
 
 class Clock:
@@ -23,70 +24,70 @@ def looks(clock: Clock, interval: float, *, embedded: bool = False) -> PollTimer
 def test_the_first_look_is_due_at_once_and_the_next_after_the_interval() -> None:
     clock = Clock()
     made = looks(clock, 30)
-    assert made.begin()
-    made.done(reached=True)
-    assert made.pause() == 30 and not made.begin()
+    assert made.start_if_due()
+    made.finished(reached=True)
+    assert made.seconds_until_due() == 30 and not made.start_if_due()
     clock.now += 30
-    assert made.begin()
+    assert made.start_if_due()
 
 
 def test_while_the_remote_is_away_looks_become_seldom_within_bounds() -> None:
     clock, pauses = Clock(), []
     made = looks(clock, 10)
     for _ in range(5):
-        made.done(reached=False)
-        pauses.append(made.pause())
+        made.finished(reached=False)
+        pauses.append(made.seconds_until_due())
     assert pauses == [20, 40, 60, 60, 60]
-    made.done(reached=True)
-    assert made.pause() == 10
+    made.finished(reached=True)
+    assert made.seconds_until_due() == 10
 
 
 def test_an_interval_above_the_bound_is_kept() -> None:
     made = looks(Clock(), 600)
-    made.done(reached=False)
-    assert made.pause() == 600
+    made.finished(reached=False)
+    assert made.seconds_until_due() == 600
 
 
 def test_what_is_asked_for_many_times_is_one_look_and_one_after_it() -> None:
     clock = Clock()
     made = looks(clock, 0)
-    assert made.pause() is None and not made.begin()
+    assert made.seconds_until_due() is None and not made.start_if_due()
     for _ in range(3):
-        made.nudge()
-    assert made.begin()
-    assert not made.begin()
-    made.nudge()  # while the look is under way: it may have come too late for it
-    made.done(reached=True)
-    assert made.pause() == 0.5, "bursts are not followed one by one"
+        made.request()
+    assert made.start_if_due()
+    assert not made.start_if_due()
+    made.request()  # while the look is under way: it may have come too late for it
+    made.finished(reached=True)
+    assert made.seconds_until_due() == 0.5, "bursts are not followed one by one"
     clock.now += 0.5
-    assert made.begin()
-    made.done(reached=True)
-    assert made.pause() is None
+    assert made.start_if_due()
+    made.finished(reached=True)
+    assert made.seconds_until_due() is None
 
 
 def test_a_look_that_was_cut_short_is_still_due() -> None:
     clock = Clock()
     made = looks(clock, 0)
-    made.nudge()
-    assert made.begin()
-    made.again()
-    assert made.begin()
+    made.request()
+    assert made.start_if_due()
+    made.interrupted()
+    assert made.start_if_due()
 
 
 def test_a_repository_on_this_disk_is_looked_at_every_second() -> None:
     made = looks(Clock(), 30, embedded=True)
-    made.done(reached=True)
-    assert made.pause() == 1
+    made.finished(reached=True)
+    assert made.seconds_until_due() == 1
     off = looks(Clock(), 0, embedded=True)
-    assert off.pause() is None
+    assert off.seconds_until_due() is None
 
 
 def test_by_chance_looks_come_earlier_and_never_later() -> None:
     made = PollTimer(100, steady=Clock())
     pauses = set()
     for _ in range(50):
-        made.done(reached=True)
-        pauses.add(made.pause())
+        made.finished(reached=True)
+        pauses.add(made.seconds_until_due())
     assert len(pauses) > 10
     assert all(pause is not None and 80 <= pause <= 100 for pause in pauses)
 
@@ -95,35 +96,35 @@ def test_by_chance_looks_come_earlier_and_never_later() -> None:
     ("text", "seconds"), [("30s", 30), ("1h30m", 5400), ("0", 0), ("0s", 0), ("0.2", 0.2)]
 )
 def test_an_interval_is_a_duration_or_seconds(text: str, seconds: float) -> None:
-    assert interval_s(text) == seconds
+    assert parse_interval(text) == seconds
 
 
 @pytest.mark.parametrize("text", ["", "-1", "often", "1e9", "30 s", "nan"])
 def test_anything_else_is_no_interval(text: str) -> None:
     with pytest.raises(ValueError, match="is no duration; write one like 90s"):
-        interval_s(text)
+        parse_interval(text)
 
 
 def test_away_and_back_are_logged_once_each(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, logger="demandops")
-    link = Link("https://git.example/state.git")
-    link.reached()
+    remote = RemoteMonitor("https://git.example/state.git")
+    remote.record_reached()
     for _ in range(3):
-        link.lost("cannot be fetched: no route")
-    assert link.is_away and link.contact.trouble == "cannot be fetched: no route"
+        remote.record_unreachable("cannot be fetched: no route")
+    assert remote.is_unreachable and remote.status.unreachable == "cannot be fetched: no route"
     for _ in range(3):
-        link.reached(pushed=True)
+        remote.record_reached(pushed=True)
     assert [record.getMessage() for record in caplog.records] == [
         "cannot be fetched: no route; trying again until it is back",
         "https://git.example/state.git is back after 0 s",
     ]
-    assert not link.is_away and link.contact.pushed is not None
+    assert not remote.is_unreachable and remote.status.last_push is not None
 
 
 def test_a_push_that_is_denied_is_remembered_until_one_is_taken() -> None:
-    link = Link("somewhere")
-    link.denied("takes no push: frozen")
-    link.reached()
-    assert link.contact.denied == "takes no push: frozen" and not link.is_away
-    link.reached(pushed=True)
-    assert link.contact.denied == ""
+    remote = RemoteMonitor("somewhere")
+    remote.record_push_denied("takes no push: frozen")
+    remote.record_reached()
+    assert remote.status.push_denied == "takes no push: frozen" and not remote.is_unreachable
+    remote.record_reached(pushed=True)
+    assert remote.status.push_denied == ""

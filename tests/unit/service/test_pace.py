@@ -7,7 +7,7 @@ from demandops.service.timing.backoff import FIRST_PAUSE_S, LONGEST_AWAY_S, LONG
 
 def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
     pace = Backoff(200)
-    away = [pace.away() for _ in range(20)]
+    away = [pace.unreachable() for _ in range(20)]
     assert max(away) <= LONGEST_AWAY_S
     assert min(away[-5:]) >= LONGEST_AWAY_S / 2
     turns = [pace.overtaken(10, 0.1, 1.0) for _ in range(20)]
@@ -18,9 +18,9 @@ def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
 def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew() -> None:
     pace = Backoff(200)
     for _ in range(10):
-        pace.away()
+        pace.unreachable()
     pace.overtaken(10, 0.1, 1.0)
-    assert pace.away() <= FIRST_PAUSE_S
+    assert pace.unreachable() <= FIRST_PAUSE_S
     for _ in range(10):
         pace.overtaken(10, 0.1, 1.0)
     pace.published()
@@ -29,14 +29,14 @@ def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew()
 
 def test_a_line_is_as_long_as_can_be_judged_while_it_is_pushed() -> None:
     pace = Backoff(200)
-    assert pace.share == 200
-    pace.overtaken(100, judging_s=0.1, pushing_s=0.2)
-    assert pace.share == 100
-    pace.overtaken(100, judging_s=1.0, pushing_s=0.2)
-    assert pace.share == 20
-    pace.overtaken(2, judging_s=100.0, pushing_s=0.2)
-    assert pace.share == 1
-    pace.overtaken(1, judging_s=0.0, pushing_s=0.2)
-    assert pace.share == 1
+    assert pace.max_demands == 200
+    pace.overtaken(100, evaluating_s=0.1, pushing_s=0.2)
+    assert pace.max_demands == 100
+    pace.overtaken(100, evaluating_s=1.0, pushing_s=0.2)
+    assert pace.max_demands == 20
+    pace.overtaken(2, evaluating_s=100.0, pushing_s=0.2)
+    assert pace.max_demands == 1
+    pace.overtaken(1, evaluating_s=0.0, pushing_s=0.2)
+    assert pace.max_demands == 1
     pace.published()
-    assert pace.share == 200
+    assert pace.max_demands == 200

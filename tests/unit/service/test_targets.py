@@ -20,7 +20,7 @@ def test_a_place_knows_by_which_controller_it_is_kept(
 ) -> None:
     state, files = start(case)
     goal = strict_yaml.load(requests_of(case)[0].read_text())
-    found = rollout_targets.of_state(decide(state, goal, NOW, files.get).state)
+    found = rollout_targets.targets_of_state(decide(state, goal, NOW, files.get).state)
     assert {target.name for release, target in found} == {release.name for release, _ in found}
     assert {target.domain.application for _, target in found} == {application}
     assert {target.by_helm for _, target in found} == {True, False}

@@ -85,7 +85,9 @@ def _decommission(
     goal: dict[str, Any], state_repo: str, signing_key: Path | None
 ) -> dict[str, Any]:
     with progress("reading the ledger") as report:
-        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=report)
+        generator = Generator(
+            state_repo, start_offline=False, signing_key=signing_key, progress=report
+        )
     try:
         receipt = generator.submit(goal).future.result()
         return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)

@@ -26,7 +26,7 @@ from demandops.cli.output import (
 from demandops.decision import Decision, admit, decide, form_faults
 from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
 from demandops.service import Generator, Receipt
-from demandops.service.approvals.proposal import where_told
+from demandops.service.approvals.proposal import parse_waiting_text
 from demandops.staterepo import reader
 
 
@@ -152,7 +152,9 @@ def _book(
     documents: list[_Document], state_repo: str, wait: bool, signing_key: Path | None
 ) -> list[dict[str, Any]]:
     with progress("reading the ledger") as report:
-        generator = Generator(state_repo, patient=False, signing_key=signing_key, progress=report)
+        generator = Generator(
+            state_repo, start_offline=False, signing_key=signing_key, progress=report
+        )
     try:
         answers = [_submitted(generator, document, wait) for document in documents]
         rows = []
@@ -184,7 +186,7 @@ def _submitted(
         if wait:
             errors.print(f"{document.file}: request '{name}' {text}")
         elif not answer.done():
-            answer.set_result(where_told(text))
+            answer.set_result(parse_waiting_text(text))
 
     def finish(future: Future[Receipt]) -> None:
         if answer.done():

@@ -129,7 +129,7 @@ def _consequences(decision: Decision | None) -> dict[str, Any]:
 def _roll_back(state_repo: str, target: _Target, key: Path | None, base: str) -> dict[str, Any]:
     """Roll back with a generator; return the result."""
     with progress("reading the ledger") as report:
-        generator = Generator(state_repo, patient=False, signing_key=key, progress=report)
+        generator = Generator(state_repo, start_offline=False, signing_key=key, progress=report)
     try:
         goal = rollbacks.goal(
             target.to, drop_newer=target.drop_newer, reason=target.reason, who=target.person

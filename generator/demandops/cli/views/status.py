@@ -52,7 +52,7 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
         problems = repo.problems()
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(progress=report)
-        targets = rollout_targets.of_state(snapshot.state)
+        targets = rollout_targets.targets_of_state(snapshot.state)
         stores = _read(clusters, [target for _, target in targets])
         commit = str(snapshot.commit)
         rows = [_row(release, target, commit, stores, repo) for release, target in targets]

@@ -1,1 +1,1 @@
-"""Demands that wait for a person to merge their branch."""
+"""Demands that wait until a person merges or rejects their branch."""

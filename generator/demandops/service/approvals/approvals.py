@@ -1,7 +1,7 @@
-"""Approval: demands that wait until a person merges their branch, turns them down, or they go.
+"""The proposals that await approval, and what becomes of them.
 
-Belongs to the thread that settles demands. A proposal is complete when main holds what it asks,
-however it came there; until then it is kept such that merging it gives what main would render.
+Belongs to the worker thread. A proposal is complete once main has its claims, however they got
+there. Until then its branch is kept up to date: merging it must give what main would render.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from demandops.errors import (
     fault,
 )
 from demandops.service.approvals.branch_sync import BranchSync
-from demandops.service.approvals.proposal import Key, Proposal, admitted, gives_up, key_of
+from demandops.service.approvals.proposal import Key, Proposal, admit_or_none, is_release, key_of
 from demandops.service.demand_queue import TAKEN_BACK, DemandQueue
-from demandops.service.rollout_targets import of_decision as targets_of
-from demandops.service.ticket import Receipt, Record, Ticket
+from demandops.service.rollout_targets import targets_of_decision
+from demandops.service.ticket import ProposalRecord, Receipt, Ticket
 from demandops.staterepo.git.repository import PushDenied, StateRepository
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
@@ -39,238 +39,241 @@ from demandops.staterepo.write.proposal_branch import BranchHeads, BranchMoved, 
 
 log = logging.getLogger("demandops")
 
-ASK_EMBEDDED_S = 1.0
-ASK_REMOTE_S = 5.0
-"""Between two looks at the branches: that one was deleted shows nowhere else."""
-_SHARE = 9
-"""Comparing proposals with a main that keeps moving may take a tenth of the time, not more."""
+CHECK_EMBEDDED_S = 1.0
+CHECK_REMOTE_S = 5.0
+"""Between two checks of the branches, because nothing else shows that one was deleted."""
+_PAUSE_FACTOR = 9
+"""Each check is followed by a pause nine times as long, so checks take a tenth of the time."""
 
-_IN_TROUBLE = "trouble"
+_UNFINISHED = "unfinished"
 
-GIVEN_UP = "was given up by a later request before it was approved"
+RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
 
 
 @dataclass(frozen=True, slots=True)
 class Deferred:
-    """What comes of a demand for now: it needs approval."""
+    """The result of a demand that needs approval."""
 
     decision: Decision
 
 
 class Approvals:
-    """The proposals that wait, and what is done about them."""
+    """The proposals that await approval."""
 
     def __init__(
         self,
         repository: StateRepository,
-        waiting: DemandQueue,
+        queue: DemandQueue,
         with_targets: bool,
         token_file: Path | None,
     ) -> None:
         self._repository = repository
-        self._waiting = waiting
+        self._queue = queue
         self._with_targets = with_targets
-        self._keeper = BranchSync(repository, waiting, token_file, self._on_news)
+        self._branch_sync = BranchSync(repository, queue, token_file, self._on_forge_update)
         self._proposals: dict[Key, Proposal] = {}
-        self._gave_up: set[str] = set()
-        self._every = ASK_EMBEDDED_S if repository.always_current else ASK_REMOTE_S
+        self._releasing: set[str] = set()
+        self._interval = CHECK_EMBEDDED_S if repository.always_current else CHECK_REMOTE_S
         self._changed: deque[str] = deque()
-        self._looked, self._began, self._rested, self._next = "", 0.0, 0.0, 0.0
+        self._checked_at, self._check_began, self._rest_until, self._next_check = "", 0.0, 0.0, 0.0
 
-    # ---- while a batch is judged ----
+    # ---- while a batch is evaluated ----
 
     def resume(self, batch: list[Ticket], state: State) -> None:
-        """Take out of a batch what an earlier run has proposed already."""
+        """Move the demands that an earlier run proposed from the batch to their proposals."""
         for ticket in [ticket for ticket in batch if ticket.proposal is not None]:
             batch.remove(ticket)
-            request = admitted(state, ticket.goal)
-            record = ticket.proposal or Record("")
+            request = admit_or_none(state, ticket.goal)
+            record = ticket.proposal or ProposalRecord("")
             ticket.state = "withdrawn" if record.withdrawn else ticket.state
             proposal = next(
                 (p for p in self._proposals.values() if p.branch == record.branch), None
             )
             if proposal is None:
                 key = key_of(request) if request else ("operation", ticket.operation)
-                if key in self._proposals:  # another run's, of the same demand
+                if key in self._proposals:  # an earlier run proposed the same demand
                     key = ("operation", ticket.operation)
-                proposal = self._proposals[key] = Proposal(key, record, seen=ticket.base)
+                proposal = self._proposals[key] = Proposal(key, record, searched_to=ticket.base)
             proposal.tickets.append(ticket)
             proposal.requests += [request] if request else []
             self._changed.append(proposal.branch)
 
-    def give_up(self, batch: Iterable[Ticket], state: State) -> None:
-        """Take away proposals that demands of the batch give up, before these are judged.
+    def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
+        """Remove the proposals that demands of the batch release, before these are evaluated.
 
-        Once its branch is gone nobody can merge it; what was merged before is on the tip that the
-        demands are judged on next.
+        Once its branch is deleted, nobody can merge a proposal. If it was merged before, it is on
+        the tip on which the demands are evaluated next.
 
         Raises:
-            RemoteAway, PushDenied: where the branch could not be taken away.
+            RemoteAway, PushDenied: if the branch could not be deleted.
         """
         for ticket in batch if self._proposals else ():
-            request = admitted(state, ticket.goal) if gives_up(ticket.goal) else None
+            request = admit_or_none(state, ticket.goal) if is_release(ticket.goal) else None
             if request is None:
                 continue
-            for proposal in [p for p in self._proposals.values() if p.is_given_up_by(request)]:
-                self._waiting.retract(proposal.tickets, GIVEN_UP)
-                self._keeper.take_away(proposal, self._keeper.heads())
-                self._waiting.answer((old, Withdrawn(GIVEN_UP)) for old in proposal.tickets)
+            for proposal in [p for p in self._proposals.values() if p.is_released_by(request)]:
+                self._queue.withdraw_proposed(proposal.tickets, RELEASED)
+                self._branch_sync.delete(proposal, self._branch_sync.fetch_heads())
+                self._queue.answer((old, Withdrawn(RELEASED)) for old in proposal.tickets)
                 self._forget(proposal, close=True)
-                self._gave_up.add(ticket.operation)
+                self._releasing.add(ticket.operation)
 
-    def gave_up(
+    def released_in_batch(
         self, ticket: Ticket, state: State, earlier: Iterable[tuple[Ticket, object]]
     ) -> set[str]:
-        """Return the operations of this pass that a demand gives up before they are proposed."""
-        request = admitted(state, ticket.goal) if gives_up(ticket.goal) else None
+        """Return the operation ids of the earlier demands that a demand releases."""
+        request = admit_or_none(state, ticket.goal) if is_release(ticket.goal) else None
         if request is None:
             return set()
-        found = {
+        released = {
             other.operation
             for other, result in earlier
             if isinstance(result, Deferred)
-            and _alone(other, result.decision).is_given_up_by(request)
+            and _proposal_of(other, result.decision).is_released_by(request)
         }
-        if found:
-            self._gave_up.add(ticket.operation)
-        return found
+        if released:
+            self._releasing.add(ticket.operation)
+        return released
 
-    def released(self, ticket: Ticket) -> bool:
-        """Tell whether a demand gave a proposal up: then it is no fault that it holds nothing."""
-        return ticket.operation in self._gave_up
+    def has_released_a_proposal(self, ticket: Ticket) -> bool:
+        """Return whether a demand released a proposal; then it may hold no claims."""
+        return ticket.operation in self._releasing
 
-    def take(self, ticket: Ticket, decision: Decision) -> None:
-        """Take in a demand that needs approval; one of the same demand waits with it."""
+    def add(self, ticket: Ticket, decision: Decision) -> None:
+        """Add a demand that needs approval, to an existing proposal of the same demand if any."""
         request, key = decision.request, key_of(decision.request)
         proposal = self._proposals.get(key)
         if proposal is not None and not proposal.requesters() & set(request.requesters()):
             owners = ", ".join(sorted(proposal.requesters()))
             message = f"'{request.demand}' is a demand of {owners}; choose another demand id"
-            self._waiting.answer([(ticket, Refused([fault("demand", message, code="not-yours")]))])
+            self._queue.answer([(ticket, Refused([fault("demand", message, code="not-yours")]))])
             return
         if proposal is None:
             branch = branch_name(request.demand or request.id, ticket.operation)
-            proposal = Proposal(key, Record(branch), seen=ticket.base)
+            proposal = Proposal(key, ProposalRecord(branch), searched_to=ticket.base)
         elif request.operation is Operation.PUT and request not in proposal.requests:
             replaced, proposal.tickets, proposal.requests = proposal.tickets, [], []
-            self._waiting.answer((old, Withdrawn(REPLACED)) for old in replaced)
-        if not self._waiting.propose(ticket, proposal.record):
-            self._waiting.answer([(ticket, Withdrawn(TAKEN_BACK))])
+            self._queue.answer((old, Withdrawn(REPLACED)) for old in replaced)
+        if not self._queue.set_proposal(ticket, proposal.record):
+            self._queue.answer([(ticket, Withdrawn(TAKEN_BACK))])
             return
         self._proposals[key] = proposal
         proposal.tickets.append(ticket)
         proposal.requests.append(request)
         self._changed.append(proposal.branch)
 
-    def replaced_by(self, request: DemandRequest) -> None:
-        """Give up the proposal of a demand that was put anew and needs no approval."""
+    def withdraw_replaced(self, request: DemandRequest) -> None:
+        """Withdraw the proposal of a demand that was put again and needs no approval now."""
         proposal = self._proposals.get(key_of(request))
         if proposal is not None and request.operation is Operation.PUT:
-            self._waiting.retract(proposal.tickets, REPLACED)
+            self._queue.withdraw_proposed(proposal.tickets, REPLACED)
 
-    # ---- after main was taken in ----
+    # ---- after main was read ----
 
     def is_due(self, tip: str) -> bool:
-        """Tell whether to look at the proposals now, with main at ``tip``."""
+        """Return whether to check the proposals now, with main at ``tip``."""
         if not self._proposals:
             return False
         now = time.monotonic()
-        if now < self._next and self._looked == _IN_TROUBLE:
+        if now < self._next_check and self._checked_at == _UNFINISHED:
             return False
         tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)
         if self._changed or any(ticket.state == "withdrawn" for ticket in tickets):
             return True
-        if tip != self._looked and now < self._rested:
-            self._next = min(self._next, self._rested)
-        return now >= self._next or (tip != self._looked and now >= self._rested)
+        if tip != self._checked_at and now < self._rest_until:
+            self._next_check = min(self._next_check, self._rest_until)
+        return now >= self._next_check or (tip != self._checked_at and now >= self._rest_until)
 
-    def pause(self, longest: float) -> float:
-        """Return the seconds until the next look is due, ``longest`` where nothing waits."""
+    def seconds_until_due(self, longest: float) -> float:
+        """Return the seconds until the next check; ``longest`` without proposals."""
         if not self._proposals:
             return longest
-        return min(longest, max(self._next - time.monotonic(), 0.05))
+        return min(longest, max(self._next_check - time.monotonic(), 0.05))
 
-    def heads(self) -> BranchHeads:
-        """Ask where the branches are; the next look is due after a while, whatever comes."""
-        self._began = time.monotonic()
-        self._next, self._looked = self._began + self._every, _IN_TROUBLE
-        return self._keeper.heads()
+    def fetch_heads(self) -> BranchHeads:
+        """Fetch the commits of the branches, and plan the next check even if this one fails."""
+        self._check_began = time.monotonic()
+        self._next_check, self._checked_at = self._check_began + self._interval, _UNFINISHED
+        return self._branch_sync.fetch_heads()
 
-    def look(self, snapshot: Snapshot, heads: BranchHeads) -> None:
-        """Look at each proposal: is it decided, does it go, does it still fit main?
+    def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
+        """Answer the proposals that are decided or withdrawn, and update the others.
 
         Args:
             snapshot: main, no older than ``heads``.
-            heads: where the branches are.
+            heads: the commits of the branches.
 
         Raises:
-            RemoteAway: where the remote does not answer any more; the rest is for the next time.
+            RemoteAway: if the remote cannot be reached; the next check continues.
         """
         while self._changed:
             branch = self._changed.popleft()
             for proposal in self._proposals.values():
                 if proposal.branch == branch:
-                    proposal.looked = ""
+                    proposal.checked_at = ""
         for proposal in list(self._proposals.values()):
             try:
-                if not proposal.stands(str(snapshot.commit), heads.branches):
-                    self._look_at(proposal, snapshot, heads)
+                if not proposal.is_unchanged(str(snapshot.commit), heads.branches):
+                    self._check(proposal, snapshot, heads)
             except BranchMoved as error:
-                log.info("%s; looking again", error)
+                log.info("%s; checking again", error)
                 self._changed.append(proposal.branch)
             except SigningFailed as error:
-                if proposal.record.pushed:  # it stands as it is, and may be merged
-                    log.warning("%s; %s is not laid anew", error, proposal.branch)
+                if proposal.record.pushed:  # the existing branch can still be merged
+                    log.warning("%s; %s is not rebuilt", error, proposal.branch)
                 else:
                     self._fail(proposal, error)
             except PushDenied as error:
                 self._fail(proposal, error)
         ended = time.monotonic()
-        self._looked, self._rested = str(snapshot.commit), ended + _SHARE * (ended - self._began)
+        self._checked_at, self._rest_until = (
+            str(snapshot.commit),
+            ended + _PAUSE_FACTOR * (ended - self._check_began),
+        )
 
     def _fail(self, proposal: Proposal, error: DemandOpsError) -> None:
-        self._waiting.answer([(ticket, error) for ticket in proposal.tickets])
+        self._queue.answer([(ticket, error) for ticket in proposal.tickets])
         self._forget(proposal, close=True)
 
-    def _look_at(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
+    def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
         objects = self._repository.objects
-        arrived = commit_log.operations_since(objects, snapshot.commit, proposal.seen)
-        proposal.seen = str(snapshot.commit)
-        verdicts = [(t, self._verdict(t, snapshot, arrived)) for t in proposal.tickets]
-        done = [(t, v) for t, v in verdicts if isinstance(v, Receipt)]
-        self._waiting.answer(done)
-        proposal.tickets = [t for t, v in verdicts if not isinstance(v, Receipt)]
-        errors = [(t, v) for t, v in verdicts if isinstance(v, DemandOpsError)]
-        left = [(t, v) for t, v in verdicts if isinstance(v, Decision) and v.approval]
-        free = [t for t, v in verdicts if isinstance(v, Decision) and not v.approval]
-        why_not = "" if done else self._keeper.turned_down(proposal, heads)
+        arrived = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
+        proposal.searched_to = str(snapshot.commit)
+        results = [(t, self._result(t, snapshot, arrived)) for t in proposal.tickets]
+        done = [(t, v) for t, v in results if isinstance(v, Receipt)]
+        self._queue.answer(done)
+        proposal.tickets = [t for t, v in results if not isinstance(v, Receipt)]
+        errors = [(t, v) for t, v in results if isinstance(v, DemandOpsError)]
+        left = [(t, v) for t, v in results if isinstance(v, Decision) and v.approval]
+        free = [t for t, v in results if isinstance(v, Decision) and not v.approval]
+        why_not = "" if done else self._branch_sync.turned_down_because(proposal, heads)
         if why_not:
             errors += [(ticket, TurnedDown(why_not)) for ticket, _ in left]
             left = []
         if not left:
-            self._keeper.take_away(proposal, heads, if_unchanged=bool(done))
-        self._waiting.answer(errors)
-        self._waiting.requeue(free)
+            self._branch_sync.delete(proposal, heads, if_unchanged=bool(done))
+        self._queue.answer(errors)
+        self._queue.requeue(free)
         proposal.tickets = [ticket for ticket, _ in left]
         if not left:
             self._forget(proposal, close=not done)
             return
-        if done and proposal.branch not in heads.branches:  # what was not merged goes on
+        if done and proposal.branch not in heads.branches:  # only a part was merged
             proposal.record = replace(proposal.record, pushed=False)
         head = heads.branches.get(proposal.branch, "")
-        if self._keeper.keep_up(proposal, left, snapshot, head):
-            proposal.looked = str(snapshot.commit)
+        if self._branch_sync.update(proposal, left, snapshot, head):
+            proposal.checked_at = str(snapshot.commit)
         else:
             self._changed.append(proposal.branch)
 
-    def _verdict(
+    def _result(
         self, ticket: Ticket, snapshot: Snapshot, arrived: dict[str, RecordedOutcome]
     ) -> Receipt | DemandOpsError | Decision:
-        """Return what became of a demand: booked, refused, taken back, or how it still stands.
+        """Return the receipt or error of a demand that is decided, else its decision on main.
 
-        It is booked where main's history has its operation, or main's books hold what it asks: a
-        squash may lose the trailer, and never the claims.
+        It is booked if the history of main has its operation id, or if the ledger has its claims:
+        a squash merge may lose the trailer.
         """
         read = commit_batch.CommitBatch(self._repository, snapshot).read
         decision: Decision | DemandOpsError
@@ -278,9 +281,9 @@ class Approvals:
             decision = decide(snapshot.state, ticket.goal, ticket.received, read)
         except InvalidInput as error:
             decision = error
-        here = arrived.get(ticket.operation)
-        if here is not None or (isinstance(decision, Decision) and not decision.files):
-            commit = here.commit if here else str(snapshot.commit)
+        arrival = arrived.get(ticket.operation)
+        if arrival is not None or (isinstance(decision, Decision) and not decision.files):
+            commit = arrival.commit if arrival else str(snapshot.commit)
             return self._receipt(ticket, decision, snapshot.state, commit)
         if ticket.state == "withdrawn" and ticket.proposal:
             return Withdrawn(ticket.proposal.withdrawn or TAKEN_BACK)
@@ -289,7 +292,7 @@ class Approvals:
     def _receipt(
         self, ticket: Ticket, decision: Decision | DemandOpsError, state: State, commit: str
     ) -> Receipt:
-        if not isinstance(decision, Decision) or decision.files:  # merged, and undone since
+        if not isinstance(decision, Decision) or decision.files:  # merged, and changed since
             goal = ticket.goal if isinstance(ticket.goal, dict) else {}
             name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
             return Receipt(ticket.operation, str(name), "booked", commit)
@@ -300,29 +303,29 @@ class Approvals:
             commit=commit,
             warnings=decision.warnings,
             lease_s=decision.lease_s,
-            targets=targets_of(state.ledger, decision) if self._with_targets else (),
+            targets=targets_of_decision(state.ledger, decision) if self._with_targets else (),
         )
 
     def _forget(self, proposal: Proposal, *, close: bool) -> None:
         self._proposals = {k: p for k, p in self._proposals.items() if p is not proposal}
-        self._keeper.forget(proposal, close=close)
+        self._branch_sync.forget(proposal, close=close)
 
-    # ---- the end ----
+    # ---- updates and the end ----
 
-    def _on_news(self, branch: str) -> None:
-        """Have the answer of a forge told; from the desk's thread."""
+    def _on_forge_update(self, branch: str) -> None:
+        """Check a branch again, because the forge answered; from the forge worker's thread."""
         self._changed.append(branch)
-        self._waiting.wake()
+        self._queue.wake()
 
     def suspend(self) -> None:
-        """Answer all that waits; the journal keeps it for the next start."""
-        error = ShuttingDown("awaits approval; it is taken up again at the next start")
+        """Answer all demands that await approval; the journal keeps them for the next start."""
+        error = ShuttingDown("awaits approval; it is resumed at the next start")
         for proposal in self._proposals.values():
-            self._waiting.fail(proposal.tickets, error, keep=True)
+            self._queue.fail(proposal.tickets, error, keep=True)
         self._proposals = {}
 
 
-def _alone(ticket: Ticket, decision: Decision) -> Proposal:
-    """Return the proposal that a demand would be by itself."""
+def _proposal_of(ticket: Ticket, decision: Decision) -> Proposal:
+    """Return a proposal with one demand."""
     request = decision.request
-    return Proposal(key_of(request), Record(""), [ticket], [request])
+    return Proposal(key_of(request), ProposalRecord(""), [ticket], [request])

@@ -1,7 +1,7 @@
-"""Keeping proposals: their branches and the requests to merge them, as main moves on.
+"""Keeps the branches and pull requests of proposals up to date while main moves on.
 
-Belongs to the thread that settles demands; knows how a proposal stands, not what is to become of
-it (:mod:`demandops.service.approvals.approvals`).
+Belongs to the worker thread. What becomes of a proposal is decided in
+:mod:`demandops.service.approvals.approvals`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,14 @@ from demandops.decision import Decision, decide
 from demandops.demand import approval_rule
 from demandops.errors import DemandOpsError, InvalidInput
 from demandops.service.approvals.forge_worker import ForgeWorker
-from demandops.service.approvals.proposal import Proposal, markdown, news, one_line
+from demandops.service.approvals.proposal import (
+    Proposal,
+    pull_request_body,
+    push_option_description,
+    waiting_text,
+)
 from demandops.service.demand_queue import DemandQueue
-from demandops.service.ticket import Record, Ticket
+from demandops.service.ticket import ProposalRecord, Ticket
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.write import commit_batch
@@ -28,115 +33,115 @@ log = logging.getLogger("demandops")
 
 
 class BranchSync:
-    """Puts proposals where a person finds them, and takes them away again."""
+    """Creates, updates and deletes the branches of proposals."""
 
     def __init__(
         self,
         repository: StateRepository,
-        waiting: DemandQueue,
+        queue: DemandQueue,
         token_file: Path | None,
-        on_news: Callable[[str], None],
+        on_update: Callable[[str], None],
     ) -> None:
         self._repository = repository
-        self._waiting = waiting
+        self._queue = queue
         self._branches = ProposalBranches(repository)
-        self._desk = ForgeWorker(token_file, on_news)
+        self._forge = ForgeWorker(token_file, on_update)
 
-    def heads(self) -> BranchHeads:
-        """Ask where the branches are.
+    def fetch_heads(self) -> BranchHeads:
+        """Fetch the commits of main and of the branches.
 
         Raises:
-            RemoteAway: where the remote does not answer.
+            RemoteAway: if the remote cannot be reached.
         """
         return self._branches.heads()
 
-    def turned_down(self, proposal: Proposal, heads: BranchHeads) -> str:
-        """Return how a person turned a proposal down that is not on main; empty where none did."""
-        request = self._desk.request(proposal.branch)
+    def turned_down_because(self, proposal: Proposal, heads: BranchHeads) -> str:
+        """Return how a person turned a proposal down that is not on main, or empty."""
+        request = self._forge.pull_request(proposal.branch)
         if proposal.record.pushed and proposal.branch not in heads.branches:
             return f"was turned down: {proposal.branch} is gone and was not merged"
         if request is not None and request.state == "closed":
             return f"was turned down: {request.link} was closed"
         return ""
 
-    def take_away(
-        self, proposal: Proposal, heads: BranchHeads, *, if_unchanged: bool = False
-    ) -> None:
-        """Delete the branch; ``if_unchanged``: not where somebody else has worked on it.
+    def delete(self, proposal: Proposal, heads: BranchHeads, *, if_unchanged: bool = False) -> None:
+        """Delete the branch; ``if_unchanged``: unless a person committed to it.
 
         Raises:
-            BranchMoved, RemoteAway, PushDenied: where it could not be deleted.
+            BranchMoved, RemoteAway, PushDenied: if it could not be deleted.
         """
         head = heads.branches.get(proposal.branch)
         if head and (not if_unchanged or head in proposal.record.commits):
             self._branches.remove(proposal.branch, head)
 
     def forget(self, proposal: Proposal, *, close: bool) -> None:
-        """Ask nobody any more; ``close`` the request where it is open."""
-        self._desk.drop(proposal.branch, close=close)
+        """Stop watching the pull request; ``close``: also close it if it is open."""
+        self._forge.forget(proposal.branch, close=close)
 
-    def keep_up(
+    def update(
         self,
         proposal: Proposal,
         left: list[tuple[Ticket, Decision]],
         snapshot: Snapshot,
         head: str,
     ) -> bool:
-        """Put the branch where merging it gives what main would render now.
+        """Update the branch, so that merging it gives what main would render now.
 
         Args:
-            left: the demands that still need approval, and how each stands on main.
-            head: where the branch is; empty where there is none yet.
+            left: the demands that still need approval, each with its decision on main.
+            head: the commit of the branch; empty if there is no branch yet.
 
         Returns:
-            False where a demand was taken back meanwhile: look again.
+            False if a demand was withdrawn meanwhile and the proposal must be checked again.
 
         Raises:
-            BranchMoved, RemoteAway, PushDenied: where the branch could not be put there.
+            BranchMoved, RemoteAway, PushDenied: if the branch could not be pushed.
         """
-        proposal.reasons = tuple(dict.fromkeys(who for _, d in left for who in d.approval))
+        proposal.reasons = tuple(dict.fromkeys(reason for _, d in left for reason in d.approval))
         proposal.requests = [decision.request for _, decision in left]
         record = proposal.record
         if head and head not in record.commits:
-            self._tell_of_edits(proposal)
+            self._mark_edited(proposal)
         else:
-            steps, faulty = self._steps(left, snapshot)
-            self._waiting.answer(faulty)
+            steps, faulty = self._decide(left, snapshot)
+            self._queue.answer(faulty)
             dropped = [ticket for ticket, _ in faulty]
             proposal.tickets = [t for t in proposal.tickets if t not in dropped]
             if not steps:
                 return False
             files = {path: text for _, d in steps for path, text in d.files.items()}
-            made = self._branches.tree(snapshot.commit, files)
-            stands = head and self._branches.is_up_to_date(snapshot.commit, head, record.base, made)
-            if not stands and not self._lay(proposal, steps, snapshot, head):
+            tree = self._branches.tree(snapshot.commit, files)
+            is_fresh = head and self._branches.is_up_to_date(
+                snapshot.commit, head, record.base, tree
+            )
+            if not is_fresh and not self._commit_and_push(proposal, steps, snapshot, head):
                 return False
         forge = snapshot.state.config.repository.proposals
         message = self._branches.message(proposal.record.commits[-1])
-        title, body = message.split("\n", 1)[0], markdown(message, proposal.reasons)
+        title, body = message.split("\n", 1)[0], pull_request_body(message, proposal.reasons)
         if forge.forge in ("github", "gitea"):
-            self._desk.want(forge, proposal.branch, title, body)
-            if not self._desk.answered(proposal.branch):
-                return True  # told together with the link
-        self._tell(proposal)
+            self._forge.open(forge, proposal.branch, title, body)
+            if not self._forge.has_answered(proposal.branch):
+                return True  # the requester is notified once the link is known
+        self._notify(proposal)
         return True
 
-    def _tell(self, proposal: Proposal) -> None:
-        request = self._desk.request(proposal.branch)
+    def _notify(self, proposal: Proposal) -> None:
+        request = self._forge.pull_request(proposal.branch)
         link = request.link if request else proposal.record.link
-        text = news(proposal.branch, link, proposal.reasons)
+        text = waiting_text(proposal.branch, link, proposal.reasons)
         for ticket in proposal.tickets:
-            ticket.tell("proposed", text)
+            ticket.notify("proposed", text)
 
-    def _tell_of_edits(self, proposal: Proposal) -> None:
+    def _mark_edited(self, proposal: Proposal) -> None:
         if not proposal.edited:
-            log.info("%s was changed by somebody else and is left to them", proposal.branch)
+            log.info("%s has commits by a person and is left as it is", proposal.branch)
         proposal.edited = True
 
-    def _steps(
+    def _decide(
         self, left: list[tuple[Ticket, Decision]], snapshot: Snapshot
     ) -> tuple[list[tuple[Ticket, Decision]], list[tuple[Ticket, DemandOpsError]]]:
-        """Judge what is left one after the other, with leases that count from the approval."""
+        """Decide the demands one after the other, with leases that start at the approval."""
         line = commit_batch.CommitBatch(self._repository, snapshot)
         state, written = snapshot.state, dict[str, str | None]()
         steps, faulty = list[tuple[Ticket, Decision]](), list[tuple[Ticket, DemandOpsError]]()
@@ -157,39 +162,43 @@ class BranchSync:
             steps.append((ticket, step))
         return steps, faulty
 
-    def _lay(
+    def _commit_and_push(
         self,
         proposal: Proposal,
         steps: list[tuple[Ticket, Decision]],
         snapshot: Snapshot,
         head: str,
     ) -> bool:
-        """Commit the demands on main as it is and put the branch there; false where one goes."""
+        """Commit the demands on main and push the branch; return False if one was withdrawn."""
         line = commit_batch.CommitBatch(self._repository, snapshot)
         now = datetime.now(timezone.utc)
         for ticket, step in steps:
             if step.files:
                 line.commit(step, ticket.operation, ticket.received, now, proposal.branch)
-        made, old = str(line.head.commit), proposal.record
-        record = replace(old, commits=(head, made) if head else (made,), base=str(snapshot.commit))
-        if not self._keep(proposal, record):
+        commit, old = str(line.head.commit), proposal.record
+        record = replace(
+            old, commits=(head, commit) if head else (commit,), base=str(snapshot.commit)
+        )
+        if not self._journal(proposal, record):
             return False
-        options = self._options(proposal, snapshot, made)
+        options = self._options(proposal, snapshot, commit)
         link = self._branches.put(proposal.branch, line.head.commit, head, options)
-        self._keep(proposal, replace(record, pushed=True, link=link or old.link))
-        log.info("%s %s", proposal.branch, "is laid anew" if head else "awaits approval")
+        self._journal(proposal, replace(record, pushed=True, link=link or old.link))
+        log.info("%s %s", proposal.branch, "was rebuilt" if head else "awaits approval")
         return True
 
-    def _options(self, proposal: Proposal, snapshot: Snapshot, made: str) -> list[str]:
+    def _options(self, proposal: Proposal, snapshot: Snapshot, commit: str) -> list[str]:
         forge = snapshot.state.config.repository.proposals
         if forge.forge != "gitlab":
             return []
-        message = self._branches.message(made)
+        message = self._branches.message(commit)
         title = message.split("\n", 1)[0]
-        return gitlab_options(title, one_line(message, proposal.reasons), forge.labels)
+        return gitlab_options(
+            title, push_option_description(message, proposal.reasons), forge.labels
+        )
 
-    def _keep(self, proposal: Proposal, record: Record) -> bool:
-        """Keep a record in the journal, for each demand; false where one was taken back."""
+    def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
+        """Journal a record for each demand; return False if one was withdrawn."""
         proposal.record = record
-        kept = [self._waiting.propose(ticket, record) for ticket in proposal.tickets]
-        return all(kept)
+        waiting = [self._queue.set_proposal(ticket, record) for ticket in proposal.tickets]
+        return all(waiting)

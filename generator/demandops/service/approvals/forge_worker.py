@@ -1,7 +1,7 @@
-"""The desk: asks a forge for merge requests in a thread of its own, and remembers the answers.
+"""Opens, watches and closes pull requests at a forge, in a thread of its own.
 
-A forge that is slow or away holds up neither demands nor proposals: a branch without a request can
-be merged all the same.
+A slow or unreachable forge delays no demand and no proposal: a branch can be merged without a pull
+request.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from demandops.settings import MAIN_BRANCH
 log = logging.getLogger("demandops")
 
 POLL_S = 30.0
-"""Between two looks at what became of the requests: a closed one leaves its branch as it is."""
+"""Between two queries for the state of each pull request: closing one does not touch its branch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,55 +32,55 @@ class _Task:
 
 
 class ForgeWorker:
-    """Opens, watches and closes requests. All but :meth:`_run` is for one other thread."""
+    """Opens, watches and closes pull requests; its public methods belong to the worker thread."""
 
     def __init__(self, token_file: Path | None, on_news: Callable[[str], None]) -> None:
         self._token_file = token_file
-        self._on_news = on_news
-        self._orders: queue.Queue[tuple[_Task, bool]] = queue.Queue()
+        self._on_update = on_news
+        self._tasks: queue.Queue[tuple[_Task, bool]] = queue.Queue()
         self._wanted: dict[str, _Task] = {}
-        self._answers: dict[str, PullRequest | None] = {}
+        self._pull_requests: dict[str, PullRequest | None] = {}
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
-        self._said = ""
+        self._last_error = ""
 
-    def want(self, forge: Proposals, branch: str, title: str, body: str) -> None:
-        """Have a request opened for a branch, unless that was said before."""
+    def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
+        """Open a pull request for a branch, unless that was requested before."""
         if branch in self._wanted:
             return
         task = _Task(forge, branch, title, body)
         with self._lock:
             self._wanted[branch] = task
-        self._order(task, close=False)
+        self._enqueue(task, close=False)
 
-    def answered(self, branch: str) -> bool:
-        """Tell whether the forge was asked about a branch, with or without success."""
-        return branch in self._answers
+    def has_answered(self, branch: str) -> bool:
+        """Return whether the forge was queried for a branch, successfully or not."""
+        return branch in self._pull_requests
 
-    def request(self, branch: str) -> PullRequest | None:
-        """Return what is known of the request for a branch."""
-        return self._answers.get(branch)
+    def pull_request(self, branch: str) -> PullRequest | None:
+        """Return the pull request of a branch, or None if there is none or it is not known yet."""
+        return self._pull_requests.get(branch)
 
-    def drop(self, branch: str, *, close: bool) -> None:
-        """Watch a request no more; ``close`` it where it is open."""
+    def forget(self, branch: str, *, close: bool) -> None:
+        """Stop watching a branch; ``close``: also close its pull request if it is open."""
         with self._lock:
             task = self._wanted.pop(branch, None)
-            self._answers.pop(branch, None)
+            self._pull_requests.pop(branch, None)
         if task is not None and close:
-            self._order(task, close=True)
+            self._enqueue(task, close=True)
 
-    def _order(self, task: _Task, *, close: bool) -> None:
-        self._orders.put((task, close))
+    def _enqueue(self, task: _Task, *, close: bool) -> None:
+        self._tasks.put((task, close))
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="demandops-desk", daemon=True)
+            self._thread = threading.Thread(target=self._run, name="demandops-forge", daemon=True)
             self._thread.start()
 
-    # ---- in the desk's own thread ----
+    # ---- in the thread of its own ----
 
     def _run(self) -> None:
         while True:
             try:
-                task, close = self._orders.get(timeout=POLL_S)
+                task, close = self._tasks.get(timeout=POLL_S)
             except queue.Empty:
                 with self._lock:
                     tasks = list(self._wanted.values())
@@ -90,37 +90,38 @@ class ForgeWorker:
             try:
                 self._handle(task, close=close)
             finally:
-                self._orders.task_done()
+                self._tasks.task_done()
 
     def _handle(self, task: _Task, *, close: bool) -> None:
-        known = self._answers.get(task.branch)
-        found = known
+        known = self._pull_requests.get(task.branch)
+        pull_request = known
         try:
             forge = forge_for(task.forge, self._token_file)
             if forge is None:
                 return
             if close:
-                found = forge.find(task.branch, MAIN_BRANCH)
-                if found is not None and found.state == "open":
-                    forge.close(found)
+                pull_request = forge.find(task.branch, MAIN_BRANCH)
+                if pull_request is not None and pull_request.state == "open":
+                    forge.close(pull_request)
                 return
             if known is None:
-                found = forge.open(task.branch, MAIN_BRANCH, task.title, task.body)
+                pull_request = forge.open(task.branch, MAIN_BRANCH, task.title, task.body)
             else:
-                found = forge.find(task.branch, MAIN_BRANCH) or known
+                pull_request = forge.find(task.branch, MAIN_BRANCH) or known
         except ForgeError as error:
-            if str(error) != self._said:
+            if str(error) != self._last_error:
                 log.warning("%s: %s", task.branch, error)
-            self._said = str(error)
+            self._last_error = str(error)
         except Exception:
-            log.exception("a fault of the generator, at the request for %s", task.branch)
-        self._remember(task, found)
+            log.exception("internal error at the pull request for %s", task.branch)
+        self._remember(task, pull_request)
 
-    def _remember(self, task: _Task, found: PullRequest | None) -> None:
+    def _remember(self, task: _Task, pull_request: PullRequest | None) -> None:
         with self._lock:
             if task.branch not in self._wanted:
                 return
-            news = task.branch not in self._answers or self._answers[task.branch] != found
-            self._answers[task.branch] = found
-        if news:
-            self._on_news(task.branch)
+            known = self._pull_requests
+            changed = task.branch not in known or known[task.branch] != pull_request
+            known[task.branch] = pull_request
+        if changed:
+            self._on_update(task.branch)

@@ -1,6 +1,6 @@
 """A proposal: demands that wait together on one branch for a person's approval.
 
-What one is found by, which requests give it up, and how it is described to the person.
+Its key, the requests that release it, and the texts that describe it to people.
 """
 
 from __future__ import annotations
@@ -14,50 +14,52 @@ from demandops.demand.approval_rule import subjects_of
 from demandops.demand.claim import Subject
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import InvalidInput
-from demandops.service.ticket import Record, Ticket
+from demandops.service.ticket import ProposalRecord, Ticket
 
 Key = tuple[str, ...]
 
-_NEWS = "awaiting approval: "
+_PREFIX = "awaiting approval: "
 
 
 @dataclass(eq=False)
 class Proposal:
-    """Demands of one key; ``requests`` are what they ask, ``reasons`` what asks for approval.
+    """Demands with one key.
 
-    Main up to ``seen`` holds none of it, and with main at ``looked`` all was done about it.
+    ``reasons`` is what asks for approval. No commit of main up to ``searched_to`` has a demand of
+    it. ``checked_at`` is the commit of main at its last check. ``edited``: a person committed to
+    the branch.
     """
 
     key: Key
-    record: Record
+    record: ProposalRecord
     tickets: list[Ticket] = field(default_factory=list)
     requests: list[DemandRequest] = field(default_factory=list)
     reasons: tuple[str, ...] = ()
-    seen: str = ""
-    looked: str = ""
+    searched_to: str = ""
+    checked_at: str = ""
     edited: bool = False
 
     @property
     def branch(self) -> str:
-        """The branch that is to be merged."""
+        """The branch to merge."""
         return self.record.branch
 
-    def stands(self, tip: str, branches: Mapping[str, str]) -> bool:
-        """Tell whether nothing happened to it since it was looked at, with main at ``tip``."""
+    def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
+        """Return whether nothing changed since the last check, with main at ``tip``."""
         head = branches.get(self.branch)
-        waits = all(ticket.state == "waiting" for ticket in self.tickets)
-        return waits and self.looked == tip and head in self.record.commits[-1:]
+        all_wait = all(ticket.state == "waiting" for ticket in self.tickets)
+        return all_wait and self.checked_at == tip and head in self.record.commits[-1:]
 
     def requesters(self) -> set[str]:
-        """Return in whose name it stands."""
-        return {who for request in self.requests for who in request.requesters()}
+        """Return the requesters of its demands."""
+        return {name for request in self.requests for name in request.requesters()}
 
     def subjects(self) -> set[Subject]:
-        """Return what it asks for."""
+        """Return the applications and connections that it requests."""
         return {subject for request in self.requests for subject in subjects_of(request)}
 
-    def is_given_up_by(self, request: DemandRequest) -> bool:
-        """Tell whether a request gives up all of it, in the name of one of its requesters."""
+    def is_released_by(self, request: DemandRequest) -> bool:
+        """Return whether a request by one of its requesters releases all of it."""
         if key_of(request) not in map(key_of, self.requests) or not self.requesters() & set(
             request.requesters()
         ):
@@ -67,44 +69,44 @@ class Proposal:
 
 
 def key_of(request: DemandRequest) -> Key:
-    """Return what proposals are told apart by: the demand, or the request and its requesters."""
+    """Return the key of a request's proposal: the demand, or the request and its requesters."""
     if request.operation.is_reference:
         return ("request", request.id, *sorted(request.requesters()))
     return ("demand", request.demand)
 
 
-def gives_up(goal: object) -> bool:
-    """Tell whether a goal, not parsed yet, gives something up."""
-    given = goal if isinstance(goal, dict) else {}
-    return bool(given.get("shutdown") or given.get("operation") == Operation.RELEASE.value)
+def is_release(goal: object) -> bool:
+    """Return whether a goal that is not parsed yet is a release."""
+    fields = goal if isinstance(goal, dict) else {}
+    return bool(fields.get("shutdown") or fields.get("operation") == Operation.RELEASE.value)
 
 
-def admitted(state: State, goal: object) -> DemandRequest | None:
-    """Return what a goal asks, or nothing where it is refused."""
+def admit_or_none(state: State, goal: object) -> DemandRequest | None:
+    """Return the request of a goal, or None if it is refused."""
     try:
         return admit(state, goal)
     except InvalidInput:
         return None
 
 
-def news(branch: str, link: str, reasons: Iterable[str]) -> str:
-    """Return what a requester is told while the demand waits."""
-    where = f"{branch} {link}" if link else branch
+def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
+    """Return the feedback for a requester while the demand awaits approval."""
+    branch_and_link = f"{branch} {link}" if link else branch
     why = ", ".join(reasons)
-    return f"{_NEWS}{where}" + (f" (asked for by {why})" if why else "")
+    return f"{_PREFIX}{branch_and_link}" + (f" (asked for by {why})" if why else "")
 
 
-def where_told(text: str) -> dict[str, str]:
-    """Return branch and link out of :func:`news`; no link where there is none."""
-    branch, _, rest = text.removeprefix(_NEWS).partition(" ")
+def parse_waiting_text(text: str) -> dict[str, str]:
+    """Return branch and link from a :func:`waiting_text`; the link may be empty."""
+    branch, _, rest = text.removeprefix(_PREFIX).partition(" ")
     link = rest.split(" ")[0] if rest.startswith("http") else ""
     return {"branch": branch, "link": link}
 
 
-def markdown(message: str, reasons: Iterable[str]) -> str:
-    """Return a commit's message as the text of a merge request.
+def pull_request_body(message: str, reasons: Iterable[str]) -> str:
+    """Return the text of a pull request with a commit's message.
 
-    Fenced, for it holds ids that anybody may choose: nothing in them links, mentions or renders.
+    The message is fenced, because it has ids that anyone may choose: none must become a link.
     """
     longest = max((len(run) for run in re.findall(r"`+", message)), default=0)
     fence = "`" * max(3, longest + 1)
@@ -115,8 +117,8 @@ def markdown(message: str, reasons: Iterable[str]) -> str:
     )
 
 
-def one_line(message: str, reasons: Iterable[str]) -> str:
-    """Return the same in one line, for push options hold no more."""
+def push_option_description(message: str, reasons: Iterable[str]) -> str:
+    """Return the text of a merge request on one line, because a push option has only one."""
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
     fence = "`" * (max((len(run) for run in re.findall(r"`+", why)), default=0) + 1)
     asks = ", ".join(reasons) or "an access policy"

@@ -1,1 +1,1 @@
-"""When something is due: fetches, retries, leases, overrides, and rate limits."""
+"""When something is due: fetches, retries, ends of leases and overrides, and rate limits."""

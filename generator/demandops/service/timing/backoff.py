@@ -1,7 +1,7 @@
-"""How long a line of commits may be, and how long to wait before the next try.
+"""The delay until the next attempt to publish, and how many demands to publish at once.
 
-Other writers may be first, and the remote may be away: two waits of their own, both jittered and
-bounded, so that no writer is overtaken for ever and a remote that comes back is not stormed.
+Two cases have delays of their own: another writer was first, or the remote cannot be reached. Both
+are jittered and bounded, so no writer starves and a remote that comes back is not flooded.
 """
 
 from __future__ import annotations
@@ -10,46 +10,46 @@ import random
 
 FIRST_PAUSE_S = 0.05
 LONGEST_AWAY_S = 10.0
-"""Between two tries of a remote that is away."""
+"""The longest delay while the remote cannot be reached."""
 LONGEST_TURN_S = 0.4
-"""Between two tries where another writer was first: it goes on at once, so who waits long loses."""
+"""The longest delay after another writer was first. Short: who waits long loses again."""
 LIMIT_EMBEDDED = 20
 LIMIT_REMOTE = 200
-"""Demands that are published together: a push costs some 50 ms, moving a branch less than one."""
+"""How many demands to publish together: a push costs some 50 ms, moving a branch less than one."""
 
 
 class Backoff:
-    """Begins anew with each batch; told of each try, it gives the seconds until the next."""
+    """The delays of one batch of demands."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self.published()
 
     def published(self) -> None:
-        """Note that a line was published."""
-        self.share = self._limit
-        """How many demands the next line may have."""
+        """Reset the delays, because commits were published."""
+        self.max_demands = self._limit
+        """How many demands to publish next."""
         self._turn = self._away = FIRST_PAUSE_S
 
-    def overtaken(self, size: int, judging_s: float, pushing_s: float) -> float:
-        """Note that another writer was first.
+    def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
+        """Return the seconds to wait after another writer was first.
 
         Args:
-            size: how many demands the line had.
-            judging_s: seconds that it took to lay it.
-            pushing_s: seconds until it was known that it came too late.
+            size: how many demands were to be published.
+            evaluating_s: seconds that it took to evaluate and commit them.
+            pushing_s: seconds until the push was rejected.
         """
-        # judging for longer than the push takes loses to faster writers for ever
-        self.share = max(1, int(size * min(1.0, pushing_s / max(judging_s, 1e-9))))
+        # who evaluates for longer than a push takes always loses to faster writers
+        self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
         wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
         self._away = FIRST_PAUSE_S
         return _jittered(wait)
 
-    def away(self) -> float:
-        """Note that the remote could not be reached."""
+    def unreachable(self) -> float:
+        """Return the seconds to wait after the remote could not be reached."""
         wait, self._away = self._away, min(self._away * 2, LONGEST_AWAY_S)
         return _jittered(wait)
 
 
 def _jittered(seconds: float) -> float:
-    return seconds * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
+    return seconds * random.uniform(0.5, 1.0)  # noqa: S311 - not for security

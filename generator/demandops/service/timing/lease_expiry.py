@@ -1,7 +1,7 @@
-"""Which leases have run out, by a clock that may be set.
+"""Which leases have ended, by a clock that somebody may set.
 
-A clock set back only delays a release. One set forward would end leases that were renewed in
-time by the old clock, so such a step grants every lease its full term again. A machine that was
+A clock that is set back only delays a release. A clock that jumps forward would end leases that
+were renewed in time, so after a jump every lease gets its full term again. A machine that was
 asleep looks the same and is treated alike.
 """
 
@@ -20,10 +20,10 @@ from demandops.service.ticket import Ticket
 
 log = logging.getLogger("demandops")
 
-_STEP = timedelta(seconds=30)
+_JUMP = timedelta(seconds=30)
 _SHORTEST_S = 1.0
 LONGEST_WAIT_S = 60.0
-"""Between two looks at the leases: a clock may be set meanwhile."""
+"""The longest time between two checks of the leases, because the clock may be set meanwhile."""
 
 
 def _wall() -> datetime:
@@ -31,76 +31,78 @@ def _wall() -> datetime:
 
 
 class LeaseClock:
-    """Tells which claims are to be released, and how long nothing will be."""
+    """Decides which leases have ended, and when to check again."""
 
     def __init__(
         self, wall: Callable[[], datetime] = _wall, steady: Callable[[], float] = time.monotonic
     ) -> None:
         self._wall, self._steady = wall, steady
         self._last = (wall(), steady())
-        self._stepped: datetime | None = None
+        self._jumped_at: datetime | None = None
 
-    def ended(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
-        """Return the time and the claims whose lease is over, the first to end first.
+    def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
+        """Return the time and the claims whose lease has ended, the first to end first.
 
-        What of a demand has ended goes together, so none of it while some is granted more time.
+        The ended claims of one demand are released together: if one of them is granted more time,
+        none is returned.
         """
-        now = self._look()
+        now = self._read_clocks()
         ended = ledger.ended_claims(now)
-        granted = {claim.demand for claim in ended if not self._is_over(claim, now)}
+        granted = {claim.demand for claim in ended if not self._has_ended(claim, now)}
         return now, [claim for claim in ended if claim.demand not in granted]
 
-    def pause(self, ledger: Ledger, longest: float) -> float:
-        """Return the seconds until the next look is due: ``longest`` at most, one at least.
+    def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
+        """Return the seconds until the next check: at least one, at most ``longest``.
 
-        Not at once, for what is over and still there could not be released or is granted more.
+        Never zero: a lease that has ended and is still in the ledger could not be released, or was
+        granted more time.
         """
         end = ledger.next_lease_end()
         if end is None:
             return longest
-        return min(max((end - self._look()).total_seconds() + 0.01, _SHORTEST_S), longest)
+        return min(max((end - self._read_clocks()).total_seconds() + 0.01, _SHORTEST_S), longest)
 
-    def _look(self) -> datetime:
+    def _read_clocks(self) -> datetime:
         wall, steady = self._wall(), self._steady()
         expected = self._last[0] + timedelta(seconds=steady - self._last[1])
-        if wall - expected > _STEP:
-            step = (wall - expected).total_seconds()
-            log.warning("the clock went forward by %.0f s; every lease gets its full term", step)
-            self._stepped = wall
+        if wall - expected > _JUMP:
+            jump = (wall - expected).total_seconds()
+            log.warning("the clock went forward by %.0f s; every lease gets its full term", jump)
+            self._jumped_at = wall
         self._last = (wall, steady)
         return wall
 
-    def _is_over(self, claim: Claim, now: datetime) -> bool:
+    def _has_ended(self, claim: Claim, now: datetime) -> bool:
         if claim.lease is None:
             return False
-        if self._stepped is None:
+        if self._jumped_at is None:
             return True
         term = timedelta(seconds=claim.lease.seconds + claim.lease.slack)
-        return now > self._stepped + term
+        return now > self._jumped_at + term
 
 
-class Expiries:
-    """Hands in the releases of what ran out; nobody waits for their receipts."""
+class LeaseExpiry:
+    """Makes the demands that release what has ended."""
 
     def __init__(self) -> None:
         self._clock = LeaseClock()
         self._tried: dict[str, datetime] = {}
 
-    def pause(self, ledger: Ledger, longest: float) -> float:
-        """Return the seconds until the next look is due."""
-        return self._clock.pause(ledger, longest)
+    def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
+        """Return the seconds until the next check."""
+        return self._clock.seconds_until_due(ledger, longest)
 
     def tickets(self, ledger: Ledger) -> list[Ticket]:
-        """Return a ticket for each demand whose lease ran out.
+        """Return a ticket for each demand whose lease has ended.
 
-        One that cannot be released (its files do not render) is tried again after a while.
+        A demand that could not be released, because its files do not render, is tried again later.
         """
-        now, claims = self._clock.ended(ledger)
+        now, claims = self._clock.ended_claims(ledger)
         since = now - timedelta(seconds=LONGEST_WAIT_S)
-        over = dict.fromkeys(claim.demand for claim in claims)
-        tried = self._tried  # what is over no more was released or renewed
-        self._tried = {d: when for d, when in tried.items() if when > since and d in over}
-        demands = [demand for demand in over if demand not in self._tried]
+        ended = dict.fromkeys(claim.demand for claim in claims)
+        # forget what was released or renewed meanwhile
+        self._tried = {d: at for d, at in self._tried.items() if at > since and d in ended}
+        demands = [demand for demand in ended if demand not in self._tried]
         self._tried |= dict.fromkeys(demands, now)
         requests = [
             DemandRequest(id=demand, operation=Operation.EXPIRE, demand=demand)

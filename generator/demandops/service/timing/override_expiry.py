@@ -1,4 +1,4 @@
-"""Which overrides are over, and when to look again; one that could not be ended waits a while."""
+"""Which overrides have expired, and when to check again."""
 
 from __future__ import annotations
 
@@ -12,46 +12,53 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
-_AGAIN = timedelta(seconds=60)
+_RETRY = timedelta(seconds=60)
 _SHORTEST_S = 1.0
 
 
-class OverrideClock:
-    """Ends overrides at their time, each in a commit of its own."""
+class OverrideExpiry:
+    """Ends each expired override in a commit of its own."""
 
     def __init__(self) -> None:
         self._failed: dict[tuple[str, datetime], datetime] = {}
         self._not_before: datetime | None = None
 
-    def end(self, line: CommitBatch, now: datetime) -> None:
-        """Commit on a line that what is over has ended; what cannot be carried out stays."""
+    def end_due(self, line: CommitBatch, now: datetime) -> None:
+        """Commit the end of each expired override; one whose end fails is tried again later."""
         for override in expired_overrides(line.head.state.config, now):
             tried = self._failed.get((override.name, override.end or now))
-            if tried is not None and now < tried + _AGAIN:
+            if tried is not None and now < tried + _RETRY:
                 continue
             try:
                 line.end_override(override, now)
                 log.info("%s ended at its time, %s", override.path, override.expires)
             except InvalidInput as error:
                 self._failed[override.name, override.end or now] = now
-                for found in error.faults:
-                    log.error("%s cannot be ended: %s (trying again later)", override.path, found)
+                for problem in error.faults:
+                    log.error("%s cannot be ended: %s; trying again later", override.path, problem)
 
-    def put_off(self, now: datetime) -> None:
-        """Wait a while before anything is ended again: it could not be published."""
-        self._not_before = now + _AGAIN
+    def postpone(self, now: datetime) -> None:
+        """End no override for a while, because the commits could not be published."""
+        self._not_before = now + _RETRY
 
-    def anything(self, config: Config, now: datetime) -> bool:
-        """Tell whether an override is to be ended now."""
-        return any(self._when(one.name, one.end) <= now for one in config.in_force if one.end)
+    def is_due(self, config: Config, now: datetime) -> bool:
+        """Return whether an override is to be ended now."""
+        return any(time <= now for time in self._due_times(config))
 
-    def pause(self, config: Config, now: datetime, longest: float) -> float:
-        """Return the seconds until the next look is due: ``longest`` at most, one at least."""
-        ends = [self._when(one.name, one.end) for one in config.in_force if one.end]
-        wait = min((end - now).total_seconds() + 0.01 for end in ends) if ends else longest
+    def seconds_until_due(self, config: Config, now: datetime, longest: float) -> float:
+        """Return the seconds until the next check: at least one, at most ``longest``."""
+        times = self._due_times(config)
+        wait = (min(times) - now).total_seconds() + 0.01 if times else longest
         return min(max(wait, _SHORTEST_S), longest)
 
-    def _when(self, name: str, end: datetime) -> datetime:
+    def _due_times(self, config: Config) -> list[datetime]:
+        return [
+            self._due_time(override.name, override.end)
+            for override in config.in_force
+            if override.end
+        ]
+
+    def _due_time(self, name: str, end: datetime) -> datetime:
         tried = self._failed.get((name, end))
-        again = tried + _AGAIN if tried is not None else end
-        return max(again, self._not_before) if self._not_before else again
+        due_time = tried + _RETRY if tried is not None else end
+        return max(due_time, self._not_before) if self._not_before else due_time

@@ -1,36 +1,30 @@
-"""When to look whether others changed the state repo, and what is known of reaching it.
+"""When to fetch from the state repo while no demand comes.
 
-Pure but for the clock that it is given. Knows nothing of Git: told of each look, it says when the
-next is due, and logs once that the remote went away and once that it is back.
+Knows no Git: it is given a clock, and its user reports the end of each fetch.
 """
 
 from __future__ import annotations
 
-import logging
 import random
 import re
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 
 from demandops.config.policy import seconds_of
-
-log = logging.getLogger("demandops")
 
 DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
 _SHORTEST_GAP_S = 0.5
 _EMBEDDED_S = 1.0
-"""A repository on this disk is looked at this often at least: it is one file that is read."""
+"""The longest interval for a repository on this disk, where a check reads one file."""
 
 
-def interval_s(text: str) -> float:
+def parse_interval(text: str) -> float:
     """Return the seconds of a fetch interval: a duration like ``30s``, or seconds; 0: never.
 
     Raises:
-        ValueError: where it is none.
+        ValueError: if it is neither.
     """
     if re.fullmatch(r"[0-9]{1,8}(\.[0-9]{1,6})?", text):
         return float(text)
@@ -38,14 +32,14 @@ def interval_s(text: str) -> float:
 
 
 def _jittered(interval: float) -> float:
-    """Return a little less than the interval: a change is to be seen within it."""
-    return interval * random.uniform(0.8, 1.0)  # noqa: S311 - no secret
+    """Return a little less than the interval, so that a change is seen within it."""
+    return interval * random.uniform(0.8, 1.0)  # noqa: S311 - not for security
 
 
 class PollTimer:
-    """The times of the looks: at an interval, seldomer while the remote is away, and when told.
+    """The times of the fetches: on request and at an interval that grows while fetches fail.
 
-    ``nudge`` may be called from any thread, the rest belongs to one.
+    Any thread may call :meth:`request`; everything else belongs to one thread.
     """
 
     def __init__(
@@ -56,106 +50,47 @@ class PollTimer:
         steady: Callable[[], float] = time.monotonic,
         jittered: Callable[[float], float] = _jittered,
     ) -> None:
-        """Begin; the first look is due at once.
+        """Start the timer; the first fetch is due at once.
 
         Args:
-            interval: seconds between two looks; 0: only those that :meth:`nudge` asks for.
-            embedded: whether a look costs next to nothing.
-            steady: gives the time in seconds.
-            jittered: shortens a pause by chance, so that generators do not all look at once.
+            interval: seconds between two fetches; 0: only on :meth:`request`.
+            embedded: whether the repository is on this disk.
+            steady: returns the time in seconds.
+            jittered: shortens a pause at random, so that generators do not fetch all at once.
         """
         self._interval = min(interval, _EMBEDDED_S) if embedded else interval
         self._steady, self._jittered = steady, jittered
         self._pause = self._interval
         self._last = -_SHORTEST_GAP_S + steady()
         self._next = steady() if interval else None
-        self._nudged = threading.Event()
+        self._requested = threading.Event()
 
-    def nudge(self) -> None:
-        """Have a look taken at once; however often it is asked for meanwhile, it is one."""
-        self._nudged.set()
+    def request(self) -> None:
+        """Make a fetch due now; requests before it starts lead to one fetch."""
+        self._requested.set()
 
-    def pause(self) -> float | None:
-        """Return the seconds until the next look is due; nothing: none is."""
+    def seconds_until_due(self) -> float | None:
+        """Return the seconds until the next fetch, or None if none is planned."""
         times = [] if self._next is None else [self._next]
-        if self._nudged.is_set():
+        if self._requested.is_set():
             times.append(self._last + _SHORTEST_GAP_S)
         return max(min(times) - self._steady(), 0.0) if times else None
 
-    def begin(self) -> bool:
-        """Tell whether a look is due; what is asked for from now on is another one."""
-        due = self.pause() == 0.0
+    def start_if_due(self) -> bool:
+        """Return whether a fetch is due; a request from now on leads to another fetch."""
+        due = self.seconds_until_due() == 0.0
         if due:
-            self._nudged.clear()
+            self._requested.clear()
         return due
 
-    def done(self, *, reached: bool) -> None:
-        """Note that the state repo was asked for what is new, here or by a push."""
+    def finished(self, *, reached: bool) -> None:
+        """Plan the next fetch after a fetch or a push, which shows what is new as well."""
         longest = max(_LONGEST_BACKOFF_S, self._interval)
         self._last = self._steady()
         if self._next is not None:
             self._pause = self._interval if reached else min(self._pause * 2, longest)
             self._next = self._last + self._jittered(self._pause)
 
-    def again(self) -> None:
-        """Note that a look was cut short: it is still due."""
-        self._nudged.set()
-
-
-@dataclass(frozen=True, slots=True)
-class Contact:
-    """What is known of reaching the state repo.
-
-    ``trouble`` is why it cannot be read or written at the moment, since ``since``; ``denied`` why
-    it took the last push not; ``pushed`` is when something was last published from here.
-    """
-
-    trouble: str = ""
-    denied: str = ""
-    since: datetime | None = None
-    reached: datetime | None = None
-    pushed: datetime | None = None
-
-
-class Link:
-    """Whether the state repo can be reached; ``contact`` may be read from any thread."""
-
-    def __init__(self, address: str) -> None:
-        self._address = address
-        self.contact = Contact()
-
-    @property
-    def is_away(self) -> bool:
-        """Whether the last that was heard is that it cannot be reached."""
-        return bool(self.contact.trouble)
-
-    def lost(self, reason: str) -> None:
-        """Note that it cannot be reached or takes nothing; logged when it could before."""
-        if not self.is_away:
-            log.warning("%s; trying again until it is back", reason)
-            self.contact = replace(self.contact, since=_now())
-        else:
-            log.debug("%s", reason)
-        self.contact = replace(self.contact, trouble=reason)
-
-    def reached(self, *, pushed: bool = False) -> None:
-        """Note that it was reached; logged when it was away before."""
-        now = _now()
-        before = self.contact
-        if before.trouble:
-            away = (now - (before.since or now)).total_seconds()
-            log.info("%s is back after %.0f s", self._address, away)
-        self.contact = Contact(
-            denied="" if pushed else before.denied,
-            reached=now,
-            pushed=now if pushed else before.pushed,
-        )
-
-    def denied(self, reason: str) -> None:
-        """Note that it was reached and took no push; whoever waited for it is told."""
-        self.reached()
-        self.contact = replace(self.contact, denied=reason)
-
-
-def _now() -> datetime:
-    return datetime.now(timezone.utc)
+    def interrupted(self) -> None:
+        """Keep the fetch due, because it was cut short."""
+        self._requested.set()

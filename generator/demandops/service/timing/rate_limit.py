@@ -1,6 +1,6 @@
 """How many demands a requester may send in a minute, by the quotas of the access domains.
 
-Counted here, by what this generator received: each hand-in once, however often it is judged.
+Counts the demands that this generator received, each once however often it is evaluated.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _WINDOW = timedelta(minutes=1)
 
 
 class RateLimit:
-    """Remembers the last minute of each requester that has a limit."""
+    """The last minute of each requester that has a limit."""
 
     def __init__(self) -> None:
         self._seen: dict[tuple[str, str], deque[tuple[datetime, str]]] = {}
@@ -25,7 +25,7 @@ class RateLimit:
     def faults(
         self, request: DemandRequest, config: Config, operation: str, received: datetime
     ) -> Iterator[Fault]:
-        """Count a hand-in and yield every quota that it goes beyond; giving up is not limited."""
+        """Count a demand and yield a fault for each quota it exceeds; releases are not limited."""
         if not request.operation.asks:
             return
         nodes = [app.node for app in request.applications]
@@ -34,7 +34,7 @@ class RateLimit:
         for domain in domains.values():
             most = domain.quotas.demands_per_minute
             for requester in request.requesters() if most else ():
-                if self._counted((domain.name, requester), operation, received) > (most or 0):
+                if self._count((domain.name, requester), operation, received) > (most or 0):
                     message = (
                         f"'{requester}' sent more than the {most} demands in a minute that "
                         f"quotas.demandsPerMinute of access domain '{domain.name}' allows; send "
@@ -42,20 +42,21 @@ class RateLimit:
                     )
                     yield fault("", message, code="quota")
 
-    def _counted(self, key: tuple[str, str], operation: str, received: datetime) -> int:
-        self._forget(received)
+    def _count(self, key: tuple[str, str], operation: str, received: datetime) -> int:
+        """Return how many demands were received in the minute up to this one."""
+        self._forget_idle(received)
         seen = self._seen.pop(key, None) or deque()
-        self._seen[key] = seen  # the one that sent last stands last
+        self._seen[key] = seen  # at the end: ordered by who sent last
         while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
             seen.popleft()
-        places = [known for _, known in seen]
-        if operation in places:
-            return places.index(operation) + 1
+        operations = [known for _, known in seen]
+        if operation in operations:
+            return operations.index(operation) + 1
         seen.append((received, operation))
         return len(seen)
 
-    def _forget(self, now: datetime) -> None:
-        """Drop the requesters that have sent nothing for a minute: vehicles come and go."""
+    def _forget_idle(self, now: datetime) -> None:
+        """Forget requesters that sent nothing for a minute, because vehicles come and go."""
         while self._seen:
             key = next(iter(self._seen))
             if self._seen[key] and abs(now - self._seen[key][-1][0]) <= _WINDOW:

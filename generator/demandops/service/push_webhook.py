@@ -1,8 +1,7 @@
-"""The inbound webhook: a Git server tells of a push, and the generator looks at once.
+"""The inbound webhook: a Git server reports a push, and the generator fetches at once.
 
-It stands beside the worker and knows only whom to call. What comes is untrusted: nothing of a
-notification is read but whether its sender knows the secret, and all of it is bounded: size, time,
-and how many are heard at once. An HTTP server of the standard library is enough for that.
+Notifications are untrusted. The server only checks whether the sender knows the secret, and it
+bounds the size, the time and the number of open connections.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ log = logging.getLogger("demandops")
 
 PATH = "/push"
 _MAX_BODY = 25 << 20
-"""GitHub sends no more than this; a body is only hashed, never kept."""
+"""GitHub sends no more than this; a body is hashed and not stored."""
 _CHUNK = 1 << 16
 _TIMEOUT_S = 10.0
 _AT_ONCE = 16
@@ -37,10 +36,10 @@ _TOKEN = "X-Gitlab-Token"  # noqa: S105 - a header's name
 
 
 def read_secret(path: Path) -> bytes:
-    """Return the secret of a file, without the line's end.
+    """Return the secret in a file, without surrounding white space.
 
     Raises:
-        InvalidInput: where there is none.
+        InvalidInput: if the file cannot be read or is empty.
     """
     try:
         secret = path.read_bytes().strip()
@@ -53,32 +52,32 @@ def read_secret(path: Path) -> bytes:
     return secret
 
 
-class Webhook:
-    """A server that hears of pushes; it runs from the beginning to :meth:`close`."""
+class PushWebhook:
+    """An HTTP server for notifications; it runs until :meth:`close`."""
 
     def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:
-        """Listen.
+        """Start the server.
 
         Args:
-            address: ``host:port``; port 0 takes any that is free.
-            secret: what notifications are signed with; empty: they are not, which only this
-                machine may do.
-            on_push: called for each notification, from a thread of its own; must return at once.
+            address: ``host:port``; port 0 picks a free port.
+            secret: the key that signs notifications; empty: unsigned ones are accepted, which is
+                allowed only on a loopback address.
+            on_push: called for each notification, in a thread of its own; must return at once.
 
         Raises:
-            InvalidInput: where it cannot listen there, or must not.
+            InvalidInput: if it cannot or must not listen on the address.
         """
         host, port = _parsed(address)
         family, bound = _resolved(host, port, address)
         if not secret and not ipaddress.ip_address(bound[0].partition("%")[0]).is_loopback:
-            raise _unfit(
+            raise _invalid(
                 f"'{address}' can be reached from other machines, so notifications must be "
                 "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1"
             )
         try:
             self._server = _Server(family, bound, secret, on_push)
         except OSError as error:
-            raise _unfit(
+            raise _invalid(
                 f"'{address}' cannot be listened on: {error.strerror}; choose another port"
             ) from None
         name, number = self._server.server_address[:2]
@@ -89,35 +88,35 @@ class Webhook:
         self._thread.start()
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
 
 
-def _unfit(message: str) -> InvalidInput:
+def _invalid(message: str) -> InvalidInput:
     return InvalidInput([fault("--webhook", message)])
 
 
 def _parsed(address: str) -> tuple[str, int]:
     host, colon, port = address.rpartition(":")
     if not colon or not host or not (port.isascii() and port.isdigit()) or int(port) > 0xFFFF:
-        raise _unfit(f"'{address}' is no address to listen on; write one like 127.0.0.1:8090")
+        raise _invalid(f"'{address}' is not an address to listen on; write one like 127.0.0.1:8090")
     return host.removeprefix("[").removesuffix("]"), int(port)
 
 
 def _resolved(host: str, port: int, address: str) -> tuple[socket.AddressFamily, Any]:
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError):
-        raise _unfit(
-            f"'{address}': the host '{host}' is not known here; write an address of this machine"
+        raise _invalid(
+            f"'{address}': host '{host}' cannot be resolved; write an address of this machine"
         ) from None
-    return found[0][0], found[0][4]
+    return addresses[0][0], addresses[0][4]
 
 
 class _Server(ThreadingHTTPServer):
-    """A server that hears only so many at once and none for long."""
+    """A server with a bounded number of connections and a time limit for each."""
 
     daemon_threads = True
     block_on_close = False
@@ -136,14 +135,14 @@ class _Server(ThreadingHTTPServer):
         super().__init__(bound, _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Hear a connection in a thread of its own, where there is room for one."""
+        """Handle a connection in a thread of its own, or close it if there are too many."""
         if not self._room.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Hear it, and cut it off when its time is over: a sender may send a byte a second."""
+        """Handle a connection and cut it off at the time limit: a sender may be very slow."""
         timer = threading.Timer(_TIMEOUT_S, _cut, (request,))
         timer.daemon = True
         timer.start()
@@ -154,11 +153,11 @@ class _Server(ThreadingHTTPServer):
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Say nothing of senders that go away in between."""
-        log.debug("a webhook's connection ended early", exc_info=True)
+        """Log a broken connection at debug level only."""
+        log.debug("a connection of the webhook ended early", exc_info=True)
 
     def warn(self, text: str) -> None:
-        """Log a warning, but seldom: anybody may send rubbish as often as they like."""
+        """Log a warning at most once a minute, because anyone may send requests."""
         if time.monotonic() - self._warned > _WARN_EVERY_S:
             self._warned = time.monotonic()
             log.warning("%s", text)
@@ -170,56 +169,56 @@ def _cut(connection: socket.socket) -> None:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One request; every answer ends the connection."""
+    """Handles one request; every answer closes the connection."""
 
     server: _Server
     server_version, sys_version = "demandops", ""
     timeout = _TIMEOUT_S
 
     def do_GET(self) -> None:
-        """Say that the server is there."""
+        """Answer ``/`` with ok, so that the server can be checked."""
         if self.path == "/":
             self._answer(200, "ok")
         elif self.path == PATH:
             self._answer(405, "notifications are sent by POST")
         else:
-            self._answer(404, "nothing is here")
+            self._answer(404, "not found")
 
     do_HEAD = do_GET
 
     def do_POST(self) -> None:
-        """Hear of a push."""
+        """Check a notification and report the push."""
         if self.path != PATH:
             self._answer(404, f"notifications go to {PATH}")
             return
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit()):
-            self._answer(411, "say how long it is")
+            self._answer(411, "Content-Length is missing")
         elif len(length) > len(str(_MAX_BODY)) or int(length) > _MAX_BODY:
-            self._answer(413, "it is too long")
+            self._answer(413, "the body is too long")
         elif not self._is_genuine(int(length)):
             self.server.warn(
                 f"a notification from {self.client_address[0]} was not signed with the webhook's "
-                "secret; it is the same here and at the Git server?"
+                "secret; is it the same here and at the Git server?"
             )
             self._answer(403, "not signed with the secret")
         else:
             self.server.on_push()
-            self._answer(202, "looking")
+            self._answer(202, "fetching")
 
     def _is_genuine(self, length: int) -> bool:
-        """Read the body, and tell whether its sender knows the secret."""
-        made = hmac.new(self.server.secret, digestmod=hashlib.sha256)
+        """Read the body and return whether its sender knows the secret."""
+        digest = hmac.new(self.server.secret, digestmod=hashlib.sha256)
         while length > 0:
             chunk = self.rfile.read(min(length, _CHUNK))
             if not chunk:
                 return False
-            made.update(chunk)
+            digest.update(chunk)
             length -= len(chunk)
         if not self.server.secret:
             return True
-        told = [self.headers.get(name, "").removeprefix("sha256=") for name in _SIGNATURES]
-        signed = [hmac.compare_digest(_bytes(one), made.hexdigest().encode()) for one in told]
+        signatures = [self.headers.get(name, "").removeprefix("sha256=") for name in _SIGNATURES]
+        signed = [hmac.compare_digest(_bytes(s), digest.hexdigest().encode()) for s in signatures]
         token = hmac.compare_digest(_bytes(self.headers.get(_TOKEN, "")), self.server.secret)
         return any(signed) or token
 
@@ -234,7 +233,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing of what came: headers hold secrets, and a path is anybody's text."""
+        """Log nothing of a request: headers hold secrets, and anyone may write the path."""
 
 
 def _bytes(text: str) -> bytes:

@@ -1,0 +1,84 @@
+"""Whether the remote can be reached and the state repo is valid, for logs and diagnostics."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+
+from demandops.errors import Fault
+
+log = logging.getLogger("demandops")
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteStatus:
+    """Whether the remote can be reached.
+
+    ``unreachable`` is why the remote cannot be read or written now, or empty; ``push_denied`` is
+    why it rejected the last push, or empty.
+    """
+
+    unreachable: str = ""
+    push_denied: str = ""
+    unreachable_since: datetime | None = None
+    last_reached: datetime | None = None
+    last_push: datetime | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StateRepoStatus:
+    """The status of the state repo.
+
+    ``problems`` are the faults in its files, ``unpublished`` the number of demands in the journal
+    that do not await approval, ``commit`` the newest commit that the generator has read.
+    """
+
+    remote: RemoteStatus
+    problems: tuple[Fault, ...]
+    unpublished: int
+    commit: str
+
+
+class RemoteMonitor:
+    """Records and logs whether the remote can be reached; any thread may read ``status``."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self.status = RemoteStatus()
+
+    @property
+    def is_unreachable(self) -> bool:
+        """Whether the last attempt to reach the remote failed."""
+        return bool(self.status.unreachable)
+
+    def record_unreachable(self, reason: str) -> None:
+        """Record that the remote cannot be reached; warn if it could be before."""
+        if not self.is_unreachable:
+            log.warning("%s; trying again until it is back", reason)
+            self.status = replace(self.status, unreachable_since=_now())
+        else:
+            log.debug("%s", reason)
+        self.status = replace(self.status, unreachable=reason)
+
+    def record_reached(self, *, pushed: bool = False) -> None:
+        """Record that the remote was reached; log it if it could not be before."""
+        now = _now()
+        before = self.status
+        if before.unreachable:
+            away = (now - (before.unreachable_since or now)).total_seconds()
+            log.info("%s is back after %.0f s", self._address, away)
+        self.status = RemoteStatus(
+            push_denied="" if pushed else before.push_denied,
+            last_reached=now,
+            last_push=now if pushed else before.last_push,
+        )
+
+    def record_push_denied(self, reason: str) -> None:
+        """Record that the remote was reached and rejected a push."""
+        self.record_reached()
+        self.status = replace(self.status, push_denied=reason)
+
+
+def _now() -> datetime:
+    return datetime.now(timezone.utc)

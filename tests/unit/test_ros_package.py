@@ -1,0 +1,33 @@
+"""What ``import demandops_ros`` gives, and what it leaves for later."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import demandops_ros
+import pytest
+
+IMPORT = """
+import sys
+import demandops_ros
+assert "rclpy" not in sys.modules, "the import alone loads rclpy"
+from demandops_ros import DemandClient
+assert DemandClient.__module__ == "demandops_ros.client"
+assert "rclpy" in sys.modules
+"""
+
+
+def test_only_using_the_client_imports_rclpy() -> None:
+    subprocess.run([sys.executable, "-c", IMPORT], check=True, timeout=60)
+
+
+def test_every_public_name_can_be_imported() -> None:
+    assert set(demandops_ros.__all__) <= set(dir(demandops_ros))
+    for name in demandops_ros.__all__:
+        assert hasattr(demandops_ros, name)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="module 'demandops_ros' has no attribute 'Client'"):
+        demandops_ros.Client  # noqa: B018
