@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pygit2
 
-from demandops import __version__, strict_yaml
+from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE
@@ -24,7 +24,7 @@ from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import commit_message
 
 PIPELINES = (".github/workflows/demandops.yml", ".gitlab-ci.yml")
-"""What checks pull requests on GitHub and GitLab, by the version that laid the repo down."""
+"""The pipelines that check pull requests, on GitHub and GitLab."""
 
 
 def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
@@ -40,8 +40,6 @@ def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
     if url:
         root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {strict_yaml.scalar(url)}", root)
     found[ROOT_FILE] = root
-    for path in PIPELINES:
-        found[path] = re.sub(r"demandops==\S+", f"demandops=={__version__}", found[path])
     config = load({p: text for p, text in found.items() if p.split("/")[0] in CONFIG_ROOTS})
     return found | rendered(State.of(config, Ledger()))
 
