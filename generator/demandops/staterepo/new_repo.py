@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pygit2
 
-from demandops import __version__, strict_yaml
+from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE
@@ -24,7 +24,7 @@ from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import commit_message
 
 PIPELINES = (".github/workflows/demandops.yml", ".gitlab-ci.yml")
-"""Pipelines that check pull requests on GitHub and GitLab with this program's version."""
+"""The pipelines that check pull requests, on GitHub and GitLab."""
 
 
 def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
@@ -40,8 +40,6 @@ def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
     if url:
         root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {strict_yaml.scalar(url)}", root)
     contents[ROOT_FILE] = root
-    for path in PIPELINES:
-        contents[path] = re.sub(r"demandops==\S+", f"demandops=={__version__}", contents[path])
     config = load({p: text for p, text in contents.items() if p.split("/")[0] in CONFIG_ROOTS})
     return contents | rendered_files(State.of(config, Ledger()))
 

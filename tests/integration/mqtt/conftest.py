@@ -28,7 +28,7 @@ DEADLINE_S = 20.0
 
 def _program(name: str) -> str:
     found = shutil.which(name) or shutil.which(name, path="/usr/sbin:/usr/local/sbin")
-    assert found, f"{name} is missing; .ci/run installs it (Debian: apt-get install mosquitto)"
+    assert found, f"{name} is missing; run `setup/system test` as root to install it"
     return found
 
 
