@@ -88,13 +88,13 @@ def fault(field: str, message: str, *, code: str = "invalid") -> Fault:
     return Fault(code=code, field=field, message=message)
 
 
-def shown(value: str, most: int = 80) -> str:
+def quoted(value: str, most: int = 80) -> str:
     """Return what somebody wrote, in quotes, for a message: of one line, short, without tricks."""
     text = value if value.isprintable() else value.encode("unicode_escape").decode()
     return f"'{text if len(text) <= most else text[: most - 1] + '…'}'"
 
 
-def near(word: str, known: Iterable[str], *, most: int = 8) -> str:
+def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
     """Return ``; did you mean 'x'?``, or what is known where nothing comes near, or nothing."""
     names = sorted(known)
     close = get_close_matches(word, names, n=1)
@@ -102,5 +102,5 @@ def near(word: str, known: Iterable[str], *, most: int = 8) -> str:
         return f"; did you mean '{close[0]}'?"
     if not names:
         return ""
-    shown = ", ".join(names[:most]) + (", …" if len(names) > most else "")
-    return f"; known: {shown}"
+    listed = ", ".join(names[:most]) + (", …" if len(names) > most else "")
+    return f"; known: {listed}"

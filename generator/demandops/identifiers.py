@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 
-from demandops.errors import shown
+from demandops.errors import quoted
 
 MAX_ID = 1024
 """Characters that an id may have; file and object names are shortened and hashed anyway."""
@@ -19,7 +19,7 @@ _UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
 _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
-def absolute(topic: str) -> str:
+def absolute_topic(topic: str) -> str:
     """Return a topic name as ROS resolves it in the root namespace: ``scan`` is ``/scan``."""
     return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
 
@@ -35,13 +35,13 @@ def id_problem(value: str) -> str:
     if len(value) > MAX_ID:
         return f"has {len(value)} characters; at most {MAX_ID} are taken"
     if ".." in value:
-        return f"{shown(value)} holds '..'; choose an id without it"
+        return f"{quoted(value)} holds '..'; choose an id without it"
     if value != value.strip():
-        return f"{shown(value)} starts or ends with white space; take it away"
+        return f"{quoted(value)} starts or ends with white space; take it away"
     for char in value:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return (
-                f"{shown(value)} holds the control character U+{ord(char):04X}; "
+                f"{quoted(value)} holds the control character U+{ord(char):04X}; "
                 "choose an id without it"
             )
     return ""
@@ -52,10 +52,10 @@ def topic_problem(name: str) -> str:
     if not name:
         return "is empty; give a topic name"
     if name.startswith("~"):
-        return f"{shown(name)} is private to a node; give the full name, starting with '/'"
+        return f"{quoted(name)} is private to a node; give the full name, starting with '/'"
     if not _TOPIC.fullmatch(name):
         return (
-            f"{shown(name)} is not a topic name that ROS 2 allows; use letters, digits and '_' "
+            f"{quoted(name)} is not a topic name that ROS 2 allows; use letters, digits and '_' "
             "between single '/', no part starting with a digit"
         )
     if len(name) > MAX_TOPIC:
@@ -67,4 +67,4 @@ def message_type_problem(name: str) -> str:
     """Return why a name is no ROS 2 message type with its package, or nothing."""
     if _MESSAGE_TYPE.fullmatch(name):
         return ""
-    return f"{shown(name)} is no message type; write it like std_msgs/msg/String"
+    return f"{quoted(name)} is no message type; write it like std_msgs/msg/String"

@@ -49,7 +49,7 @@ def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:  # noqa: AN
             raise yaml.constructor.ConstructorError(
                 None,
                 None,
-                f"the key {brief(key)} must be text; put it in quotes",
+                f"the key {short_repr(key)} must be text; put it in quotes",
                 key_node.start_mark,
             )
         if key in seen:
@@ -96,7 +96,7 @@ def _readable_block(text: str) -> bool:
 _PlainDumper.add_representer(str, _text)
 
 
-def brief(value: object) -> str:
+def short_repr(value: object) -> str:
     """Return a value for a message, whatever it is."""
     try:
         text = repr(value)
@@ -170,7 +170,7 @@ def dump(data: Mapping[str, Any]) -> str:
     )
 
 
-def edited(text: str, key: str, value: object) -> str:
+def set_key(text: str, key: str, value: object) -> str:
     """Return a file with one top-level key set; all else stays, comments included.
 
     A key that holds one plain value has it replaced where it stands; one that is missing is added
@@ -195,12 +195,12 @@ def edited(text: str, key: str, value: object) -> str:
         done = False
     if not done:
         raise InvalidInput(
-            [fault(key, f"cannot be set by the program; write {brief(value)} there")]
+            [fault(key, f"cannot be set by the program; write {short_repr(value)} there")]
         )
     return changed
 
 
-def scalar(value: object) -> str:
+def to_json(value: object) -> str:
     """Return ``value`` as JSON that is also YAML: what a template's ``{{ … }}`` writes.
 
     Characters that YAML does not print are written as ``\\uXXXX``; others stay readable.

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StringConstraints, model_validator
 
 from demandops.config.file_model import Approval, DnsLabel, FileModel, Frozen, Word
-from demandops.errors import near
+from demandops.errors import suggestion
 
 TopicPattern = Annotated[
     str,
@@ -114,19 +114,20 @@ class ApplicationDefinition(FileModel):
             if service.each and service.each not in self.inputs:
                 problems.append(
                     f"services.{name}.each: '{service.each}' is not an input"
-                    + near(service.each, self.inputs)
+                    + suggestion(service.each, self.inputs)
                 )
             sources = self.sources()
             problems += [
                 f"services.{name}.inputs.{role}: '{source}' is neither an input nor an output of "
-                "a service that runs for each topic" + near(source, sources)
+                "a service that runs for each topic" + suggestion(source, sources)
                 for role, source in service.inputs.items()
                 if source not in sources
             ]
         for role in (self.deployment_request.inputs if self.deployment_request else {}).values():
             if role not in self.inputs:
                 problems.append(
-                    f"deploymentRequest.inputs: '{role}' is not an input" + near(role, self.inputs)
+                    f"deploymentRequest.inputs: '{role}' is not an input"
+                    + suggestion(role, self.inputs)
                 )
         if problems:
             raise ValueError("; ".join(problems))

@@ -22,7 +22,7 @@ from demandops.config.override import Override
 from demandops.config.override_conflict import check_override_conflicts
 from demandops.config.policy import matches
 from demandops.config.registry import ChartSource
-from demandops.errors import InvalidInput, near
+from demandops.errors import InvalidInput, suggestion
 
 _CONNECTION_PREFIXES = ("mqtt", "zenoh", "ros")
 
@@ -52,7 +52,7 @@ def _check_inventory(config: Config, reading: ItemReader) -> None:
                 NODES_FILE,
                 f"nodes[{reading.place(NODES_FILE, node.id)}].cluster",
                 f"'{node.cluster}' is not in clusters.yaml"
-                + near(node.cluster, reading.names(CLUSTERS_FILE)),
+                + suggestion(node.cluster, reading.names(CLUSTERS_FILE)),
             )
     for broker in config.brokers.values():
         if reading.lacks(NODES_FILE, broker.node):
@@ -60,7 +60,7 @@ def _check_inventory(config: Config, reading: ItemReader) -> None:
                 BROKERS_FILE,
                 f"brokers[{reading.place(BROKERS_FILE, broker.node)}].node",
                 f"'{broker.node}' is not in nodes.yaml"
-                + near(broker.node, reading.names(NODES_FILE)),
+                + suggestion(broker.node, reading.names(NODES_FILE)),
             )
 
 
@@ -72,7 +72,7 @@ def _check_topics(config: Config, reading: ItemReader) -> None:
                 reading.tell(
                     NODES_FILE,
                     f"nodes[{reading.place(NODES_FILE, node.id)}].topics.{role}",
-                    f"'{role}' is an input of no application" + near(role, roles),
+                    f"'{role}' is an input of no application" + suggestion(role, roles),
                 )
 
 
@@ -137,13 +137,13 @@ def _check_services(config: Config, reading: ItemReader) -> None:
         for name, service in appdef.services.items():
             where = f"services.{name}"
             if reading.lacks(CHARTS_FILE, service.chart):
-                known = near(service.chart, reading.names(CHARTS_FILE))
+                known = suggestion(service.chart, reading.names(CHARTS_FILE))
                 reading.tell(
                     file, f"{where}.chart", f"'{service.chart}' is not in {CHARTS_FILE}{known}"
                 )
             for image in service.images:
                 if reading.lacks(IMAGES_FILE, image):
-                    known = near(image, reading.names(IMAGES_FILE))
+                    known = suggestion(image, reading.names(IMAGES_FILE))
                     reading.tell(
                         file, f"{where}.images", f"'{image}' is not in {IMAGES_FILE}{known}"
                     )
@@ -185,7 +185,7 @@ def _check_links(config: Config, reading: ItemReader) -> None:
         where = f"nodes[{reading.place(NODES_FILE, node.id)}]"
         for peer in node.bridged:
             if reading.lacks(NODES_FILE, peer):
-                known = near(peer, reading.names(NODES_FILE))
+                known = suggestion(peer, reading.names(NODES_FILE))
                 message = f"'{peer}' is not in nodes.yaml{known}"
                 reading.tell(NODES_FILE, f"{where}.bridged.{peer}", message)
         if node.zenoh is None:
@@ -220,12 +220,12 @@ def _check_overrides(config: Config, reading: ItemReader) -> None:
     for override in config.overrides.values():
         for image in override.images or ():
             if reading.lacks(IMAGES_FILE, image):
-                known = near(image, reading.names(IMAGES_FILE))
+                known = suggestion(image, reading.names(IMAGES_FILE))
                 message = f"'{image}' is not in {IMAGES_FILE}{known}"
                 reading.tell(override.path, f"images.{image}", message)
         node = override.node
         if node is not None and reading.lacks(NODES_FILE, node):
-            known = near(node, reading.names(NODES_FILE))
+            known = suggestion(node, reading.names(NODES_FILE))
             reading.tell(override.path, "node", f"'{node}' is not in nodes.yaml{known}")
         elif node is not None and not reading.lacks(NODES_FILE, node):
             _check_moved_to(node, override, config, reading)
@@ -235,7 +235,7 @@ def _check_overrides(config: Config, reading: ItemReader) -> None:
                 override.path,
                 "version",
                 f"'{override.version}' is no version or channel in {CHARTS_FILE} of a chart that "
-                f"is selected{near(override.version, versions)}",
+                f"is selected{suggestion(override.version, versions)}",
             )
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
 
 from demandops import strict_yaml
-from demandops.errors import Fault, InvalidInput, fault, near
+from demandops.errors import Fault, InvalidInput, fault, suggestion
 from demandops.settings import API_VERSION
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -78,12 +78,12 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
         name = str(item["loc"][-1])
         known = _fields(model) if len(item["loc"]) == 1 else []
         return "is not a field here; remove it or mend its spelling" + (
-            near(name, known) if known else ""
+            suggestion(name, known) if known else ""
         )
     if kind == "string_type" and isinstance(value, int | float):
-        return f"must be text, not {strict_yaml.brief(value)}; put it in quotes"
+        return f"must be text, not {strict_yaml.short_repr(value)}; put it in quotes"
     if kind == "literal_error":
-        return f"is {strict_yaml.brief(value)}, but must be {item['ctx']['expected']}"
+        return f"is {strict_yaml.short_repr(value)}, but must be {item['ctx']['expected']}"
     if kind == "string_pattern_mismatch":
         return (
             f"{value!r} is not a name that can be used here; it must match {item['ctx']['pattern']}"
@@ -93,7 +93,7 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
     if kind == "string_too_short":
         return "is empty; fill it in"
     expected = _EXPECTED.get(kind) or f"{item['msg'][:1].lower()}{item['msg'][1:]}"
-    return f"{expected}, not {strict_yaml.brief(value)}"
+    return f"{expected}, not {strict_yaml.short_repr(value)}"
 
 
 def _fields(model: type[BaseModel]) -> list[str]:

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, Field, StringConstraints, model_validator
 from demandops.config.file_model import DnsLabel, FileModel, Frozen
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.config.registry import Image
-from demandops.errors import shown
+from demandops.errors import quoted
 from demandops.identifiers import id_problem
 
 OVERRIDES_ROOT = "overrides"
@@ -48,7 +48,7 @@ def moment_of(text: str) -> datetime:
         return moment.astimezone(timezone.utc)
     except (ValueError, OverflowError):
         raise ValueError(
-            f"{shown(text)} is no time with a time zone; write one like 2026-01-31T12:00:00Z"
+            f"{quoted(text)} is no time with a time zone; write one like 2026-01-31T12:00:00Z"
         ) from None
 
 
@@ -67,7 +67,7 @@ def _one_line(text: str) -> str:
     if not text.strip() or text != text.strip():
         raise ValueError("is empty or starts or ends with white space; write one line of text")
     if not text.isprintable():
-        raise ValueError(f"{shown(text)} is more than one line of plain text; make it one")
+        raise ValueError(f"{quoted(text)} is more than one line of plain text; make it one")
     return text
 
 

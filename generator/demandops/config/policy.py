@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from demandops.config.file_model import Approval, DnsLabel, FileModel, Frozen
-from demandops.errors import shown
+from demandops.errors import quoted
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
 _UNITS_S = (86_400, 3_600, 60, 1)
@@ -28,7 +28,7 @@ def seconds_of(text: str) -> int:
     """
     match = _DURATION.fullmatch(text)
     if not text or match is None:
-        raise ValueError(f"{shown(text)} is no duration; write one like 90s, 10m, 1h30m or 2d")
+        raise ValueError(f"{quoted(text)} is no duration; write one like 90s, 10m, 1h30m or 2d")
     seconds = sum(int(part) * unit for part, unit in zip(match.groups("0"), _UNITS_S, strict=True))
     if seconds > _YEAR_S:
         raise ValueError(f"'{text}' is longer than a year; choose a shorter duration")

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from demandops.config.file_model import DnsLabel, FileModel, Frozen
-from demandops.errors import shown
+from demandops.errors import quoted
 
 ROOT_FILE = "demandops.yaml"
 
@@ -45,7 +45,7 @@ _WEB_URL = re.compile(
 def _web_url(text: str) -> str:
     if not _WEB_URL.fullmatch(text):
         raise ValueError(
-            f"{shown(text)} is no address that a token is sent to; write https://HOST/PATH, "
+            f"{quoted(text)} is no address that a token is sent to; write https://HOST/PATH, "
             "without a user (plain http only for this machine)"
         )
     return text

@@ -18,7 +18,7 @@ from demandops.demand.demand_request import (
     ConnectionType,
     DemandRequest,
 )
-from demandops.errors import Fault, fault, near, shown
+from demandops.errors import Fault, fault, quoted, suggestion
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
@@ -45,19 +45,19 @@ def _application(
             if role not in appdef.inputs and topics:
                 yield fault(
                     f"{where}.inputs.{role}",
-                    f"{appdef.name} takes no such input" + near(role, appdef.inputs),
+                    f"{appdef.name} takes no such input" + suggestion(role, appdef.inputs),
                 )
         for name in app.parameters:
             if name not in appdef.parameters:
                 yield fault(
                     f"{where}.parameters.{name}",
-                    f"{appdef.name} has no such parameter" + near(name, appdef.parameters),
+                    f"{appdef.name} has no such parameter" + suggestion(name, appdef.parameters),
                 )
         if app.version and app.version not in config.versions_of(appdef.name):
             yield fault(
                 f"{where}.version",
-                f"{shown(app.version)} is no version or channel of {appdef.name} in "
-                "registry/charts.yaml" + near(app.version, config.versions_of(appdef.name)),
+                f"{quoted(app.version)} is no version or channel of {appdef.name} in "
+                "registry/charts.yaml" + suggestion(app.version, config.versions_of(appdef.name)),
             )
     if not joining:
         return
@@ -80,8 +80,8 @@ def _unknown_application(where: str, asked: str, config: Config) -> Fault:
             if one.deployment_request
         )
     else:
-        known = near(asked, config.appdefs)
-    named = asked.removeprefix("#") if asked.startswith("#") else shown(asked)
+        known = suggestion(asked, config.appdefs)
+    named = asked.removeprefix("#") if asked.startswith("#") else quoted(asked)
     message = f"{named} names no application definition{known}"
     return fault(f"{where}.appdef", message, code="unknown-application")
 
@@ -124,13 +124,13 @@ def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
     if node not in config.nodes:
         yield fault(
             where,
-            f"{shown(node)} is not in inventory/nodes.yaml" + near(node, config.nodes),
+            f"{quoted(node)} is not in inventory/nodes.yaml" + suggestion(node, config.nodes),
             code="unknown-node",
         )
     elif node not in config.domain_of:
         yield fault(
             where,
-            f"{shown(node)} is in no access domain; a platform engineer adds it to "
+            f"{quoted(node)} is in no access domain; a platform engineer adds it to "
             "policy/access-domains.yaml",
             code="no-access-domain",
         )

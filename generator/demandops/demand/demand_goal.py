@@ -27,8 +27,8 @@ from demandops.demand.demand_request import (
 )
 from demandops.demand.goal_form import valid_part
 from demandops.demand.route import RouteOptions
-from demandops.errors import Fault, fault, shown
-from demandops.identifiers import absolute
+from demandops.errors import Fault, fault, quoted
+from demandops.identifiers import absolute_topic
 from demandops.settings import API_VERSION
 
 TypeName = Literal["auto", "mqtt", "zenoh", "ros"]
@@ -84,7 +84,7 @@ def _lease_form(value: object) -> object:
     if value is None or (isinstance(value, str | int) and not isinstance(value, bool)):
         return value
     raise ValueError(
-        f"must be a duration like 10m, or whole seconds, not {strict_yaml.brief(value)}"
+        f"must be a duration like 10m, or whole seconds, not {strict_yaml.short_repr(value)}"
     )
 
 
@@ -181,7 +181,7 @@ def _application(
         requesters=requesters,
         inputs=MappingProxyType(
             {
-                role: tuple(InputTopic(absolute(t.topic), t.source, t.type) for t in topics)
+                role: tuple(InputTopic(absolute_topic(t.topic), t.source, t.type) for t in topics)
                 for role, topics in app.inputs.items()
                 if topics
             }
@@ -206,7 +206,7 @@ def _unkeepable(value: object, depth: int) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return f"holds {value}, which is no finite number; give one, or leave it out"
     if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
-        return f"holds {shown(value)}, which is no Unicode text; write whole characters"
+        return f"holds {quoted(value)}, which is no Unicode text; write whole characters"
     parts = [*value, *value.values()] if isinstance(value, dict) else value
     nested = parts if isinstance(parts, list) else ()
     return next(filter(None, (_unkeepable(part, depth + 1) for part in nested)), "")
@@ -219,7 +219,7 @@ def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> Conn
         source=connection.source,
         target=connection.target,
         topics=tuple(
-            route.route(absolute(route.source), absolute(route.target or route.source))
+            route.route(absolute_topic(route.source), absolute_topic(route.target or route.source))
             for route in connection.topics
         ),
         broker=connection.broker,

@@ -27,7 +27,7 @@ from demandops.demand.demand_request import (
 from demandops.demand.goal_form import valid_part
 from demandops.demand.route import Route
 from demandops.errors import Fault, fault
-from demandops.identifiers import absolute
+from demandops.identifiers import absolute_topic
 
 Uint8 = Annotated[int, Field(ge=0, le=255)]
 AppdefByType = Callable[[int], ApplicationDefinition | None]
@@ -185,7 +185,8 @@ def _application(app: WireApplication, appdef: ApplicationDefinition | None) -> 
 
 def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
     return tuple(
-        InputTopic(absolute(topic.topic_name), topic.source_node_id, topic.type) for topic in topics
+        InputTopic(absolute_topic(topic.topic_name), topic.source_node_id, topic.type)
+        for topic in topics
     )
 
 
@@ -201,7 +202,9 @@ def _connection(connection: WireConnection, *, sound: bool) -> ConnectionDemand:
         type=connection.type if sound else ConnectionType.AUTO.value,
         source=connection.source_node_id,
         target=connection.target_node_id,
-        topics=tuple(Route(absolute(source), absolute(target)) for source, target in pairs),
+        topics=tuple(
+            Route(absolute_topic(source), absolute_topic(target)) for source, target in pairs
+        ),
         broker=connection.broker_node_id,
         requesters=tuple(dict.fromkeys(connection.requester_ids)),
     )

@@ -59,7 +59,7 @@ def _with_keys_of_text(
         if isinstance(key, str):
             kept[key] = _with_keys_of_text(value, (*location, key), faults)
         else:
-            message = f"the key {strict_yaml.brief(key)} must be text; put it in quotes"
+            message = f"the key {strict_yaml.short_repr(key)} must be text; put it in quotes"
             faults.append(fault(field_path(location), message))
     return kept
 

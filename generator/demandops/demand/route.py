@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, ValidationError
 
 from demandops.config.file_model import Frozen, faults_of
-from demandops.errors import Fault, fault, shown
+from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import message_type_problem, topic_problem
 
 
@@ -134,19 +134,19 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
         if first.target != route.target:
             yield fault(
                 f"{where}[{index}].target",
-                f"{shown(route.source)} goes to {shown(first.target)} and to "
-                f"{shown(route.target)}; one source topic has one target, use a second connection",
+                f"{quoted(route.source)} goes to {quoted(first.target)} and to "
+                f"{quoted(route.target)}; one source topic has one target, use a second connection",
             )
         for name, stands, asked in differences(first, route):
             yield fault(
                 f"{where}[{index}].{name}",
-                f"{shown(route.source)} is listed with {name} {stands} and {asked}; list it once",
+                f"{quoted(route.source)} is listed with {name} {stands} and {asked}; list it once",
             )
         if route.reverse and read_back.setdefault(route.target, route.source) != route.source:
             yield fault(
                 f"{where}[{index}].target",
-                f"{shown(route.target)} is carried back to {shown(read_back[route.target])} and to "
-                f"{shown(route.source)}; one topic goes to one place, use a second connection",
+                f"{quoted(route.target)} is carried back to {quoted(read_back[route.target])} and "
+                f"to {quoted(route.source)}; one topic goes to one place, use a second connection",
             )
 
 

@@ -21,7 +21,7 @@ from demandops.config.config import (
 from demandops.config.inventory import Broker, Node
 from demandops.demand.demand_request import ConnectionDemand, ConnectionType, DemandRequest
 from demandops.demand.route import Route
-from demandops.errors import Fault, fault, shown
+from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import topic_problem
 
 PREFERENCE = (ConnectionType.ZENOH, ConnectionType.MQTT, ConnectionType.ROS)
@@ -223,7 +223,7 @@ def _no_broker(asked: ConnectionDemand, config: Config) -> Fault:
     known = ", ".join(sorted(config.brokers))
     remedy = f"name one of: {known}" if known else "inventory/brokers.yaml has none; add one there"
     if asked.broker:
-        message = f"no broker runs on {shown(asked.broker)}; {remedy}"
+        message = f"no broker runs on {quoted(asked.broker)}; {remedy}"
     else:
         message = f"is open, and no broker runs on '{asked.target}' or '{asked.source}'; {remedy}"
     return fault("broker", message, code="no-broker")

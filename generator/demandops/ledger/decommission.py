@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim, Subject, SubjectKind
 from demandops.demand.demand_request import DemandRequest, Leaving
-from demandops.errors import Fault, Refused, fault, near
+from demandops.errors import Fault, Refused, fault, suggestion
 from demandops.ledger.ledger import Changes, Ledger, differences
 
 
@@ -80,6 +80,6 @@ def _nothing_held(ledger: Ledger, leaving: Leaving) -> Fault:
     names = [ledger.names("requester")] if "requester" in leaving.kinds else []
     names += [ledger.names("node"), ledger.names("link")] if "node" in leaving.kinds else []
     kinds = " or ".join(sorted(leaving.kinds))
-    close = near(leaving.name, {name for found in names for name in found})
+    close = suggestion(leaving.name, {name for found in names for name in found})
     message = f"'{leaving.name}' holds nothing as a {kinds}{close}"
     return fault("name", message, code="not-held")

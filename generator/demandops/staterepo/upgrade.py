@@ -185,14 +185,14 @@ def _root(text: str, config: Config, wish: UpgradeRequest) -> str:
     gitops = wish.gitops or repository.gitops
     try:
         if repository.render_version != RENDER_VERSION:
-            text = strict_yaml.edited(text, "renderVersion", RENDER_VERSION)
+            text = strict_yaml.set_key(text, "renderVersion", RENDER_VERSION)
         if repository.gitops != gitops:
-            text = strict_yaml.edited(text, "gitops", gitops)
+            text = strict_yaml.set_key(text, "gitops", gitops)
         section = getattr(repository, gitops)
         if section is None:
             # both fetch the same repo, so the one that stands says from where
             known = getattr(repository, repository.gitops)
-            text = strict_yaml.edited(text, gitops, {"url": wish.url or known.url})
+            text = strict_yaml.set_key(text, gitops, {"url": wish.url or known.url})
         elif wish.url not in (None, section.url):
             told = f"is {section.url} already; change it there, or leave out --url"
             raise InvalidInput([fault(f"{gitops}.url", told)])

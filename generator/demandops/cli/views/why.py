@@ -18,7 +18,7 @@ from demandops.cli.output import (
 )
 from demandops.cli.views import why_answer
 from demandops.demand.claim import Subject, SubjectKind
-from demandops.errors import StateRepoError, near, shown
+from demandops.errors import StateRepoError, quoted, suggestion
 from demandops.ledger import claim_file as ledger_format
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
@@ -105,13 +105,15 @@ def _understood(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -
         return (running or found)[0]
     if found:
         kinds = ", ".join(one.kind for one in found)
-        raise StateRepoError(f"{shown(name)} names more than one: {kinds}; say which by --kind")
+        raise StateRepoError(f"{quoted(name)} names more than one: {kinds}; say which by --kind")
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     ledger, config = snapshot.state.ledger, snapshot.state.config
     known = {*explanation.names(ledger, config), *repo.ever_stopped(str(snapshot.commit))}
     known |= {id for one in SubjectKind for id in ledger.subjects(one)}
-    raise StateRepoError(f"nothing called {shown(name)} runs, or ever did{near(name, known)}")
+    raise StateRepoError(
+        f"nothing called {quoted(name)} runs, or ever did{suggestion(name, known)}"
+    )
 
 
 def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Asked]:
@@ -143,7 +145,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Asked:
     if release is not None and path_of(release) == path:
         return _Asked("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
-        raise StateRepoError(f"{shown(path)} is no file of the state repo, and never was")
+        raise StateRepoError(f"{quoted(path)} is no file of the state repo, and never was")
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return _Asked("file", path, path)
     return _Asked("claim" if ledger_format.kind_of(path) else "release", name, path)

@@ -226,4 +226,4 @@ def _pin(reference: object, image: Image) -> dict[str, str] | None:
 
 def value_of(value: object) -> str:
     """Return a value of a manifest in few words, for a person."""
-    return "nothing" if value is ABSENT else strict_yaml.brief(value)
+    return "nothing" if value is ABSENT else strict_yaml.short_repr(value)
