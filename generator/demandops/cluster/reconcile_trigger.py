@@ -108,7 +108,7 @@ class ReconcileTrigger:
         return max(0.0, self._woken_at + _SPACING_S - time.monotonic())
 
     def _wake(self, name: str, reached: ClusterAccess, config: Config) -> None:
-        argocd = config.repository.argocd if config.repository.gitops == "argocd" else None
+        argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
         if argocd and reached.webhook:
             self._tell(name, reached.webhook, reached, config, argocd.url)
         elif reached.receiver and not argocd:
@@ -141,7 +141,7 @@ class ReconcileTrigger:
         now = datetime.now(timezone.utc).isoformat()
         for domain in _domains(name, config):
             self._api(name, reached).patch_namespaced_custom_object(
-                *_asked(domain, config.repository, now), _request_timeout=_TIMEOUT_S
+                *_asked(domain, config.repo_settings, now), _request_timeout=_TIMEOUT_S
             )
 
     def _api(self, name: str, reached: ClusterAccess) -> Any:  # noqa: ANN401

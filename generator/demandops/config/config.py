@@ -39,10 +39,10 @@ class Config:
 
     ``files`` keeps the texts that templates and chart schemas are read from, by path. ``overrides``
     are all that lie there; ``ended`` maps those that ended to the time that they named then, and
-    ``in_force`` are the others, in the order in which they apply.
+    ``active_overrides`` are the others, in the order in which they apply.
     """
 
-    repository: RepoSettings
+    repo_settings: RepoSettings
     clusters: Mapping[str, Cluster]
     nodes: Mapping[str, Node]
     brokers: Mapping[str, Broker]
@@ -53,20 +53,24 @@ class Config:
     domain_of: Mapping[str, AccessDomain]
     files: Mapping[str, str]
     overrides: Mapping[str, Override] = field(default_factory=dict)
-    ended: Mapping[str, str] = field(default_factory=dict)
-    in_force: tuple[Override, ...] = ()
-    judged: dict[Hashable, Override | None] = field(default_factory=dict, compare=False, repr=False)
+    ended_overrides: Mapping[str, str] = field(default_factory=dict)
+    active_overrides: tuple[Override, ...] = ()
+    denial_cache: dict[Hashable, Override | None] = field(
+        default_factory=dict, compare=False, repr=False
+    )
     """What was found denied, kept by :mod:`demandops.plan.overrides.claims_in_force`."""
 
-    def with_ended(self, ended: Mapping[str, str]) -> Config:
+    def with_ended_overrides(self, ended: Mapping[str, str]) -> Config:
         """Return the configuration with these overrides ended."""
-        in_force = in_order(still_in_force(self.overrides, ended))
+        active_overrides = in_order(still_in_force(self.overrides, ended))
         ended = MappingProxyType(dict(ended))
-        return replace(self, ended=ended, in_force=in_force, judged={})
+        return replace(
+            self, ended_overrides=ended, active_overrides=active_overrides, denial_cache={}
+        )
 
     def without_overrides(self) -> Config:
         """Return the configuration as it would be had nobody written an override."""
-        return replace(self, overrides={}, ended={}, in_force=(), judged={})
+        return replace(self, overrides={}, ended_overrides={}, active_overrides=(), denial_cache={})
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
         """Return the appdef that ``DeploymentRequest`` names by ``number``."""

@@ -89,7 +89,7 @@ def _check_namespaces(config: Config, reading: ItemReader) -> None:
 
 
 def _check_controllers_namespace(config: Config, reading: ItemReader) -> None:
-    argocd = config.repository.argocd if config.repository.gitops == "argocd" else None
+    argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
     for domain in config.domains.values():
         if argocd and domain.namespace == argocd.namespace:
             reading.tell(

@@ -67,7 +67,7 @@ def load(files: Mapping[str, str]) -> Config:
     nodes = reading.listed(NODES_FILE, NodesFile, "nodes", Node, "id")
     domains = reading.listed(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
     config = Config(
-        repository=repository or _ANY,
+        repo_settings=repository or _ANY,
         clusters=reading.listed(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
         nodes=nodes,
         brokers=reading.listed(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
@@ -78,7 +78,7 @@ def load(files: Mapping[str, str]) -> Config:
         domain_of=_domains_of_nodes(reading, nodes, domains),
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
         overrides=_read_overrides(reading),
-    ).with_ended({})
+    ).with_ended_overrides({})
     cross_check(config, reading)
     if reading.faults:
         raise InvalidInput(dict.fromkeys(reading.faults))

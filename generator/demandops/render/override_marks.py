@@ -73,7 +73,7 @@ def charts_kept(
 
     Not those from a folder of this repo: under their old name they would fetch the new chart.
     """
-    if not any(override.hold for override in config.in_force):
+    if not any(override.hold for override in config.active_overrides):
         return {}
     return {
         path: text

@@ -23,7 +23,7 @@ def rehearse(config: Config, engine: Engine) -> None:
     """
     invented = trial_demands.releases(config)
     faults = [found for made in invented.values() for found in _tried(made, config, engine)]
-    for override in () if faults else config.in_force:
+    for override in () if faults else config.active_overrides:
         tries = {
             appdef: list(trial_demands.overridden(override, made, appdef, config))
             for appdef, made in invented.items()

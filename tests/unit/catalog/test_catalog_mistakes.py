@@ -477,12 +477,12 @@ class TestArgoCd:
 
     def test_a_url_is_enough(self) -> None:
         config = load(configuration(self.root(url="https://git.example/state.git")))
-        assert config.repository.argocd
-        assert config.repository.argocd.namespace == "argocd"
+        assert config.repo_settings.argocd
+        assert config.repo_settings.argocd.namespace == "argocd"
 
     def test_the_other_controllers_section_may_stay(self) -> None:
         text = skeleton()[ROOT] + "argocd:\n  url: https://git.example/state.git\n"
-        assert load(configuration({ROOT: text})).repository.gitops == "flux"
+        assert load(configuration({ROOT: text})).repo_settings.gitops == "flux"
 
     def test_a_section_without_its_url(self) -> None:
         assert faults(self.root(namespace="argo")) == [f"{ROOT}: argocd.url: is missing; add it"]

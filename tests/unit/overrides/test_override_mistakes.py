@@ -198,7 +198,7 @@ def test_notes_are_passed_over_and_a_sound_override_is_taken() -> None:
             {"overrides/README.md": "hello", "overrides/.gitkeep": "", "overrides/a.yaml": text()}
         )
     )
-    assert [one.path for one in config.in_force] == ["overrides/a.yaml"]
+    assert [one.path for one in config.active_overrides] == ["overrides/a.yaml"]
 
 
 def test_a_node_in_no_access_domain_takes_nothing() -> None:
@@ -240,4 +240,4 @@ def test_a_tie_names_both_files_and_the_remedy() -> None:
 def test_no_tie_where_it_does_not_matter_who_comes_last(other: dict[str, Any]) -> None:
     changed = {"replicas": 3} | other
     files = {"overrides/one.yaml": text(), "overrides/two.yaml": text(**changed)}
-    assert len(load(configuration(files)).in_force) == 2
+    assert len(load(configuration(files)).active_overrides) == 2

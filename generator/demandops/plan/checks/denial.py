@@ -25,7 +25,7 @@ def faults(
     request: DemandRequest, after: Ledger, changes: Changes, config: Config
 ) -> Iterator[Fault]:
     """Yield each thing that a request asks anew and an override denies."""
-    denying = [one for one in reversed(config.in_force) if one.deny]
+    denying = [one for one in reversed(config.active_overrides) if one.deny]
     if not denying or not request.operation.asks:
         return
     renewed = {
@@ -117,7 +117,7 @@ def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator
     ]
     seen = set()
     asking = set(request.requesters())
-    for claim in claims if config.in_force else ():
+    for claim in claims if config.active_overrides else ():
         override = suspended_by(claim, config)
         if override is None or claim.key in seen or not asking & set(claim.requesters):
             continue

@@ -45,23 +45,23 @@ class ClaimsInForce(Ledger):
 
 def in_force(ledger: Ledger, config: Config) -> Ledger:
     """Return what of the books is planned; the ledger itself where nothing denies a claim."""
-    if isinstance(ledger, ClaimsInForce) or not any(one.deny for one in config.in_force):
+    if isinstance(ledger, ClaimsInForce) or not any(one.deny for one in config.active_overrides):
         return ledger
     return ClaimsInForce(ledger.claims, ledger.index, ledger.minutes, config)
 
 
 def suspended_by(claim: Claim, config: Config) -> Override | None:
     """Return the override that suspends a claim, the highest where several do, or nothing."""
-    if not config.in_force:
+    if not config.active_overrides:
         return None
     traits = traits_of(claim)
     try:
-        return config.judged[traits]
+        return config.denial_cache[traits]
     except KeyError:
         pass
-    if len(config.judged) >= _MOST_JUDGED:
-        config.judged.clear()
-    found = config.judged[traits] = denied_by(traits, config)
+    if len(config.denial_cache) >= _MOST_JUDGED:
+        config.denial_cache.clear()
+    found = config.denial_cache[traits] = denied_by(traits, config)
     return found
 
 
@@ -70,7 +70,7 @@ def denied_by(traits: Traits, config: Config) -> Override | None:
 
     A selector that names services denies these releases, and not what asks for them.
     """
-    for override in reversed(config.in_force):
+    for override in reversed(config.active_overrides):
         if override.deny and any(
             bool(selector.services) is bool(traits.service) and fits(selector, traits, config)
             for selector in override.select
@@ -81,7 +81,7 @@ def denied_by(traits: Traits, config: Config) -> Override | None:
 
 def suspended(ledger: Ledger, config: Config) -> Iterator[tuple[Claim, Override]]:
     """Yield every suspended claim, sorted, and the override that suspends it."""
-    if not any(one.deny for one in config.in_force):
+    if not any(one.deny for one in config.active_overrides):
         return
     for claim in sorted(ledger, key=lambda one: (str(one.subject), one.demand)):
         override = suspended_by(claim, config)

@@ -30,7 +30,7 @@ def shaped(release: Release, ledger: Ledger, config: Config) -> Release | None:
     Raises:
         Refused: where the node that it is moved to is gone.
     """
-    if not config.in_force:
+    if not config.active_overrides:
         return release
     claims = _claims(release, ledger)
     traits = _traits(release, claims)
@@ -38,7 +38,7 @@ def shaped(release: Release, ledger: Ledger, config: Config) -> Release | None:
         return None
     kept = {claim.demand.removeprefix(KEPT) for claim in claims if claim.demand.startswith(KEPT)}
     by = []
-    for override in config.in_force:
+    for override in config.active_overrides:
         effects = _effects(release, override, config) if selects(override, traits, config) else ()
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
@@ -49,7 +49,9 @@ def shaped(release: Release, ledger: Ledger, config: Config) -> Release | None:
 
 def denying(release: Release, ledger: Ledger, config: Config) -> Override | None:
     """Return the override that keeps a service from running, or nothing."""
-    if not isinstance(release, ServiceRelease) or not any(one.deny for one in config.in_force):
+    if not isinstance(release, ServiceRelease) or not any(
+        one.deny for one in config.active_overrides
+    ):
         return None
     return denied_by(_traits(release, _claims(release, ledger)), config)
 

@@ -111,6 +111,6 @@ def keepers(claim: Claim, config: Config) -> list[Override]:
     traits, whoever = traits_of(claim), is_kept(claim)
     return [
         one
-        for one in reversed(config.in_force)
+        for one in reversed(config.active_overrides)
         if one.keep and selects(one, traits, config, whoever_asks=whoever)
     ]

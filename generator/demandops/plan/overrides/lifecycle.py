@@ -45,18 +45,18 @@ def taken_in(
         now: overrides that are new and ended by then do not apply.
     """
     ledger, config = after
-    known = {one.name: one for one in before[1].in_force}
+    known = {one.name: one for one in before[1].active_overrides}
     late = [
         one for one in due(config, now) if one.name not in known or known[one.name].end != one.end
     ]
     gone = ended_override_file.stale(marked, config.overrides)
     ended = {
         name: end
-        for name, end in config.ended.items()
+        for name, end in config.ended_overrides.items()
         if ended_override_file.path_of(name) not in gone
     }
     ended |= {one.name: written(one.end) for one in late if one.end}
-    config = config.with_ended(ended)
+    config = config.with_ended_overrides(ended)
     files: dict[str, str | None] = dict.fromkeys(gone)
     files |= {ended_override_file.path_of(one.name): ended_override_file.write(one) for one in late}
     touched = (*subjects, *kept_claims.subjects_kept(before[0]), *kept_claims.subjects_kept(ledger))
@@ -70,7 +70,9 @@ def ended(state: tuple[Ledger, Config], override: Override, now: datetime) -> Ta
     ledger, config = state
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
-    after = config.with_ended({**config.ended, override.name: written(override.end)})
+    after = config.with_ended_overrides(
+        {**config.ended_overrides, override.name: written(override.end)}
+    )
     found = taken_in(state, (ledger, after), (), {}, now)
     marker = {ended_override_file.path_of(override.name): ended_override_file.write(override)}
     return TakenIn(found.ledger, found.config, found.keys, {**found.files, **marker})
@@ -88,18 +90,20 @@ def files_of(before: Ledger, after: Ledger, keys: Iterable[ClaimKey]) -> dict[st
 
 def due(config: Config, now: datetime) -> list[Override]:
     """Return the overrides in force whose time is over, the first to end first."""
-    over = [(one.end, one.name, one) for one in config.in_force if one.end and one.end <= now]
+    over = [
+        (one.end, one.name, one) for one in config.active_overrides if one.end and one.end <= now
+    ]
     return [one for _, _, one in sorted(over, key=lambda item: item[:2])]
 
 
 def next_end(config: Config) -> datetime | None:
     """Return when the next override in force ends."""
-    return min((one.end for one in config.in_force if one.end), default=None)
+    return min((one.end for one in config.active_overrides if one.end), default=None)
 
 
 def differing(before: Config, after: Config) -> list[str]:
     """Return the files of the overrides that came into force, changed or ceased to apply."""
-    old = {one.name: one for one in before.in_force}
-    new = {one.name: one for one in after.in_force}
+    old = {one.name: one for one in before.active_overrides}
+    new = {one.name: one for one in after.active_overrides}
     names = [name for name in {*old, *new} if old.get(name) != new.get(name)]
     return sorted((new.get(name) or old[name]).path for name in names)

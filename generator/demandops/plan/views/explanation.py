@@ -93,7 +93,7 @@ def how_to_release(claim: Claim) -> str:
 
 def shaped_by(release: Release, config: Config) -> list[Shaping]:
     """Return the files of people that say what a release is, and where."""
-    found = [Shaping(ROOT_FILE, "gitops", f"written for {config.repository.gitops}")]
+    found = [Shaping(ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}")]
     of_kind = _service if isinstance(release, ServiceRelease) else _client
     found += of_kind(release, config)
     found.append(Shaping(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))

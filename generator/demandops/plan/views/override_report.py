@@ -40,7 +40,7 @@ def survey(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
         )
         standing: Standing = "in force" if any(entry) else "matches nothing"
         over = override.end is not None and override.end <= now
-        if over or override not in config.in_force:
+        if over or override not in config.active_overrides:
             standing, entry = "expired", ((), ())
         found.append(Entry(override, standing, *entry))
     return found

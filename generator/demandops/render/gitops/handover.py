@@ -43,9 +43,9 @@ def handover(old: Config, new: Config) -> Handover:
 
     Nothing is deleted on the way: docs/argocd.md has the reasons, and the end-to-end tests do it.
     """
-    if old.repository.gitops == new.repository.gitops:
+    if old.repo_settings.gitops == new.repo_settings.gitops:
         return Handover()
-    if new.repository.gitops == "argocd":
+    if new.repo_settings.gitops == "argocd":
         return Handover(tuple(_suspend_flux(new)), tuple(_from_flux(new)))
     return Handover(tuple(_let_argocd_go(old)), tuple(_from_argocd(new)))
 
@@ -79,7 +79,7 @@ def _from_flux(config: Config) -> Iterator[Step]:
             commands.append(f"{kubectl} delete {_FLUXS} -l {_of(domain)}")
             commands.append(f"{kubectl} delete kustomization {domain.name}")
         commands += [
-            f"kubectl -n {namespace} delete gitrepository {config.repository.source}"
+            f"kubectl -n {namespace} delete gitrepository {config.repo_settings.source}"
             for namespace in _namespaces(domains)
         ]
         yield Step(cluster, "delete what Flux had; suspended, it removes nothing", (*commands,))
@@ -91,13 +91,13 @@ def _of(domain: AccessDomain) -> str:
 
 
 def _let_argocd_go(config: Config) -> Iterator[Step]:
-    section = config.repository.argocd
+    section = config.repo_settings.argocd
     assert section is not None  # noqa: S101 - the configuration holds what gitops names
     for cluster, domains in domains_by_cluster(config).items():
         commands = []
         for domain in domains:
             name, kubectl = (
-                project_of(domain, config.repository),
+                project_of(domain, config.repo_settings),
                 f"kubectl -n {section.namespace}",
             )
             commands.append(f"{kubectl} patch application {name} --type merge -p {_LET_GO}")
@@ -111,7 +111,7 @@ def _let_argocd_go(config: Config) -> Iterator[Step]:
             commands.append(f"{kubectl} delete application -l {_OURS}")
         commands += [
             f"kubectl -n {section.namespace} delete appproject "
-            f"{project_of(domain, config.repository)}"
+            f"{project_of(domain, config.repo_settings)}"
             for domain in domains
         ]
         what = "delete Argo CD's Applications without what they hold: finalizers first"

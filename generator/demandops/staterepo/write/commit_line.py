@@ -119,7 +119,7 @@ class CommitLine:
                 state, change, keys = self._taken_in(state, before, good, now)
             except InvalidInput as error:
                 problems += error.faults
-                config = before.state.config.with_ended(state.config.ended)
+                config = before.state.config.with_ended_overrides(state.config.ended_overrides)
                 state = replace(before.state, ledger=state.ledger, config=config)
                 snapshot, good, found = self._held_back(
                     replace(snapshot, state=state), before, good
