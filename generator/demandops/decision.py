@@ -154,7 +154,7 @@ def decide(
             *made.waiting,
             *denial.warnings(request, ledger, state.config),
         ),
-        approval=approval_rule.asked_by(
+        approval=approval_rule.approval_reasons(
             request, ((c.before, c.after) for c in changes.claims), state.config
         ),
         overrides=made.overrides,
@@ -189,14 +189,14 @@ def admit(
         return decommission_goal.parse(goal)
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         request, faults = demand_goal.parse(goal)
-        request = permission.with_terms(request, config)
+        request = permission.with_lease_terms(request, config)
         request = implied_connections.with_connections(request, state.ledger, config)
     else:
         parsed, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if parsed is None:
             raise Refused(faults)
-        request = permission.with_terms(parsed, config)
-    request = transport_choice.resolved(request, config, state.ledger.type_of)
+        request = permission.with_lease_terms(parsed, config)
+    request = transport_choice.with_chosen_types(request, config, state.ledger.type_of)
     told = {found.field for found in faults}
     found_in_content = [*admission.faults(request, config), *permission.faults(request, config)]
     content = _in_goals_words(found_in_content, request, config)
@@ -261,8 +261,8 @@ def _in_goals_words(faults: Iterable[Fault], request: DemandRequest, config: Con
         if request.operation is Operation.DECOMMISSION:
             return path
         if request.operation.is_reference:
-            return deployment_request_goal.wire_field(path, request, config.appdefs)
-        return demand_goal.field(path, request)
+            return deployment_request_goal.goal_field(path, request, config.appdefs)
+        return demand_goal.goal_field(path, request)
 
     return [replace(found, field=field(found.field)) for found in faults]
 

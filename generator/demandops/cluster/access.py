@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen, parse_file
+from demandops.config.file_model import DnsLabel, FileModel, FrozenModel, parse_file
 from demandops.errors import Fault, InvalidInput, fault
 
 
@@ -20,7 +20,7 @@ class NoAccess(ValueError):
     """A cluster cannot be called, for a reason in the operator's files; it names no secret."""
 
 
-class ClusterAccess(Frozen):
+class ClusterAccess(FrozenModel):
     """How one cluster is reached: through its API, by a webhook of its controller, or both.
 
     ``receiver`` is the URL of a Flux Receiver, ``webhook`` that of an Argo CD; ``secret_file``

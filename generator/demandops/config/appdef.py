@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.file_model import Approval, DnsLabel, FileModel, Frozen, Word
+from demandops.config.file_model import Approval, DnsLabel, FileModel, FrozenModel, Word
 from demandops.errors import suggestion
 
 TopicPattern = Annotated[
@@ -23,14 +23,14 @@ TopicPattern = Annotated[
 """A topic name; ``{instance}`` stands for the source or the application that the service is for."""
 
 
-class Input(Frozen):
+class Input(FrozenModel):
     """A role that demanded topics play, ``point_cloud`` say."""
 
     description: str = ""
     type: str = ""
 
 
-class Parameter(Frozen):
+class Parameter(FrozenModel):
     """A value that a demand may give, and what holds when several demands give different ones."""
 
     description: str = ""
@@ -38,7 +38,7 @@ class Parameter(Frozen):
     merge: Literal["union", "max", "min", "latest"] | None = None
 
 
-class Scaling(Frozen):
+class Scaling(FrozenModel):
     """How many replicas a service has: one for ``topics_per_replica`` inputs, within bounds."""
 
     min: Annotated[int, Field(ge=0, le=1000)] = 1
@@ -56,7 +56,7 @@ class Scaling(Frozen):
         return self
 
 
-class Service(Frozen):
+class Service(FrozenModel):
     """One deployable part of an application: one Helm release for each instance.
 
     ``each`` names the input whose every topic gets an instance of its own, shared between
@@ -84,7 +84,7 @@ class Service(Frozen):
         return self
 
 
-class WireNames(Frozen):
+class WireNames(FrozenModel):
     """How the reference's ``DeploymentRequest`` names this application.
 
     ``type`` is the number in ``Application.type``; ``inputs`` says which role each topic list of

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 from demandops.config.appdef import ApplicationDefinition, Service
 from demandops.config.inventory import Broker, Cluster, Node
-from demandops.config.override import OVERRIDES_ROOT, Override, in_order, still_in_force
+from demandops.config.override import OVERRIDES_ROOT, Override, by_rank, still_active
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import Chart, Image
 from demandops.config.repo_settings import RepoSettings
@@ -62,7 +62,7 @@ class Config:
 
     def with_ended_overrides(self, ended: Mapping[str, str]) -> Config:
         """Return the configuration with these overrides ended."""
-        active_overrides = in_order(still_in_force(self.overrides, ended))
+        active_overrides = by_rank(still_active(self.overrides, ended))
         ended = MappingProxyType(dict(ended))
         return replace(
             self, ended_overrides=ended, active_overrides=active_overrides, denial_cache={}

@@ -28,13 +28,13 @@ Approval = Literal["none", "required"]
 """Whether a person has to agree before a demand is carried out."""
 
 
-class Frozen(BaseModel):
+class FrozenModel(BaseModel):
     """A value that cannot change, with no room for misspelt fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-class FileModel(Frozen):
+class FileModel(FrozenModel):
     """A file that people write: it says which format it is in."""
 
     apiVersion: Literal["demandops/v1"]

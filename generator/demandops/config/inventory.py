@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen, Word
+from demandops.config.file_model import DnsLabel, FileModel, FrozenModel, Word
 from demandops.identifiers import id_problem, message_type_problem, topic_problem
 
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
@@ -25,14 +25,14 @@ Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$")]
 """A Zenoh endpoint without certificates: ``tcp/host:7447``."""
 
 
-class Tls(Frozen):
+class Tls(FrozenModel):
     """Encrypted connections to a broker; without ``caSecret`` the client image's own CAs count."""
 
     ca_secret: DnsLabel | None = Field(default=None, alias="caSecret")
     ca_key: SecretKey = Field(default="ca.crt", alias="caKey")
 
 
-class Credentials(Frozen):
+class Credentials(FrozenModel):
     """The Secret with a broker's user name and password, and the keys that they stand under."""
 
     secret: DnsLabel
@@ -40,7 +40,7 @@ class Credentials(Frozen):
     password_key: SecretKey = Field(default="password", alias="passwordKey")
 
 
-class Zenoh(Frozen):
+class Zenoh(FrozenModel):
     """That a node runs a Zenoh bridge where a connection needs it, and how bridges meet.
 
     ``endpoint`` is where other nodes' bridges reach this one; ``listen`` where it listens for
@@ -66,7 +66,7 @@ class Zenoh(Frozen):
         return (f"{protocol}/0.0.0.0:{address.rpartition(':')[2]}",)
 
 
-class Wan(Frozen):
+class Wan(FrozenModel):
     """Where DDS Routers on a node can be reached, one port for each ROS connection."""
 
     host: Host
@@ -116,14 +116,14 @@ _LABEL_VALUE = re.compile(r"([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?")
 LabelValue = Annotated[str, StringConstraints(pattern=f"^{_LABEL_VALUE.pattern}$")]
 
 
-class Cluster(Frozen):
+class Cluster(FrozenModel):
     """A Kubernetes cluster whose GitOps controller reads ``clusters/<name>/``."""
 
     name: DnsLabel
     description: str = ""
 
 
-class Toleration(Frozen):
+class Toleration(FrozenModel):
     """A taint of the node that workloads put up with (Kubernetes core/v1 Toleration)."""
 
     key: str = ""
@@ -140,7 +140,7 @@ class Toleration(Frozen):
         return self
 
 
-class Ros(Frozen):
+class Ros(FrozenModel):
     """What a container on the node needs to join its ROS graph."""
 
     domain_id: Annotated[int, Field(ge=0, le=232)] = Field(default=0, alias="domainId")
@@ -149,7 +149,7 @@ class Ros(Frozen):
     )
 
 
-class Node(Frozen):
+class Node(FrozenModel):
     """A C-ITS entity that runs services.
 
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
@@ -191,7 +191,7 @@ class Node(Frozen):
         return dict(self.selector) if self.selector is not None else {"node_id": self.id}
 
 
-class Broker(Frozen):
+class Broker(FrozenModel):
     """A message broker and the node that it runs on."""
 
     node: NodeId

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen
+from demandops.config.file_model import DnsLabel, FileModel, FrozenModel
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.config.registry import Image
 from demandops.errors import quoted
@@ -32,7 +32,7 @@ EFFECTS = (*_SHAPING, "hold", "deny", "keep")
 """What an override may do, in the order in which it is told."""
 
 
-def moment_of(text: str) -> datetime:
+def parse_time(text: str) -> datetime:
     """Return the moment that an RFC 3339 time with zone names, in UTC.
 
     Raises:
@@ -52,14 +52,14 @@ def moment_of(text: str) -> datetime:
         ) from None
 
 
-def written(moment: datetime) -> str:
+def format_time(moment: datetime) -> str:
     """Return a moment as messages and markers show it."""
     text = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
     return re.sub(r"\.?0*\+00:00$", "Z", text)
 
 
 def _moment(text: str) -> str:
-    moment_of(text)
+    parse_time(text)
     return text
 
 
@@ -101,14 +101,14 @@ Patterns = Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_some)
 Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)]
 
 
-def _filled_in(model: Frozen) -> None:
+def _filled_in(model: FrozenModel) -> None:
     """Raise for a field that is written down and empty: it would say less than it seems to."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
         raise ValueError(f"{' and '.join(empty)}: nothing stands there; fill it in, or remove it")
 
 
-class Selector(Frozen):
+class Selector(FrozenModel):
     """What an override is for: a release or claim that every field given here fits.
 
     Patterns take ``*`` and ``?``. ``requesters`` fits where one of the requesters does, ``labels``
@@ -136,7 +136,7 @@ class Selector(Frozen):
         return self
 
 
-class ImagePin(Frozen):
+class ImagePin(FrozenModel):
     """What an override says of an image of the registry; what it leaves out stays."""
 
     repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")] | None = None
@@ -210,7 +210,7 @@ class OverrideFile(FileModel):
     @property
     def end(self) -> datetime | None:
         """When it ceases to apply."""
-        return moment_of(self.expires) if self.expires else None
+        return parse_time(self.expires) if self.expires else None
 
 
 class Override(OverrideFile):  # noqa: PLW1641 - with mappings in them overrides have no hash
@@ -252,7 +252,7 @@ def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
         )
 
 
-def merged(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
+def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
     """Return ``target`` with a JSON merge patch (RFC 7386) laid over; null removes."""
     if not isinstance(patch, Mapping):
         return patch
@@ -261,19 +261,19 @@ def merged(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
         if value is None:
             result.pop(key, None)
         else:
-            result[key] = merged(result.get(key), value)
+            result[key] = merge_patch(result.get(key), value)
     return result
 
 
-def in_order(overrides: Iterable[Override]) -> tuple[Override, ...]:
+def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
     """Return overrides in the order in which they apply: who comes last wins."""
     return tuple(sorted(overrides, key=lambda one: one.rank))
 
 
-def still_in_force(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
+def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
     """Return the overrides that no marker says to have ended at the time that they name now."""
     return [
         one
         for name, one in overrides.items()
-        if one.end is None or ended.get(name) != written(one.end)
+        if one.end is None or ended.get(name) != format_time(one.end)
     ]

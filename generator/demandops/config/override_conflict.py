@@ -15,7 +15,7 @@ from itertools import combinations
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
 from demandops.config.item_reader import ItemReader
-from demandops.config.override import Override, Selector, in_order
+from demandops.config.override import Override, Selector, by_rank
 from demandops.config.policy import matches
 
 _MERGED = ("values", "images")
@@ -25,10 +25,10 @@ _FROZEN = (*_SINGLE, *_MERGED)
 
 def check_override_conflicts(config: Config, reading: ItemReader) -> None:
     """Note every pair of overrides whose order decides what runs, and that have none."""
-    for one, other in combinations(in_order(config.overrides.values()), 2):
+    for one, other in combinations(by_rank(config.overrides.values()), 2):
         if one.priority != other.priority:
             continue
-        touched = contested(one, other)
+        touched = contested_effects(one, other)
         if touched and can_meet(one.select, other.select, config):
             reading.tell(
                 other.path,
@@ -38,14 +38,14 @@ def check_override_conflicts(config: Config, reading: ItemReader) -> None:
             )
 
 
-def contested(one: Override, other: Override) -> list[str]:
+def contested_effects(one: Override, other: Override) -> list[str]:
     """Return the effects of two overrides for which it matters who comes last."""
     touched = [
         name
         for name in _SINGLE
         if None not in (left := getattr(one, name), right := getattr(other, name)) and left != right
     ]
-    if one.values and other.values and not commute(one.values, other.values):
+    if one.values and other.values and not patches_commute(one.values, other.values):
         touched.append("values")
     pins = (one.images or {}, other.images or {})
     touched += [
@@ -60,10 +60,10 @@ def contested(one: Override, other: Override) -> list[str]:
     return touched
 
 
-def commute(one: object, other: object) -> bool:
+def patches_commute(one: object, other: object) -> bool:
     """Tell whether two merge patches give the same whichever comes first."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return all(commute(one[key], other[key]) for key in one if key in other)
+        return all(patches_commute(one[key], other[key]) for key in one if key in other)
     return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)  # 1 is not True
 
 
@@ -78,7 +78,7 @@ def _meet(one: Selector, other: Selector, config: Config) -> bool:
         return False
     for name in _telling_apart(one, other, config):
         left, right = getattr(one, name), getattr(other, name)
-        if left and right and not any(overlap(a, b) for a in left for b in right):
+        if left and right and not any(patterns_overlap(a, b) for a in left for b in right):
             return False
     left, right = one.labels or {}, other.labels or {}
     return all(left[key] == right[key] for key in left if key in right)
@@ -106,7 +106,7 @@ def _shared(one: Selector, other: Selector, appdef: ApplicationDefinition) -> bo
     )
 
 
-def overlap(one: str, other: str) -> bool:
+def patterns_overlap(one: str, other: str) -> bool:
     """Tell whether some text fits both patterns (``*`` any characters, ``?`` one)."""
     reached = {0}  # places in ``other`` that what is read of ``one`` can stand at
     reached |= _past_stars(other, reached)

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from demandops.config.file_model import Approval, DnsLabel, FileModel, Frozen
+from demandops.config.file_model import Approval, DnsLabel, FileModel, FrozenModel
 from demandops.errors import quoted
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
@@ -49,7 +49,7 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
     return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
 
 
-class Rule(Frozen):
+class Rule(FrozenModel):
     """What some requesters may demand; a demand needs one rule for each of its requesters.
 
     ``nodes`` are those where it runs or where a connection ends, ``brokers`` the nodes of brokers.
@@ -64,7 +64,7 @@ class Rule(Frozen):
     approval: Approval | None = None
 
 
-class Quotas(Frozen):
+class Quotas(FrozenModel):
     """How much at most; no limit where one is left out.
 
     ``demands_per_minute`` counts what one generator receives from a requester.
@@ -81,7 +81,7 @@ class Quotas(Frozen):
     )
 
 
-class LeasePolicy(Frozen):
+class LeasePolicy(FrozenModel):
     """How long a demand holds without being renewed.
 
     ``default`` is for demands that ask for no lease, for ever where it is left out. It covers the
@@ -108,7 +108,7 @@ class LeasePolicy(Frozen):
         return self
 
 
-class AccessDomain(Frozen):
+class AccessDomain(FrozenModel):
     """A namespace and service account, the nodes whose releases live in it, and who may use them.
 
     Without ``rules`` everybody may demand everything on its nodes.

@@ -11,14 +11,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen, Word
+from demandops.config.file_model import DnsLabel, FileModel, FrozenModel, Word
 
 ChartVersion = Annotated[
     str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
 ]
 
 
-class ChartSource(Frozen):
+class ChartSource(FrozenModel):
     """A Helm chart in one version: exactly one of ``folder``, ``oci``, ``http`` says where."""
 
     version: ChartVersion
@@ -82,7 +82,7 @@ class Chart(ChartSource):
         return (*self.channels, *(source.version for source in self.sources()))
 
 
-class Image(Frozen):
+class Image(FrozenModel):
     """A container image, pinned by tag, by digest or by both (the digest then decides)."""
 
     repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen
+from demandops.config.file_model import DnsLabel, FileModel, FrozenModel
 from demandops.errors import quoted
 
 ROOT_FILE = "demandops.yaml"
@@ -17,7 +17,7 @@ GitUrl = Annotated[
 ]
 
 
-class Flux(Frozen):
+class Flux(FrozenModel):
     """How the clusters' Flux reaches this repo: the GitRepository of each access domain."""
 
     url: GitUrl
@@ -27,7 +27,7 @@ class Flux(Frozen):
     secret: DnsLabel | None = None
 
 
-class ArgoCd(Frozen):
+class ArgoCd(FrozenModel):
     """How the clusters' Argo CD reaches this repo, and the namespace it runs in.
 
     Credentials are Argo CD's own: a Secret of that namespace that names the URL.
@@ -54,7 +54,7 @@ def _web_url(text: str) -> str:
 WebUrl = Annotated[str, AfterValidator(_web_url)]
 
 
-class Proposals(Frozen):
+class Proposals(FrozenModel):
     """Where demands that need approval are proposed.
 
     ``none`` pushes the branch and asks nobody. GitLab opens a merge request by push options; GitHub

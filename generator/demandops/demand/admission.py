@@ -106,10 +106,10 @@ def _connection(
         return
     if kind is ConnectionType.AUTO:
         ends_known = connection.source in config.nodes and connection.target in config.nodes
-        if ends_known and transport_choice.choice(connection, config) is kind:
-            yield _within(where, transport_choice.none_fits(connection, config))
+        if ends_known and transport_choice.choose_type(connection, config) is kind:
+            yield _within(where, transport_choice.no_type_fault(connection, config))
         return
-    for found in transport_choice.obstacles(kind, connection, config):
+    for found in transport_choice.type_faults(kind, connection, config):
         yield _within(where, found)
 
 

@@ -14,12 +14,12 @@ from demandops.config.policy import AccessDomain, matches
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim, Subject, SubjectKind
 from demandops.demand.demand_request import ConnectionType, DemandRequest
 from demandops.demand.lease import Term
-from demandops.demand.permission import asked_at_ends, missing, places
+from demandops.demand.permission import access_of_connection, first_uncovered, service_nodes
 
 Asked = Iterable[tuple[str, str]]
 
 
-def asked_by(
+def approval_reasons(
     request: DemandRequest, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
 ) -> tuple[str, ...]:
     """Return what asks for approval of a request, each once: ``access domain 'edge'``.
@@ -69,9 +69,9 @@ def _asks(claim: Claim, config: Config) -> Iterator[tuple[AccessDomain, Asked]]:
     """Yield what a claim asks of each access domain that it touches."""
     if isinstance(claim, ConnectionClaim):
         mqtt = claim.type is ConnectionType.MQTT
-        yield from asked_at_ends(claim.source, claim.target, claim.broker, mqtt, config)
+        yield from access_of_connection(claim.source, claim.target, claim.broker, mqtt, config)
         return
-    for node in places(claim, config):
+    for node in service_nodes(claim, config):
         domain = config.domain_of.get(node)
         if domain is not None:
             yield domain, (("applications", claim.appdef), ("nodes", node))
@@ -82,7 +82,7 @@ def _of_domain(domain: AccessDomain, requester: str, asked: Asked) -> Iterator[s
     rules = [
         rule
         for rule in domain.rules
-        if matches(requester, rule.requesters) and missing(rule, asked) is None
+        if matches(requester, rule.requesters) and first_uncovered(rule, asked) is None
     ]
     if any((rule.approval or domain.approval) == "none" for rule in rules):
         return
@@ -93,7 +93,7 @@ def _of_domain(domain: AccessDomain, requester: str, asked: Asked) -> Iterator[s
         yield f"access domain '{domain.name}'"
 
 
-def proposed(request: DemandRequest) -> DemandRequest:
+def with_leases_from_approval(request: DemandRequest) -> DemandRequest:
     """Return a request whose leases count from the approval, not from when it was received."""
 
     def waiting(term: Term | None) -> Term | None:

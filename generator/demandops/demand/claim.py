@@ -119,7 +119,7 @@ Claim = ApplicationClaim | ConnectionClaim
 KEPT = OVERRIDE_PREFIX
 
 
-def is_kept(claim: Claim) -> bool:
+def is_override_claim(claim: Claim) -> bool:
     """Tell whether an override holds a claim, rather than a demand."""
     return claim.demand.startswith(KEPT)
 

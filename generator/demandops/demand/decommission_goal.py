@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from demandops.demand.demand_request import DemandRequest, Leaving, Operation
+from demandops.demand.demand_request import DecommissionTarget, DemandRequest, Operation
 from demandops.errors import Fault, Refused, fault
 from demandops.identifiers import id_problem
 
@@ -43,5 +43,5 @@ def parse(data: dict[str, Any]) -> DemandRequest:
     if faults:
         raise Refused(faults)
     kinds = frozenset(kind for kind in data.get("as", ()) if kind in ("node", "requester"))
-    leaving = Leaving(str(name), kinds, str(data.get("by") or ""))
+    leaving = DecommissionTarget(str(name), kinds, str(data.get("by") or ""))
     return DemandRequest(id=str(name), operation=Operation.DECOMMISSION, leaving=leaving)

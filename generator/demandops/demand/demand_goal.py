@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PlainValidator
 
 from demandops import strict_yaml
-from demandops.config.file_model import Frozen
+from demandops.config.file_model import FrozenModel
 from demandops.config.policy import seconds_of
 from demandops.demand.demand_request import (
     ApplicationDemand,
@@ -25,7 +25,7 @@ from demandops.demand.demand_request import (
     InputTopic,
     Operation,
 )
-from demandops.demand.goal_form import valid_part
+from demandops.demand.goal_form import parse_valid_part
 from demandops.demand.route import RouteOptions
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import absolute_topic
@@ -36,7 +36,7 @@ TypeName = Literal["auto", "mqtt", "zenoh", "ros"]
 _TYPES = {known.name.lower(): known.value for known in ConnectionType}
 
 
-class GoalTopic(Frozen):
+class GoalTopic(FrozenModel):
     """A topic that an application takes in, and the node that publishes it."""
 
     topic: str = ""
@@ -44,7 +44,7 @@ class GoalTopic(Frozen):
     type: str = ""
 
 
-class GoalApplication(Frozen):
+class GoalApplication(FrozenModel):
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
     ``parameters`` are values, ``parameters_json`` the same as JSON text. ``version`` is a version
@@ -69,7 +69,7 @@ class GoalRoute(RouteOptions):
     target: str = ""
 
 
-class GoalConnection(Frozen):
+class GoalConnection(FrozenModel):
     """One connection and the topics that it carries."""
 
     id: str = ""
@@ -92,7 +92,7 @@ Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
 """One validator for all that it may be: pydantic names each member of a union a field."""
 
 
-class DemandGoal(Frozen):
+class DemandGoal(FrozenModel):
     """A demand. ``lease`` is a duration like ``10m``, or whole seconds."""
 
     apiVersion: Literal["demandops/v1"] = API_VERSION
@@ -123,7 +123,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
     Returns:
         The request and the faults of its form; a request with faults must not be booked.
     """
-    goal, faults = valid_part(data, DemandGoal, _LISTS_OF_TEXT)
+    goal, faults = parse_valid_part(data, DemandGoal, _LISTS_OF_TEXT)
     requesters = tuple(goal.requesters)
     request = DemandRequest(
         id=goal.request or goal.demand,
@@ -237,7 +237,7 @@ _NAMES = (
 _OF_CONNECTION = re.compile(r"connections\[(\d+)\]")
 
 
-def field(path: str, request: DemandRequest) -> str:
+def goal_field(path: str, request: DemandRequest) -> str:
     """Return the goal's name for a field of its request; of a derived connection, its input."""
     for pattern, replacement in _NAMES:
         if pattern.match(path):

@@ -110,7 +110,7 @@ class ConnectionDemand:
 
 
 @dataclass(frozen=True, slots=True)
-class Leaving:
+class DecommissionTarget:
     """What is decommissioned: a name, as what (``node``, ``requester``), and who has it done."""
 
     name: str
@@ -135,7 +135,7 @@ class DemandRequest:
     demand: str = ""
     named_by: tuple[str, ...] = ()
     lease_s: int | None = None
-    leaving: Leaving | None = None
+    leaving: DecommissionTarget | None = None
 
     def requesters(self) -> tuple[str, ...]:
         """Return everybody in whose name something is asked, in the order listed, each once."""

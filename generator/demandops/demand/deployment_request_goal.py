@@ -15,7 +15,7 @@ from typing import Annotated
 from pydantic import Field
 
 from demandops.config.appdef import ApplicationDefinition
-from demandops.config.file_model import Frozen
+from demandops.config.file_model import FrozenModel
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -24,7 +24,7 @@ from demandops.demand.demand_request import (
     InputTopic,
     Operation,
 )
-from demandops.demand.goal_form import valid_part
+from demandops.demand.goal_form import parse_valid_part
 from demandops.demand.route import Route
 from demandops.errors import Fault, fault
 from demandops.identifiers import absolute_topic
@@ -34,7 +34,7 @@ AppdefByType = Callable[[int], ApplicationDefinition | None]
 AppdefByName = Mapping[str, ApplicationDefinition]
 
 
-class WireTopic(Frozen):
+class WireTopic(FrozenModel):
     """``application_manager_interfaces/msg/Topic``."""
 
     topic_name: str = ""
@@ -42,14 +42,14 @@ class WireTopic(Frozen):
     type: str = ""
 
 
-class WireHeader(Frozen):
+class WireHeader(FrozenModel):
     """``application_manager_interfaces/msg/ApplicationHeader``."""
 
     id: str = ""
     node_id: str = ""
 
 
-class WireBody(Frozen):
+class WireBody(FrozenModel):
     """``application_manager_interfaces/msg/ObjectDetectionFusionApp``."""
 
     requester_ids: list[str] = Field(default_factory=list)
@@ -57,7 +57,7 @@ class WireBody(Frozen):
     pointcloud_topics: list[WireTopic] = Field(default_factory=list)
 
 
-class WireApplication(Frozen):
+class WireApplication(FrozenModel):
     """``application_manager_interfaces/msg/Application``."""
 
     header: WireHeader = WireHeader()
@@ -65,7 +65,7 @@ class WireApplication(Frozen):
     object_detection_fusion_app: WireBody = WireBody()
 
 
-class WireConnection(Frozen):
+class WireConnection(FrozenModel):
     """``application_manager_interfaces/msg/Connection``."""
 
     id: str = ""
@@ -78,7 +78,7 @@ class WireConnection(Frozen):
     type: Uint8 = 0
 
 
-class WireGoal(Frozen):
+class WireGoal(FrozenModel):
     """``application_manager_interfaces/action/DeploymentRequest``, the goal."""
 
     apps: list[WireApplication] = Field(default_factory=list)
@@ -119,7 +119,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
     """
     if not isinstance(data, dict):
         return None, [_no_mapping()]
-    goal, faults = valid_part(data, WireGoal, _LISTS_OF_TEXT)
+    goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
     # where it does not say which, it is held to what a shutdown is held to: the rules of both
     told = {found.field for found in faults}
     unsaid = "shutdown" in told
@@ -149,7 +149,7 @@ def form_faults(data: object) -> list[Fault]:
     """Return what of ``data`` has not the form of a goal: unknown fields, wrong types."""
     if not isinstance(data, dict):
         return [_no_mapping()]
-    return valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]
+    return parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]
 
 
 def _no_mapping() -> Fault:
@@ -210,7 +210,7 @@ def _connection(connection: WireConnection, *, sound: bool) -> ConnectionDemand:
     )
 
 
-def wire_field(path: str, request: DemandRequest, appdefs: AppdefByName) -> str:
+def goal_field(path: str, request: DemandRequest, appdefs: AppdefByName) -> str:
     """Return the wire's name for a field of ``request``.
 
     ``applications[0].node`` is ``apps[0].header.node_id`` in the message, and a role is the topic

@@ -21,7 +21,7 @@ _DEEPEST = 100
 Goal = TypeVar("Goal", bound=BaseModel)
 
 
-def valid_part(
+def parse_valid_part(
     data: dict[str, Any], model: type[Goal], lists_of_text: Container[str]
 ) -> tuple[Goal, list[Fault]]:
     """Return what of ``data`` has the form of ``model``, and the faults of the rest.

@@ -32,7 +32,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         return
     for index, app in enumerate(request.applications):
         where = f"applications[{index}]"
-        for node in places(app, config):
+        for node in service_nodes(app, config):
             domain = config.domain_of.get(node)
             if domain is not None:
                 asked = (("applications", app.appdef), ("nodes", node))
@@ -47,7 +47,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
             yield from _too_long(request, domain)
 
 
-def places(app: ApplicationDemand | ApplicationClaim, config: Config) -> Iterable[str]:
+def service_nodes(app: ApplicationDemand | ApplicationClaim, config: Config) -> Iterable[str]:
     """Return the nodes on which services of an application run: its own, and sources."""
     appdef = config.appdefs.get(app.appdef)
     services = appdef.services.values() if appdef else ()
@@ -58,11 +58,13 @@ def places(app: ApplicationDemand | ApplicationClaim, config: Config) -> Iterabl
 
 def _connection(where: str, asked: ConnectionDemand, config: Config) -> Iterator[Fault]:
     mqtt = asked.type == ConnectionType.MQTT.value
-    for domain, asks in asked_at_ends(asked.source, asked.target, asked.broker, mqtt, config):
+    for domain, asks in access_of_connection(
+        asked.source, asked.target, asked.broker, mqtt, config
+    ):
         yield from _unruled(where, asked.requesters, domain, asks)
 
 
-def asked_at_ends(
+def access_of_connection(
     source: str, target: str, wanted_broker: str, mqtt: bool, config: Config
 ) -> Iterator[tuple[AccessDomain, list[tuple[str, str]]]]:
     """Yield what a connection asks of the access domain of each of its ends."""
@@ -87,7 +89,7 @@ def _unruled(
     asked = list(asked)
     for index, requester in enumerate(requesters if domain.rules else ()):
         own = [rule for rule in domain.rules if matches(requester, rule.requesters)]
-        misses = [missing(rule, asked) for rule in own]
+        misses = [first_uncovered(rule, asked) for rule in own]
         if own and None in misses:
             continue
         place = f"{where}.requesters[{index}]"
@@ -106,7 +108,7 @@ def _unruled(
         yield fault(place, message, code="not-allowed")
 
 
-def missing(rule: Rule, asked: Iterable[tuple[str, str]]) -> tuple[str, str] | None:
+def first_uncovered(rule: Rule, asked: Iterable[tuple[str, str]]) -> tuple[str, str] | None:
     """Return the first thing asked that a rule does not cover; nothing where it covers all."""
     return next(
         ((kind, value) for kind, value in asked if not matches(value, getattr(rule, kind))), None
@@ -125,7 +127,7 @@ def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
     )
 
 
-def with_terms(request: DemandRequest, config: Config) -> DemandRequest:
+def with_lease_terms(request: DemandRequest, config: Config) -> DemandRequest:
     """Return the request with the lease that each subject gets, by its domain."""
 
     def term(node: str) -> Term | None:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from demandops.config.file_model import Frozen, faults_of
+from demandops.config.file_model import FrozenModel, faults_of
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import message_type_problem, topic_problem
 
@@ -78,7 +78,7 @@ def _message_type(value: str) -> str:
 MessageType = Annotated[str, AfterValidator(_message_type)]
 
 
-class RouteOptions(Frozen):
+class RouteOptions(FrozenModel):
     """The options of a route as they come from outside; each default is that of :class:`Route`."""
 
     type: MessageType = ""
@@ -137,7 +137,7 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
                 f"{quoted(route.source)} goes to {quoted(first.target)} and to "
                 f"{quoted(route.target)}; one source topic has one target, use a second connection",
             )
-        for name, stands, asked in differences(first, route):
+        for name, stands, asked in contradictions(first, route):
             yield fault(
                 f"{where}[{index}].{name}",
                 f"{quoted(route.source)} is listed with {name} {stands} and {asked}; list it once",
@@ -150,7 +150,7 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             )
 
 
-def differences(one: Route, other: Route) -> Iterator[tuple[str, object, object]]:
+def contradictions(one: Route, other: Route) -> Iterator[tuple[str, object, object]]:
     """Yield (option, its value in one, in the other) where two routes contradict each other.
 
     A message type that is not said contradicts none.
@@ -166,7 +166,7 @@ def _written(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else f"{value!r}"
 
 
-def united(routes: Iterable[Route]) -> dict[str, Route]:
+def merge_routes(routes: Iterable[Route]) -> dict[str, Route]:
     """Return routes by source topic, sorted; a type that one of them says holds for all."""
     found: dict[str, Route] = {}
     for route in routes:

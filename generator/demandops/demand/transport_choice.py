@@ -27,7 +27,7 @@ from demandops.identifiers import topic_problem
 PREFERENCE = (ConnectionType.ZENOH, ConnectionType.MQTT, ConnectionType.ROS)
 """The order of the automatic choice."""
 
-HONOURED: dict[ConnectionType, frozenset[str]] = {
+SUPPORTED_OPTIONS: dict[ConnectionType, frozenset[str]] = {
     ConnectionType.MQTT: frozenset(
         {"qos", "retained", "primitive", "reliability", "durability", "queue"}
     ),
@@ -48,14 +48,14 @@ Standing = Callable[[str], ConnectionType | None]
 """Returns the type of a connection that something holds already, or nothing."""
 
 
-def resolved(request: DemandRequest, config: Config, standing: Standing) -> DemandRequest:
+def with_chosen_types(request: DemandRequest, config: Config, standing: Standing) -> DemandRequest:
     """Return ``request`` with every ``AUTO`` made the type that carries the connection.
 
     A connection that stands keeps its type. Otherwise the first of Zenoh, MQTT and ROS that
     nothing keeps from carrying it (:func:`obstacles`); ``AUTO`` stays where there is none.
     """
     connections = tuple(
-        replace(asked, type=(standing(asked.id) or choice(asked, config)).value)
+        replace(asked, type=(standing(asked.id) or choose_type(asked, config)).value)
         if asked.type == ConnectionType.AUTO.value
         else asked
         for asked in request.connections
@@ -63,26 +63,26 @@ def resolved(request: DemandRequest, config: Config, standing: Standing) -> Dema
     return replace(request, connections=connections)
 
 
-def choice(asked: ConnectionDemand, config: Config) -> ConnectionType:
+def choose_type(asked: ConnectionDemand, config: Config) -> ConnectionType:
     """Return the type that a connection without one gets; ``AUTO`` where none can carry it."""
     for kind in PREFERENCE:
-        if next(obstacles(kind, asked, config), None) is None:
+        if next(type_faults(kind, asked, config), None) is None:
             return kind
     return ConnectionType.AUTO
 
 
-def none_fits(asked: ConnectionDemand, config: Config) -> Fault:
+def no_type_fault(asked: ConnectionDemand, config: Config) -> Fault:
     """Say of each type what keeps it from carrying a connection."""
     reasons = []
     for kind in PREFERENCE:
-        found = next(obstacles(kind, asked, config))
+        found = next(type_faults(kind, asked, config))
         place = "" if found.field == "type" else f"{found.field} "
         reasons.append(f"{kind.name}: {place}{found.message}")
     message = f"is open, and nothing can carry it. {'; '.join(reasons)}"
     return fault("type", message, code=_UNCARRIED)
 
 
-def obstacles(kind: ConnectionType, asked: ConnectionDemand, config: Config) -> Iterator[Fault]:
+def type_faults(kind: ConnectionType, asked: ConnectionDemand, config: Config) -> Iterator[Fault]:
     """Yield what keeps ``kind`` from carrying a connection, by fields of :class:`ConnectionDemand`.
 
     Nodes that are not in the inventory are told elsewhere and passed over here.
@@ -94,10 +94,10 @@ def obstacles(kind: ConnectionType, asked: ConnectionDemand, config: Config) -> 
             code=_UNCARRIED,
         )
     yield from _ends(kind, asked, config)
-    yield from misfits(kind, asked.topics, (asked.source, asked.target), config)
+    yield from route_faults(kind, asked.topics, (asked.source, asked.target), config)
 
 
-def misfits(
+def route_faults(
     kind: ConnectionType, topics: Iterable[Route], ends: tuple[str, str], config: Config
 ) -> Iterator[Fault]:
     """Yield what of the routes between two ends ``kind`` cannot do, by ``topics[i].<option>``."""
@@ -173,9 +173,9 @@ def _zenoh_ends(source: Node, target: Node) -> Iterator[Fault]:
 
 def _options(where: str, kind: ConnectionType, route: Route) -> Iterator[Fault]:
     for name in route.options():
-        if name in _ALWAYS or name in HONOURED[kind]:
+        if name in _ALWAYS or name in SUPPORTED_OPTIONS[kind]:
             continue
-        able = [other for other in PREFERENCE if name in HONOURED[other]]
+        able = [other for other in PREFERENCE if name in SUPPORTED_OPTIONS[other]]
         names = " or ".join(f"{other.value} ({other.name})" for other in able)
         yield fault(
             f"{where}.{name}",

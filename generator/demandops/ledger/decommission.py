@@ -13,7 +13,7 @@ from datetime import datetime
 from types import MappingProxyType
 
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim, Subject, SubjectKind
-from demandops.demand.demand_request import DemandRequest, Leaving
+from demandops.demand.demand_request import DecommissionTarget, DemandRequest
 from demandops.errors import Fault, Refused, fault, suggestion
 from demandops.ledger.ledger import Changes, Ledger, differences
 
@@ -54,7 +54,7 @@ def needs(claim: Claim, node: str) -> bool:
     return node in (claim.source, claim.target, claim.broker)
 
 
-def _left_of(claim: Claim, leaving: Leaving, now: datetime) -> Claim | None:
+def _left_of(claim: Claim, leaving: DecommissionTarget, now: datetime) -> Claim | None:
     if "requester" in leaving.kinds and leaving.name in claim.requesters:
         return None
     return _without_node(claim, leaving.name, now) if needs(claim, leaving.name) else claim
@@ -75,7 +75,7 @@ def _without_node(claim: Claim, node: str, now: datetime) -> Claim | None:
     return replace(claim, inputs=MappingProxyType(inputs), booked=now) if inputs else None
 
 
-def _nothing_held(ledger: Ledger, leaving: Leaving) -> Fault:
+def _nothing_held(ledger: Ledger, leaving: DecommissionTarget) -> Fault:
     """Say that nothing is held, with a name that comes near: a typo must show."""
     names = [ledger.names("requester")] if "requester" in leaving.kinds else []
     names += [ledger.names("node"), ledger.names("link")] if "node" in leaving.kinds else []

@@ -131,7 +131,7 @@ def _route_conflicts(
             "one target, use a second connection",
             code="conflict",
         )
-    for name, value, wanted in routes.differences(stands, asked):
+    for name, value, wanted in routes.contradictions(stands, asked):
         yield fault(
             f"{where}.{name}",
             f"{name} {wanted} of '{asked.source}' contradicts what stands: {held} with {name} "
@@ -206,7 +206,7 @@ def _joined_connection(
         source=asked.source,
         target=asked.target,
         broker=asked.broker or broker,
-        topics=MappingProxyType(routes.united([*known.values(), *asked.topics])),
+        topics=MappingProxyType(routes.merge_routes([*known.values(), *asked.topics])),
         lease=renewed(standing.lease if standing else None, asked.term, now),
     )
     return touched(claim, standing, now)

@@ -105,7 +105,7 @@ def _connection(
         source=asked.source,
         target=asked.target,
         broker=asked.broker,
-        topics=MappingProxyType(routes.united(asked.topics)),
+        topics=MappingProxyType(routes.merge_routes(asked.topics)),
         lease=renewed(standing.lease if standing else None, asked.term, now),
     )
     return touched(claim, standing, now)

@@ -14,7 +14,7 @@ from datetime import datetime
 
 from demandops.config.config import Config
 from demandops.demand import admission, permission
-from demandops.demand.claim import ApplicationClaim, Claim, is_kept
+from demandops.demand.claim import ApplicationClaim, Claim, is_override_claim
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -55,7 +55,7 @@ def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
     assert isinstance(request, Restoration)  # noqa: S101 - the operation says so
     changes = _changes(ledger, request)
     if not request.drop_newer:
-        newer = [c for c in changes if c.before is not None and not is_kept(c.before)]
+        newer = [c for c in changes if c.before is not None and not is_override_claim(c.before)]
         if newer:
             raise Refused(_newer(newer))
     start = ledger
@@ -76,7 +76,7 @@ def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
 def _alike(one: Claim | None, other: Claim | None) -> bool:
     if one is None or other is None:
         return one is other
-    if is_kept(one):  # when it was kept is no part of what is asked
+    if is_override_claim(one):  # when it was kept is no part of what is asked
         one = replace(one, booked=other.booked)
     return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
 
@@ -109,7 +109,9 @@ def _newer(changes: list[ClaimChange]) -> Iterator[Fault]:
 def faults(request: Restoration, ledger: Ledger, config: Config) -> Iterator[Fault]:
     """Yield why claims that come back are not possible any more, by what is configured now."""
     for change in _changes(ledger, request):
-        if change.after is None or is_kept(change.after):  # overrides keep or drop their own
+        if change.after is None or is_override_claim(
+            change.after
+        ):  # overrides keep or drop their own
             continue
         asked = _asked(change.after)
         for found in (*admission.faults(asked, config), *permission.faults(asked, config)):

@@ -18,7 +18,7 @@ from demandops.demand import route as routes
 from demandops.demand.claim import ConnectionClaim
 from demandops.demand.demand_request import ConnectionType
 from demandops.demand.route import Route
-from demandops.demand.transport_choice import choose_broker, message_type, misfits
+from demandops.demand.transport_choice import choose_broker, message_type, route_faults
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.apply import Ledger
 from demandops.plan import naming
@@ -57,7 +57,7 @@ def keys_of(ledger: Ledger, connection: str) -> Iterator[EndKey | BridgeKey]:
 
 def connection_topics(claims: Iterable[ConnectionClaim]) -> dict[str, Route]:
     """Return the routes by source topic, united over a connection's claims and sorted."""
-    return routes.united(route for claim in claims for route in claim.topics.values())
+    return routes.merge_routes(route for claim in claims for route in claim.topics.values())
 
 
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
@@ -85,7 +85,7 @@ def carried(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[str, Ro
         for name, route in connection_topics(claims).items()
         if not is_bridged(route, first.source, first.target, config)
     }
-    found = list(misfits(first.type, topics.values(), (first.source, first.target), config))
+    found = list(route_faults(first.type, topics.values(), (first.source, first.target), config))
     if found:
         raise Refused(
             replace(one, field="connections", message=f"'{first.connection}': {one.message}")

@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 
 from demandops.config.config import Config
-from demandops.config.override import Override, written
+from demandops.config.override import Override, format_time
 from demandops.plan.release import Release
 from demandops.render.engine import Engine
 from demandops.render.gitops import controller
@@ -50,7 +50,7 @@ def _commented(lines: list[str], body: str) -> str:
 
 def line(override: Override, effects: tuple[str, ...]) -> str:
     """Return the comment line for an override."""
-    until = f"until {written(override.end)}; " if override.end else ""
+    until = f"until {format_time(override.end)}; " if override.end else ""
     return (
         f"# override {override.path}: {', '.join(effects)}; priority {override.priority}; {until}"
         f"owner {override.owner}; reason: {override.reason}"

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from demandops.demand import transport_choice
-from demandops.demand.route import Route, RouteOptions, differences, faults, parse, united
+from demandops.demand.route import Route, RouteOptions, contradictions, faults, merge_routes, parse
 
 OPTIONS: dict[str, object] = {
     "type": "std_msgs/msg/String",
@@ -47,7 +47,7 @@ def test_options_and_routes_have_the_same_fields_and_defaults() -> None:
 
 
 def test_every_option_does_something_in_some_client() -> None:
-    honoured = set().union(*transport_choice.HONOURED.values())
+    honoured = set().union(*transport_choice.SUPPORTED_OPTIONS.values())
     assert honoured == RouteOptions.model_fields.keys() - {"type", "reverse"}
 
 
@@ -111,10 +111,10 @@ def test_two_topics_may_arrive_as_one() -> None:
 
 def test_a_type_that_is_not_said_contradicts_none_and_is_filled_in() -> None:
     plain, typed = Route("/a", "/a"), Route("/a", "/a", type="std_msgs/msg/String")
-    assert not list(differences(plain, typed))
-    assert united([plain, typed]) == united([typed, plain]) == {"/a": typed}
+    assert not list(contradictions(plain, typed))
+    assert merge_routes([plain, typed]) == merge_routes([typed, plain]) == {"/a": typed}
     other = Route("/a", "/a", type="std_msgs/msg/Bool")
-    assert list(differences(typed, other)) == [
+    assert list(contradictions(typed, other)) == [
         ("type", "'std_msgs/msg/String'", "'std_msgs/msg/Bool'")
     ]
 

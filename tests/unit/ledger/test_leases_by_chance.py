@@ -16,7 +16,7 @@ from demandops.decision import Decision, State
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim
 from demandops.demand.demand_request import ConnectionType, InputTopic
 from demandops.demand.lease import LONGEST_S, Lease
-from demandops.demand.route import Route, united
+from demandops.demand.route import Route, merge_routes
 from demandops.identifiers import id_problem
 from demandops.ledger import claim_file as ledger_format
 from demandops.ledger.apply import Ledger
@@ -300,7 +300,9 @@ connections = st.builds(
     source=ids,
     target=ids,
     broker=st.just("") | ids,
-    topics=st.lists(routes, min_size=1, max_size=3).map(lambda r: MappingProxyType(united(r))),
+    topics=st.lists(routes, min_size=1, max_size=3).map(
+        lambda r: MappingProxyType(merge_routes(r))
+    ),
     **common,
 )
 

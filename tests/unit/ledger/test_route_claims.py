@@ -16,7 +16,7 @@ from demandops.demand.demand_request import (
     DemandRequest,
     Operation,
 )
-from demandops.demand.route import Route, united
+from demandops.demand.route import Route, merge_routes
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger import claim_file as ledger_format
 from demandops.ledger.apply import Ledger, apply
@@ -36,7 +36,7 @@ def claim(*routes: Route, kind: ConnectionType = ConnectionType.MQTT) -> Connect
         source="s",
         target="t",
         broker="",
-        topics=MappingProxyType(united(routes)),
+        topics=MappingProxyType(merge_routes(routes)),
     )
 
 

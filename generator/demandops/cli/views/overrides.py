@@ -16,7 +16,7 @@ from demandops.cli.output import (
     progress,
     state_repo_option,
 )
-from demandops.config.override import ImagePin, written
+from demandops.config.override import ImagePin, format_time
 from demandops.plan.views.override_report import Entry, survey
 from demandops.staterepo import reader
 
@@ -52,7 +52,7 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
             "\n".join([*entry.releases, *entry.claims]),
             str(one.priority),
             one.owner,
-            written(one.end) if one.end else "",
+            format_time(one.end) if one.end else "",
             one.reason,
         )
     out.print(table)
@@ -82,7 +82,7 @@ def _row(entry: Entry) -> dict[str, Any]:
         "claims": list(entry.claims),
         "priority": one.priority,
         "owner": one.owner,
-        "until": written(one.end) if one.end else None,
+        "until": format_time(one.end) if one.end else None,
         "reason": one.reason,
     }
 

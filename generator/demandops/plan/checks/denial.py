@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from demandops.config.config import Config
-from demandops.config.override import Override, Selector, written
+from demandops.config.override import Override, Selector, format_time
 from demandops.config.policy import matches
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, DemandRequest
@@ -101,7 +101,7 @@ def _field(selector: Selector, asked: ApplicationDemand | ConnectionDemand, conf
 
 
 def _told(override: Override) -> str:
-    until = f" until {written(override.end)}" if override.end else ""
+    until = f" until {format_time(override.end)}" if override.end else ""
     return (
         f"is denied by {override.path}{until}: {override.reason}; ask its owner, {override.owner}, "
         "or leave it out"

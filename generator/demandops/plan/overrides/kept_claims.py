@@ -13,7 +13,7 @@ from datetime import datetime
 
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.demand.claim import KEPT, Claim, ClaimKey, Subject, SubjectKind, is_kept
+from demandops.demand.claim import KEPT, Claim, ClaimKey, Subject, SubjectKind, is_override_claim
 from demandops.demand.demand_request import DemandRequest
 from demandops.ledger.apply import Changes, Ledger
 from demandops.ledger.ledger import differences
@@ -33,7 +33,7 @@ def giving_way(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
     """Return the ledger without the overrides' own claims on these subjects."""
     for subject in subjects:
         for claim in ledger.of(subject):
-            if is_kept(claim):
+            if is_override_claim(claim):
                 ledger = ledger.replace(claim.key, None)
     return ledger
 
@@ -64,9 +64,9 @@ def kept(
     """
     keys: list[ClaimKey] = []
     for subject in subjects:
-        own = [c for c in (*after.of(subject), *before.of(subject)) if is_kept(c)]
+        own = [c for c in (*after.of(subject), *before.of(subject)) if is_override_claim(c)]
         wanted = None
-        if all(is_kept(claim) for claim in after.of(subject)):
+        if all(is_override_claim(claim) for claim in after.of(subject)):
             wanted = _wanted(own, before.of(subject), world)
         for claim in own:
             keys.append(claim.key)
@@ -79,7 +79,7 @@ def kept(
 
 def subjects_kept(ledger: Ledger) -> tuple[Subject, ...]:
     """Return every subject that an override's own claim holds."""
-    found = {claim.subject for claim in ledger if is_kept(claim)}
+    found = {claim.subject for claim in ledger if is_override_claim(claim)}
     return tuple(sorted(found, key=str))
 
 
@@ -108,7 +108,7 @@ def keepers(claim: Claim, config: Config) -> list[Override]:
 
     One of an override's own stands in its owner's name, so there ``requesters`` has been judged.
     """
-    traits, whoever = traits_of(claim), is_kept(claim)
+    traits, whoever = traits_of(claim), is_override_claim(claim)
     return [
         one
         for one in reversed(config.active_overrides)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from demandops.config.config import Config
-from demandops.config.override import Override, written
+from demandops.config.override import Override, format_time
 from demandops.demand.claim import ClaimKey, Subject
 from demandops.ledger import claim_file as ledger_format
 from demandops.ledger import ended_override_file
@@ -55,7 +55,7 @@ def taken_in(
         for name, end in config.ended_overrides.items()
         if ended_override_file.path_of(name) not in gone
     }
-    ended |= {one.name: written(one.end) for one in late if one.end}
+    ended |= {one.name: format_time(one.end) for one in late if one.end}
     config = config.with_ended_overrides(ended)
     files: dict[str, str | None] = dict.fromkeys(gone)
     files |= {ended_override_file.path_of(one.name): ended_override_file.write(one) for one in late}
@@ -71,7 +71,7 @@ def ended(state: tuple[Ledger, Config], override: Override, now: datetime) -> Ta
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     after = config.with_ended_overrides(
-        {**config.ended_overrides, override.name: written(override.end)}
+        {**config.ended_overrides, override.name: format_time(override.end)}
     )
     found = taken_in(state, (ledger, after), (), {}, now)
     marker = {ended_override_file.path_of(override.name): ended_override_file.write(override)}

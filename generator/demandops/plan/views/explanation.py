@@ -21,7 +21,14 @@ from demandops.config.config import (
 )
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.demand.claim import KEPT, ApplicationClaim, Claim, Subject, demand_id, is_kept
+from demandops.demand.claim import (
+    KEPT,
+    ApplicationClaim,
+    Claim,
+    Subject,
+    demand_id,
+    is_override_claim,
+)
 from demandops.ledger.apply import Ledger
 from demandops.plan.planner import denied, plan
 from demandops.plan.release import Bridge, MqttEnd, Release, ServiceRelease
@@ -84,7 +91,7 @@ def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
 
 def how_to_release(claim: Claim) -> str:
     """Return how its requesters give a claim up."""
-    if is_kept(claim):
+    if is_override_claim(claim):
         return f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(KEPT)}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):
         return f"send request '{claim.request}' again with shutdown: true"
@@ -112,7 +119,9 @@ def denied_called(ledger: Ledger, config: Config, name: str) -> tuple[Release, O
 
 def kept_by(claim: Claim, config: Config) -> Override | None:
     """Return the override whose own claim this is, or nothing where somebody asks for it."""
-    return config.overrides.get(claim.demand.removeprefix(KEPT)) if is_kept(claim) else None
+    return (
+        config.overrides.get(claim.demand.removeprefix(KEPT)) if is_override_claim(claim) else None
+    )
 
 
 def _service(release: Release, config: Config) -> Iterator[Shaping]:

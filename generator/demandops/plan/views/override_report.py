@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Literal
 
 from demandops.config.config import Config
-from demandops.config.override import Override, written
+from demandops.config.override import Override, format_time
 from demandops.ledger.apply import Ledger
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.claims_in_force import suspended_by
@@ -53,7 +53,7 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
         if entry.state == "expired" and override.end:
             yield (
                 override.path,
-                f"expired at {written(override.end)} and applies no more; remove the file, or "
+                f"expired at {format_time(override.end)} and applies no more; remove the file, or "
                 "write a later time",
             )
         elif entry.state == "matches nothing":

@@ -145,7 +145,10 @@ class BranchSync:
         for ticket, decision in left:
             try:
                 step = decide(
-                    state, approval_rule.proposed(decision.request), ticket.received, read
+                    state,
+                    approval_rule.with_leases_from_approval(decision.request),
+                    ticket.received,
+                    read,
                 )
             except InvalidInput as error:
                 faulty.append((ticket, error))

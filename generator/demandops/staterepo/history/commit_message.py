@@ -12,7 +12,7 @@ from datetime import datetime, timezone
 
 import pygit2
 
-from demandops.config.override import OVERRIDES_ROOT, Override, written
+from demandops.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.decision import Decision
 from demandops.demand.claim import KEPT, ClaimKey, SubjectKind
 from demandops.demand.demand_request import DemandRequest, Operation
@@ -242,7 +242,7 @@ def of_ended(
         f"End override {override.name}",
         "",
         f"Why: {override.path} of {override.owner} ({override.reason}) expired at "
-        f"{written(override.end) if override.end else ''}.",
+        f"{format_time(override.end) if override.end else ''}.",
         "",
         *(_desired_state(releases) if releases else ["Desired state: unchanged."]),
     ]

@@ -16,7 +16,7 @@ from pathlib import Path
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
-from demandops.config.override import written
+from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, rehearse, rendered
 from demandops.errors import Fault, InvalidInput, fault
@@ -185,7 +185,7 @@ def _marked(files: Mapping[str, str]) -> dict[str, str]:
 def _with_ended(config: Config, files: Mapping[str, str], now: datetime) -> Config:
     """Return the configuration without the overrides that a generator ended, or would at once."""
     config = config.with_ended_overrides(ended_override_file.read(_marked(files)))
-    over = {one.name: written(one.end) for one in due(config, now) if one.end}
+    over = {one.name: format_time(one.end) for one in due(config, now) if one.end}
     return config.with_ended_overrides({**config.ended_overrides, **over})
 
 
