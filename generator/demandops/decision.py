@@ -269,7 +269,7 @@ def _in_goals_words(faults: Iterable[Fault], request: DemandRequest, config: Con
 
 def _uncarried(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
     """Yield a warning for each input that no connection brings to the application's node."""
-    if not request.operation.asks:
+    if not request.operation.adds_claims:
         return
     ledger = in_force(ledger, config)
     for app in request.applications:
@@ -284,13 +284,13 @@ def _uncarried(request: DemandRequest, ledger: Ledger, config: Config) -> Iterat
 
 def _bridged(request: DemandRequest, config: Config) -> Iterator[str]:
     """Yield a warning for each topic that the initial deployment carries already."""
-    if not request.operation.asks:
+    if not request.operation.adds_claims:
         return
     for connection in request.connections:
         for route in connection.topics:
             if is_bridged(route, connection.source, connection.target, config):
                 yield (
-                    f"connection '{connection.id}': {route.read} is bridged between "
+                    f"connection '{connection.id}': {route.read_topic} is bridged between "
                     f"'{connection.source}' and '{connection.target}' already, so no client "
                     "carries it"
                 )

@@ -120,7 +120,7 @@ def _read_overrides(reading: ItemReader) -> Mapping[str, Override]:
             continue
         file = reading.one(path, OverrideFile)
         if file is not None:
-            overrides[stem] = Override.of(stem, file)
+            overrides[stem] = Override.from_file(stem, file)
     return MappingProxyType(overrides)
 
 

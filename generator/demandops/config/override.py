@@ -219,7 +219,7 @@ class Override(OverrideFile):  # noqa: PLW1641 - with mappings in them overrides
     name: str
 
     @classmethod
-    def of(cls, name: str, file: OverrideFile) -> Override:
+    def from_file(cls, name: str, file: OverrideFile) -> Override:
         """Return what a file says, by its name."""
         return cls.model_construct(file.model_fields_set | {"name"}, **dict(file), name=name)
 

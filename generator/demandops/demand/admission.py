@@ -27,7 +27,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
     A shutdown is not held to the inventory: what a removed node still holds can be released.
     """
     yield from shape.faults(request)
-    joining = request.operation.asks
+    joining = request.operation.adds_claims
     for index, app in enumerate(request.applications):
         yield from _application(f"applications[{index}]", app, config, joining)
     for index, connection in enumerate(request.connections):

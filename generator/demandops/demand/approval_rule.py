@@ -31,7 +31,7 @@ def approval_reasons(
         changes: each claim that it changes, before and after.
         config: the access domains and application definitions.
     """
-    if not request.operation.asks:
+    if not request.operation.adds_claims:
         return ()
     listed = set(subjects_of(request))
     asked = (

@@ -116,12 +116,10 @@ class ConnectionClaim:
 
 Claim = ApplicationClaim | ConnectionClaim
 
-KEPT = OVERRIDE_PREFIX
-
 
 def is_override_claim(claim: Claim) -> bool:
     """Tell whether an override holds a claim, rather than a demand."""
-    return claim.demand.startswith(KEPT)
+    return claim.demand.startswith(OVERRIDE_PREFIX)
 
 
 def demand_id(request: str, requesters: Iterable[str]) -> str:

@@ -44,4 +44,6 @@ def parse(data: dict[str, Any]) -> DemandRequest:
         raise Refused(faults)
     kinds = frozenset(kind for kind in data.get("as", ()) if kind in ("node", "requester"))
     leaving = DecommissionTarget(str(name), kinds, str(data.get("by") or ""))
-    return DemandRequest(id=str(name), operation=Operation.DECOMMISSION, leaving=leaving)
+    return DemandRequest(
+        id=str(name), operation=Operation.DECOMMISSION, decommission_target=leaving
+    )

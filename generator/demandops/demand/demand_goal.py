@@ -134,7 +134,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         ),
         connections=tuple(_connection(connection, requesters) for connection in goal.connections),
         demand=goal.demand,
-        named_by=requesters,
+        own_requesters=requesters,
         lease_s=_lease(goal.lease, faults),
     )
     return request, faults
@@ -243,4 +243,4 @@ def goal_field(path: str, request: DemandRequest) -> str:
         if pattern.match(path):
             return pattern.sub(replacement, path)
     of = _OF_CONNECTION.match(path)
-    return (request.connections[int(of[1])].because if of else "") or path
+    return (request.connections[int(of[1])].for_input if of else "") or path

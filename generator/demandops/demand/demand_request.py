@@ -42,7 +42,7 @@ class Operation(Enum):
     ROLLBACK = "rollback"
 
     @property
-    def asks(self) -> bool:
+    def adds_claims(self) -> bool:
         """Tell whether something is asked for, rather than given up or kept."""
         return self in (Operation.JOIN, Operation.PUT)
 
@@ -106,7 +106,7 @@ class ConnectionDemand:
     broker: str
     requesters: tuple[str, ...]
     term: Term | None = None
-    because: str = ""
+    for_input: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ class DemandRequest:
     """A whole request: booked as a whole or refused as a whole.
 
     ``demand`` is the demand's id where the request names it; the reference's does not, and there
-    it is made for each subject (:func:`demandops.demand.claim.demand_id`). ``named_by`` says in
+    it is made for each subject (:func:`demandops.demand.claim.demand_id`). ``own_requesters`` says in
     whose name a request speaks that lists no subject. ``lease_s`` is the lease that it asks for, in
     seconds.
     """
@@ -133,21 +133,21 @@ class DemandRequest:
     applications: tuple[ApplicationDemand, ...] = ()
     connections: tuple[ConnectionDemand, ...] = ()
     demand: str = ""
-    named_by: tuple[str, ...] = ()
+    own_requesters: tuple[str, ...] = ()
     lease_s: int | None = None
-    leaving: DecommissionTarget | None = None
+    decommission_target: DecommissionTarget | None = None
 
     def requesters(self) -> tuple[str, ...]:
         """Return everybody in whose name something is asked, in the order listed, each once."""
         subjects: tuple[ApplicationDemand | ConnectionDemand, ...]
         subjects = (*self.applications, *self.connections)
         listed = (who for subject in subjects for who in subject.requesters)
-        return tuple(dict.fromkeys((*self.named_by, *listed)))
+        return tuple(dict.fromkeys((*self.own_requesters, *listed)))
 
 
 def faults(request: DemandRequest) -> Iterator[Fault]:
     """Yield every fault of a request that shows without looking at configuration or ledger."""
-    joining = request.operation.asks
+    joining = request.operation.adds_claims
     if request.id and request.id != request.demand:  # which it is where none is given
         yield from _id("id", request.id)
     yield from _named(request)
@@ -181,7 +181,7 @@ def _named(request: DemandRequest) -> Iterator[Fault]:
             "demand", f"starts with '{OVERRIDE_PREFIX}', as overrides do; choose another demand id"
         )
     if not (request.applications or request.connections):  # else told for each of these
-        yield from _requesters("requesters", request.named_by)
+        yield from _requesters("requesters", request.own_requesters)
     if request.lease_s is not None and not 0 < request.lease_s <= LONGEST_S:
         yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
     if request.operation is not Operation.PUT and request.lease_s is not None:

@@ -28,7 +28,7 @@ class Term:
     slack: int = 0
     on_approval: bool = False
 
-    def starting(self, now: datetime) -> Lease:
+    def lease_from(self, now: datetime) -> Lease:
         """Return the lease of a claim that is asked for at ``now``."""
         if self.on_approval:
             return Lease(self.seconds, self.slack, UNSTARTED)
@@ -48,12 +48,12 @@ class Lease:
         """Tell whether its time runs: what is proposed waits for the approval."""
         return self.until < UNSTARTED
 
-    def begun(self, now: datetime) -> Lease:
+    def restarted(self, now: datetime) -> Lease:
         """Return the lease with its whole term to run from ``now``."""
-        return Term(self.seconds, self.slack).starting(now)
+        return Term(self.seconds, self.slack).lease_from(now)
 
     @property
-    def ends(self) -> datetime:
+    def expires_at(self) -> datetime:
         """When the claim may be released: after every renewal that was not recorded."""
         return self.until + timedelta(seconds=self.slack)
 
@@ -62,8 +62,11 @@ class Lease:
 
         The end never moves to an earlier time: the clock may have been set back.
         """
-        wanted = term.starting(now)
-        if (self.seconds, self.slack) == (term.seconds, term.slack) and wanted.until <= self.ends:
+        wanted = term.lease_from(now)
+        if (self.seconds, self.slack) == (
+            term.seconds,
+            term.slack,
+        ) and wanted.until <= self.expires_at:
             return self
         return replace(wanted, until=max(wanted.until, self.until))
 
@@ -72,4 +75,4 @@ def renewed(standing: Lease | None, term: Term | None, now: datetime) -> Lease |
     """Return the lease of a claim that is asked for again; nothing where it has no end."""
     if term is None:
         return None
-    return standing.renewed(term, now) if standing else term.starting(now)
+    return standing.renewed(term, now) if standing else term.lease_from(now)

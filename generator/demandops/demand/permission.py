@@ -28,7 +28,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 
     Giving something up needs no permission. Nodes that are in no domain are told elsewhere.
     """
-    if not request.operation.asks:
+    if not request.operation.adds_claims:
         return
     for index, app in enumerate(request.applications):
         where = f"applications[{index}]"

@@ -50,16 +50,16 @@ class Route:
         }
 
     @property
-    def read(self) -> str:
+    def read_topic(self) -> str:
         """The topic that is read, at the end where messages come from."""
         return self.target if self.reverse else self.source
 
     @property
-    def written(self) -> str:
+    def written_topic(self) -> str:
         """The topic that is written, at the end where messages arrive."""
         return self.source if self.reverse else self.target
 
-    def ends(self, source: str, target: str) -> tuple[str, str]:
+    def sender_and_receiver(self, source: str, target: str) -> tuple[str, str]:
         """Return the nodes that messages come from and arrive at, of a connection's two ends."""
         return (target, source) if self.reverse else (source, target)
 

@@ -107,7 +107,7 @@ def route_faults(
         where = f"topics[{index}]"
         yield from _options(where, kind, route)
         if kind is ConnectionType.ROS:
-            yield from _of_dds(where, route, route.ends(*ends)[0], config)
+            yield from _of_dds(where, route, route.sender_and_receiver(*ends)[0], config)
         if kind is not ConnectionType.MQTT and route.source != route.target:
             yield fault(
                 f"{where}.target",
@@ -201,7 +201,7 @@ def _of_dds(where: str, route: Route, node: str, config: Config) -> Iterator[Fau
 def message_type(route: Route, node: str, config: Config) -> str:
     """Return the message type of a route that is read on ``node``, as said or by the inventory."""
     known = config.nodes.get(node)
-    return route.type or (known.types.get(route.read, "") if known else "")
+    return route.type or (known.types.get(route.read_topic, "") if known else "")
 
 
 def choose_broker(requested: str, source: str, target: str, config: Config) -> Broker | None:

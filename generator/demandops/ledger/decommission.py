@@ -24,7 +24,7 @@ def decommission(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple
     Raises:
         Refused: where it holds nothing.
     """
-    leaving = request.leaving
+    leaving = request.decommission_target
     assert leaving is not None  # noqa: S101 - a request to decommission says what
     start, claims = ledger, dict[str, Claim]()
     if "node" in leaving.kinds:

@@ -139,7 +139,7 @@ def renew(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
 def expire(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
     """Release what of a demand has come to the end of its lease; nothing where it was renewed."""
     held = ledger.of_demand(request.demand)
-    return _without(ledger, [c for c in held if c.lease is not None and c.lease.ends < now])
+    return _without(ledger, [c for c in held if c.lease is not None and c.lease.expires_at < now])
 
 
 def _without(ledger: Ledger, claims: Iterable[Claim]) -> tuple[Ledger, Changes]:
@@ -155,7 +155,7 @@ def _owned(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
         near = sorted(
             {
                 claim.demand
-                for requester in request.named_by
+                for requester in request.own_requesters
                 for claim in ledger.of_requester(requester)
             }
         )

@@ -86,7 +86,7 @@ def _fresh(change: ClaimChange, now: datetime) -> Claim | None:
     if claim is None or claim.lease is None:
         return claim
     term = Term(claim.lease.seconds, claim.lease.slack)
-    lease: Lease = term.starting(now)
+    lease: Lease = term.lease_from(now)
     return replace(claim, lease=lease)
 
 

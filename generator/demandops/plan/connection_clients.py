@@ -65,11 +65,11 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
 
     It keeps names, so a route that gives the topic another name is not carried by it.
     """
-    giving, taking = route.ends(source, target)
+    giving, taking = route.sender_and_receiver(source, target)
     node = config.nodes.get(giving)
     if node is None or route.source != route.target:
         return False
-    return route.read in node.bridged.get(taking, ())
+    return route.read_topic in node.bridged.get(taking, ())
 
 
 def carried(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[str, Route]:
@@ -152,7 +152,7 @@ def _ros_end(ledger: Ledger, config: Config, key: EndKey, topics: dict[str, Rout
     claim = ledger.connection(key.connection)[0]
     ends = (claim.source, claim.target)
     typed = {
-        name: replace(route, type=message_type(route, route.ends(*ends)[0], config))
+        name: replace(route, type=message_type(route, route.sender_and_receiver(*ends)[0], config))
         for name, route in topics.items()
     }
     listener = _listener(claim, config)
@@ -226,10 +226,10 @@ def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
         source, target = claims[0].source, claims[0].target
         for route in carried(claims, config).values():
             connections[id] = target if key.node == source else source
-            if key.node != route.ends(source, target)[0]:
-                subscribers.add(route.written)
+            if key.node != route.sender_and_receiver(source, target)[0]:
+                subscribers.add(route.written_topic)
                 continue
-            rate, other = publishers.setdefault(route.read, (route.rate, id))
+            rate, other = publishers.setdefault(route.read_topic, (route.rate, id))
             if rate != route.rate:
                 raise Refused([_two_rates(route, id, rate, other, key.node)])
     if not connections:
@@ -251,7 +251,7 @@ def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
 def _two_rates(route: Route, id: str, rate: float, other: str, node: str) -> Fault:
     return fault(
         "connections",
-        f"rate {route.rate} of '{route.read}' in '{id}' contradicts what stands: '{other}' carries "
+        f"rate {route.rate} of '{route.read_topic}' in '{id}' contradicts what stands: '{other}' carries "
         f"it from '{node}' with rate {rate}, and the node's bridge has one for each topic; use the "
         "same",
         code="conflict",

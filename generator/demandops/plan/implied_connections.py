@@ -30,7 +30,7 @@ def with_connections(request: DemandRequest, ledger: Ledger, config: Config) -> 
     """
     found = list(request.connections)
     brought = {
-        (route.ends(connection.source, connection.target)[1], route.written)
+        (route.sender_and_receiver(connection.source, connection.target)[1], route.written_topic)
         for connection in request.connections
         for route in connection.topics
     }
@@ -45,7 +45,7 @@ def with_connections(request: DemandRequest, ledger: Ledger, config: Config) -> 
             same = (wanted.id, wanted.source, wanted.target)
             known = next((c for c in found if (c.id, c.source, c.target) == same), None)
             if known is None:
-                found.append(replace(wanted, because=f"applications[{index}].{foreign.field}"))
+                found.append(replace(wanted, for_input=f"applications[{index}].{foreign.field}"))
                 continue
             topics = dict.fromkeys((*known.topics, *wanted.topics))
             found[found.index(known)] = replace(known, topics=tuple(topics))

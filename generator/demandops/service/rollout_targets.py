@@ -51,7 +51,7 @@ def of_state(state: State) -> list[tuple[Release, Target]]:
 
 def _asked(request: DemandRequest, ledger: Ledger) -> list[Subject]:
     subjects = [claim.subject for claim in ledger.of_demand(request.demand)]
-    if request.operation.asks:
+    if request.operation.adds_claims:
         subjects += [Subject(SubjectKind.APPLICATION, app.id) for app in request.applications]
         subjects += [Subject(SubjectKind.CONNECTION, one.id) for one in request.connections]
     return subjects

@@ -121,5 +121,13 @@ def test_a_type_that_is_not_said_contradicts_none_and_is_filled_in() -> None:
 
 def test_where_messages_come_from_and_arrive() -> None:
     there, back = Route("/a", "/b"), Route("/a", "/b", reverse=True)
-    assert (there.read, there.written, there.ends("s", "t")) == ("/a", "/b", ("s", "t"))
-    assert (back.read, back.written, back.ends("s", "t")) == ("/b", "/a", ("t", "s"))
+    assert (there.read_topic, there.written_topic, there.sender_and_receiver("s", "t")) == (
+        "/a",
+        "/b",
+        ("s", "t"),
+    )
+    assert (back.read_topic, back.written_topic, back.sender_and_receiver("s", "t")) == (
+        "/b",
+        "/a",
+        ("t", "s"),
+    )

@@ -134,7 +134,7 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     assert ledger_format.read(text, path) == claim
     found = {one.key for one in waiting.state.ledger.unstarted()}
     assert found == {one.key for one in waiting.state.ledger.of_demand("d")}
-    later = claim.lease.begun(NOW)
+    later = claim.lease.restarted(NOW)
     assert (later.seconds, (later.until - NOW).total_seconds()) == (60, 60)
     assert waiting.state.ledger.ended(NOW.replace(year=2100)) == ()
 

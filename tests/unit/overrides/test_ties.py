@@ -197,7 +197,7 @@ def test_what_is_not_contested_is_the_same_in_either_order(
 def _override(name: str, fields: dict[str, Any]) -> Override:
     head = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "r", "owner": "o"}
     file = OverrideFile.model_validate(head | {"select": [{"nodes": ["*"]}]} | fields)
-    return Override.of(name, file)
+    return Override.from_file(name, file)
 
 
 def _shaped(overrides: list[Override]) -> tuple[Any, ...]:

@@ -26,7 +26,7 @@ def faults(
 ) -> Iterator[Fault]:
     """Yield each thing that a request asks anew and an override denies."""
     denying = [one for one in reversed(config.active_overrides) if one.deny]
-    if not denying or not request.operation.asks:
+    if not denying or not request.operation.adds_claims:
         return
     renewed = {
         change.key.subject: change.before is not None

@@ -11,7 +11,8 @@ from dataclasses import replace
 
 from demandops.config.config import DDS_ROUTER_IMAGE, MQTT_CLIENT_IMAGE, ZENOH_BRIDGE_IMAGE, Config
 from demandops.config.override import Override
-from demandops.demand.claim import KEPT, Claim
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.apply import Ledger
 from demandops.plan.overrides.claims_in_force import denied_by
 from demandops.plan.overrides.selectors import Traits, selects
@@ -36,7 +37,11 @@ def shaped(release: Release, ledger: Ledger, config: Config) -> Release | None:
     traits = _traits(release, claims)
     if denying(release, ledger, config) is not None:
         return None
-    kept = {claim.demand.removeprefix(KEPT) for claim in claims if claim.demand.startswith(KEPT)}
+    kept = {
+        claim.demand.removeprefix(OVERRIDE_PREFIX)
+        for claim in claims
+        if claim.demand.startswith(OVERRIDE_PREFIX)
+    }
     by = []
     for override in config.active_overrides:
         effects = _effects(release, override, config) if selects(override, traits, config) else ()

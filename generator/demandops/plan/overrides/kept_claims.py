@@ -13,8 +13,8 @@ from datetime import datetime
 
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.demand.claim import KEPT, Claim, ClaimKey, Subject, SubjectKind, is_override_claim
-from demandops.demand.demand_request import DemandRequest
+from demandops.demand.claim import Claim, ClaimKey, Subject, SubjectKind, is_override_claim
+from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest
 from demandops.ledger.apply import Changes, Ledger
 from demandops.ledger.ledger import differences
 from demandops.plan.overrides.claims_in_force import suspended_by
@@ -88,7 +88,7 @@ def _wanted(
 ) -> Claim | None:
     config, now = world
     for claim in own:
-        if any(KEPT + one.name == claim.demand for one in keepers(claim, config)):
+        if any(OVERRIDE_PREFIX + one.name == claim.demand for one in keepers(claim, config)):
             return claim
     if not stood:
         return None
@@ -96,7 +96,7 @@ def _wanted(
     if suspended_by(last, config) is not None:
         return None
     for override in keepers(last, config):
-        name = KEPT + override.name
+        name = OVERRIDE_PREFIX + override.name
         return replace(
             last, demand=name, request=name, requesters=(override.owner,), booked=now, lease=None
         )

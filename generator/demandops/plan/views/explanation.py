@@ -21,14 +21,8 @@ from demandops.config.config import (
 )
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.demand.claim import (
-    KEPT,
-    ApplicationClaim,
-    Claim,
-    Subject,
-    demand_id,
-    is_override_claim,
-)
+from demandops.demand.claim import ApplicationClaim, Claim, Subject, demand_id, is_override_claim
+from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.apply import Ledger
 from demandops.plan.planner import denied, plan
 from demandops.plan.release import Bridge, MqttEnd, Release, ServiceRelease
@@ -92,7 +86,9 @@ def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
 def how_to_release(claim: Claim) -> str:
     """Return how its requesters give a claim up."""
     if is_override_claim(claim):
-        return f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(KEPT)}.yaml"
+        return (
+            f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(OVERRIDE_PREFIX)}.yaml"
+        )
     if claim.demand == demand_id(claim.request, claim.requesters):
         return f"send request '{claim.request}' again with shutdown: true"
     return f"send operation: release for demand '{claim.demand}'"
@@ -120,7 +116,9 @@ def denied_called(ledger: Ledger, config: Config, name: str) -> tuple[Release, O
 def kept_by(claim: Claim, config: Config) -> Override | None:
     """Return the override whose own claim this is, or nothing where somebody asks for it."""
     return (
-        config.overrides.get(claim.demand.removeprefix(KEPT)) if is_override_claim(claim) else None
+        config.overrides.get(claim.demand.removeprefix(OVERRIDE_PREFIX))
+        if is_override_claim(claim)
+        else None
     )
 
 

@@ -288,7 +288,7 @@ def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, st
     ledger, files = state.ledger, {}
     for claim in ledger.unstarted():
         assert claim.lease is not None  # noqa: S101 - that is what was looked for
-        begun = replace(claim, lease=claim.lease.begun(now))
+        begun = replace(claim, lease=claim.lease.restarted(now))
         ledger = ledger.replace(claim.key, begun)
         files[ledger_format.path_of(claim.key)] = ledger_format.write(begun)
     return replace(state, ledger=ledger), files
