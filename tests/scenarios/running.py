@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
+from demandops.config.base_model import FrozenModel, parse_file
 from demandops.config.config import CONFIG_ROOTS
-from demandops.config.file_model import FrozenModel, parse_file
 from demandops.config.load import load
 from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, FrozenModel, parse_file
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, parse_file
 from demandops.errors import Fault, InvalidInput, fault
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.file_model import Approval, DnsLabel, FileModel, FrozenModel, Word
+from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel, Word
 from demandops.errors import suggestion
 
 TopicPattern = Annotated[

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, FrozenModel, Word
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Word
 from demandops.identifiers import id_problem, message_type_problem, topic_problem
 
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, FrozenModel
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.config.registry import Image
 from demandops.errors import quoted

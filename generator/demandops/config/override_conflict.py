@@ -14,7 +14,7 @@ from itertools import combinations
 
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
-from demandops.config.item_reader import ItemReader
+from demandops.config.config_reader import ConfigReader
 from demandops.config.override import Override, Selector, by_rank
 from demandops.config.policy import matches
 
@@ -23,14 +23,14 @@ _SINGLE = ("version", "replicas", "node")
 _FROZEN = (*_SINGLE, *_MERGED)
 
 
-def check_override_conflicts(config: Config, reading: ItemReader) -> None:
+def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
     """Note every pair of overrides whose order decides what runs, and that have none."""
     for one, other in combinations(by_rank(config.overrides.values()), 2):
         if one.priority != other.priority:
             continue
         touched = contested_effects(one, other)
         if touched and can_meet(one.select, other.select, config):
-            reading.tell(
+            reader.add_fault(
                 other.path,
                 "priority",
                 f"is {other.priority}, as in {one.path}, and both may set {' and '.join(touched)} "

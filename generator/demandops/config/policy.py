@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from demandops.config.file_model import Approval, DnsLabel, FileModel, FrozenModel
+from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel
 from demandops.errors import quoted
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, FrozenModel, Word
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Word
 
 ChartVersion = Annotated[
     str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)

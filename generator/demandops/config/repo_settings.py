@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, FrozenModel
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel
 from demandops.errors import quoted
 
 ROOT_FILE = "demandops.yaml"

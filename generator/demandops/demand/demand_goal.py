@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PlainValidator
 
 from demandops import strict_yaml
-from demandops.config.file_model import FrozenModel
+from demandops.config.base_model import FrozenModel
 from demandops.config.policy import seconds_of
 from demandops.demand.demand_request import (
     ApplicationDemand,
@@ -25,7 +25,7 @@ from demandops.demand.demand_request import (
     InputTopic,
     Operation,
 )
-from demandops.demand.goal_form import parse_valid_part
+from demandops.demand.goal_validation import parse_valid_part
 from demandops.demand.route import RouteOptions
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import absolute_topic

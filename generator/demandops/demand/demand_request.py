@@ -122,10 +122,10 @@ class DecommissionTarget:
 class DemandRequest:
     """A whole request: booked as a whole or refused as a whole.
 
-    ``demand`` is the demand's id where the request names it; the reference's does not, and there
-    it is made for each subject (:func:`demandops.demand.claim.demand_id`). ``own_requesters`` says in
-    whose name a request speaks that lists no subject. ``lease_s`` is the lease that it asks for, in
-    seconds.
+    ``demand`` is the demand's id. The reference's requests carry none; there
+    :func:`demandops.demand.claim.demand_id` makes one for each subject. ``own_requesters`` are the
+    requesters of the request itself, also when it lists no subject. ``lease_s`` is the requested
+    lease in seconds.
     """
 
     id: str

@@ -15,7 +15,7 @@ from typing import Annotated
 from pydantic import Field
 
 from demandops.config.appdef import ApplicationDefinition
-from demandops.config.file_model import FrozenModel
+from demandops.config.base_model import FrozenModel
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -24,7 +24,7 @@ from demandops.demand.demand_request import (
     InputTopic,
     Operation,
 )
-from demandops.demand.goal_form import parse_valid_part
+from demandops.demand.goal_validation import parse_valid_part
 from demandops.demand.route import Route
 from demandops.errors import Fault, fault
 from demandops.identifiers import absolute_topic

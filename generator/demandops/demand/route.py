@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from demandops.config.file_model import FrozenModel, faults_of
+from demandops.config.base_model import FrozenModel, faults_of
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import message_type_problem, topic_problem
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from demandops import strict_yaml
-from demandops.config.file_model import FrozenModel, parse
+from demandops.config.base_model import FrozenModel, parse
 from demandops.demand.claim import (
     ApplicationClaim,
     Claim,

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 from demandops import strict_yaml
-from demandops.config.file_model import FrozenModel, parse_file
+from demandops.config.base_model import FrozenModel, parse_file
 from demandops.config.override import Override, format_time, parse_time
 from demandops.errors import InvalidInput
 from demandops.ledger.claim_file import LEDGER_ROOT

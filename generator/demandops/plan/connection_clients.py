@@ -251,9 +251,9 @@ def bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | None:
 def _two_rates(route: Route, id: str, rate: float, other: str, node: str) -> Fault:
     return fault(
         "connections",
-        f"rate {route.rate} of '{route.read_topic}' in '{id}' contradicts what stands: '{other}' carries "
-        f"it from '{node}' with rate {rate}, and the node's bridge has one for each topic; use the "
-        "same",
+        f"rate {route.rate} of '{route.read_topic}' in '{id}' contradicts what stands: '{other}' "
+        f"carries it from '{node}' with rate {rate}, and the node's bridge has one for each topic; "
+        "use the same",
         code="conflict",
     )
 

@@ -179,8 +179,8 @@ def _why(decision: Decision, received: datetime) -> str:
     if request.decommission_target is not None:
         by = f" by {request.decommission_target.by}" if request.decommission_target.by else ""
         return (
-            f"Why: '{request.decommission_target.name}' leaves for good, told{by} on {moment}; it held a part "
-            f"of {what} in the name of {who}."
+            f"Why: '{request.decommission_target.name}' leaves for good, told{by} on "
+            f"{moment}; it held a part of {what} in the name of {who}."
         )
     verb = _VERBS[request.operation][1]
     if request.operation.adds_claims and _only_leases(decision):

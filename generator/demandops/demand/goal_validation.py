@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from demandops import strict_yaml
-from demandops.config.file_model import faults_of, field_path
+from demandops.config.base_model import faults_of, field_path
 from demandops.errors import Fault, fault
 
 _DEEPEST = 100

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from demandops import strict_yaml
-from demandops.config.file_model import DnsLabel, faults_of, parse, parse_file
+from demandops.config.base_model import DnsLabel, faults_of, parse, parse_file
 from demandops.errors import Fault, InvalidInput, fault
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -17,7 +17,7 @@ Raw = TypeVar("Raw", list[Any], dict[str, Any])
 _NAME = TypeAdapter(DnsLabel)
 
 
-class ItemReader:
+class ConfigReader:
     """The files of one state repo, and every fault found in them so far."""
 
     def __init__(self, files: Mapping[str, str]) -> None:
@@ -26,15 +26,15 @@ class ItemReader:
         self._places: dict[str, dict[str, int]] = {}
         self._unsound: set[str] = set()
 
-    def tell(self, file: str, field: str, message: str) -> None:
+    def add_fault(self, file: str, field: str, message: str) -> None:
         """Note a fault."""
         self.faults.append(fault(field, message).within(file))
 
-    def one(self, file: str, model: type[Model]) -> Model | None:
+    def read_file(self, file: str, model: type[Model]) -> Model | None:
         """Parse a file into one model; nothing where it is missing or faulty, which is noted."""
         text = self.files.get(file)
         if text is None:
-            self.tell(file, "", "is missing; `demandops init` shows what it holds")
+            self.add_fault(file, "", "is missing; `demandops init` shows what it holds")
             return None
         try:
             return parse_file(model, text, file)
@@ -42,7 +42,7 @@ class ItemReader:
             self.faults += error.faults
             return None
 
-    def listed(
+    def read_list(
         self, file: str, whole: type[BaseModel], field: str, item: type[Model], key: str
     ) -> dict[str, Model]:
         """Parse a file that is a list of items; return the sound ones by their name."""
@@ -53,7 +53,9 @@ class ItemReader:
         for index, entry in enumerate(raw or ()):
             name = entry.get(key) if isinstance(entry, dict) else None
             if isinstance(name, str) and name in places:
-                self.tell(file, f"{field}[{index}].{key}", f"'{name}' stands twice; remove one")
+                self.add_fault(
+                    file, f"{field}[{index}].{key}", f"'{name}' stands twice; remove one"
+                )
                 continue
             parsed = self._item(file, f"{field}[{index}]", item, entry)
             if parsed is None or not isinstance(name, str):
@@ -65,7 +67,7 @@ class ItemReader:
             self._unsound.add(file)
         return found
 
-    def named(
+    def read_mapping(
         self, file: str, whole: type[BaseModel], field: str, item: type[Model]
     ) -> dict[str, Model]:
         """Parse a file that maps names to items; return the sound ones."""
@@ -88,15 +90,15 @@ class ItemReader:
             self._unsound.add(file)
         return found
 
-    def place(self, file: str, name: str) -> int:
+    def index_of(self, file: str, name: str) -> int:
         """Return where in its list an item stands."""
         return self._places[file][name]
 
-    def lacks(self, file: str, name: str) -> bool:
+    def is_missing(self, file: str, name: str) -> bool:
         """Tell whether a file has no item of that name; not where it may be one that is faulty."""
         return file not in self._unsound and name not in self._places[file]
 
-    def names(self, file: str) -> list[str]:
+    def item_names(self, file: str) -> list[str]:
         """Return the names of a file's items."""
         return list(self._places[file])
 
@@ -106,7 +108,7 @@ class ItemReader:
         """Return what stands in ``field``, once the rest of the file is found sound or told."""
         text = self.files.get(file)
         if text is None:
-            self.one(file, whole)
+            self.read_file(file, whole)
             return None
         try:
             data = strict_yaml.load(text)
@@ -115,7 +117,7 @@ class ItemReader:
             return None
         raw = data.get(field) if isinstance(data, dict) else None
         if not isinstance(data, dict) or not isinstance(raw, kind):
-            self.one(file, whole)
+            self.read_file(file, whole)
             return None
         try:
             parse(whole, {**data, field: kind()}, file)
