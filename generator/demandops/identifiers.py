@@ -1,4 +1,4 @@
-"""What ids and topic names may be, wherever they come from: requests, inventory, ledger."""
+"""The rules for ids, topic names and message types in requests, inventory and ledger."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import unicodedata
 from demandops.errors import quoted
 
 MAX_ID = 1024
-"""Characters that an id may have; file and object names are shortened and hashed anyway."""
+"""The longest id, in characters; file and object names are shortened and hashed."""
 
 MAX_TOPIC = 247
-"""Characters of a topic name, ``RMW_TOPIC_MAX_NAME_LENGTH`` of ROS 2's rmw."""
+"""The longest topic name, in characters: ``RMW_TOPIC_MAX_NAME_LENGTH`` of ROS 2's rmw."""
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _MESSAGE_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
@@ -20,15 +20,14 @@ _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
 def absolute_topic(topic: str) -> str:
-    """Return a topic name as ROS resolves it in the root namespace: ``scan`` is ``/scan``."""
+    """Return a topic name as ROS resolves it in the root namespace: ``scan`` gives ``/scan``."""
     return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
 
 
 def id_problem(value: str) -> str:
-    """Return what is wrong with an id, or nothing.
+    """Return what is wrong with an id, or an empty string.
 
-    Ids name entities of the field, so nearly all text is taken; what could hide from a reader or
-    climb out of a folder is not.
+    Nearly all text is valid. Invisible characters and paths out of a folder are not.
     """
     if not value:
         return "is empty; give an id"
@@ -48,7 +47,7 @@ def id_problem(value: str) -> str:
 
 
 def topic_problem(name: str) -> str:
-    """Return what ROS 2 forbids in a fully qualified topic name (rmw's validation), or nothing."""
+    """Return why ROS 2 (rmw) rejects a fully qualified topic name, or an empty string."""
     if not name:
         return "is empty; give a topic name"
     if name.startswith("~"):
@@ -64,7 +63,7 @@ def topic_problem(name: str) -> str:
 
 
 def message_type_problem(name: str) -> str:
-    """Return why a name is no ROS 2 message type with its package, or nothing."""
+    """Return why a name is not a ROS 2 message type with its package, or an empty string."""
     if _MESSAGE_TYPE.fullmatch(name):
         return ""
     return f"{quoted(name)} is no message type; write it like std_msgs/msg/String"

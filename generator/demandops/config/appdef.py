@@ -1,8 +1,8 @@
-"""Application definitions: one YAML file and a folder make a new type of application.
+"""Application definitions (appdefs): a YAML file and a folder define a type of application.
 
-An appdef names its inputs and parameters and the services to run for them. A service runs once
-for each application, or once for each topic of an input, and in the second case is shared by all
-applications that ask for the same topic on the same node (paper, section on object detection).
+An appdef lists inputs, parameters and services. A service runs once for each application, or once
+for each topic of an input. In the second case, all applications that demand the same topic on the
+same node share it (paper, section on object detection).
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ TopicPattern = Annotated[
         pattern=r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
     ),
 ]
-"""A topic name; ``{instance}`` stands for the source or the application that the service is for."""
+"""A topic name; ``{instance}`` is replaced by the service's source or application."""
 
 
 class Input(FrozenModel):
-    """A role that demanded topics play, ``point_cloud`` say."""
+    """A role of demanded topics, for example ``point_cloud``."""
 
     description: str = ""
     type: str = ""
 
 
 class Parameter(FrozenModel):
-    """A value that a demand may give, and what holds when several demands give different ones."""
+    """A value that demands may set, and how the values of several demands are merged."""
 
     description: str = ""
     default: Any = None
@@ -39,7 +39,7 @@ class Parameter(FrozenModel):
 
 
 class Scaling(FrozenModel):
-    """How many replicas a service has: one for ``topics_per_replica`` inputs, within bounds."""
+    """The number of replicas: one for ``topics_per_replica`` inputs, from ``min`` to ``max``."""
 
     min: Annotated[int, Field(ge=0, le=1000)] = 1
     max: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -57,11 +57,11 @@ class Scaling(FrozenModel):
 
 
 class Service(FrozenModel):
-    """One deployable part of an application: one Helm release for each instance.
+    """One deployable part of an application, with one Helm release for each instance.
 
-    ``each`` names the input whose every topic gets an instance of its own, shared between
-    applications; without it there is one instance for each application. ``inputs`` of an
-    application-wide service name roles of the appdef, or ``<service>.<output>``.
+    ``each`` names an input; every topic of it gets its own instance, which applications share.
+    Without ``each``, every application gets one instance. Its ``inputs`` name roles of the appdef
+    or ``<service>.<output>``.
     """
 
     prefix: Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9]{0,9}$")]
@@ -85,10 +85,10 @@ class Service(FrozenModel):
 
 
 class WireNames(FrozenModel):
-    """How the reference's ``DeploymentRequest`` names this application.
+    """The names of this application in the reference's ``DeploymentRequest``.
 
-    ``type`` is the number in ``Application.type``; ``inputs`` says which role each topic list of
-    the message's body plays.
+    ``type`` is the number in ``Application.type``. ``inputs`` maps the topic lists of the
+    message's body to roles.
     """
 
     type: Annotated[int, Field(ge=1, le=255)]

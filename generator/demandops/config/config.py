@@ -1,4 +1,4 @@
-"""All that people configured, indexed: the :class:`Catalog`, one frozen value."""
+"""The whole configuration as one frozen, indexed value: :class:`Config`."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ CHARTS_FILE = "registry/charts.yaml"
 IMAGES_FILE = "registry/images.yaml"
 
 MQTT_CLIENT_IMAGE = "mqtt-client"
-"""The image of the registry that both ends of an MQTT connection run."""
+"""The registry image that both ends of an MQTT connection run."""
 
 ZENOH_BRIDGE_IMAGE = "zenoh-bridge"
-"""The image of the registry that carries a node's Zenoh connections."""
+"""The registry image that carries a node's Zenoh connections."""
 
 DDS_ROUTER_IMAGE = "dds-router"
-"""The image of the registry that both ends of a ROS connection run."""
+"""The registry image that both ends of a ROS connection run."""
 
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
-"""The top-level entries of a state repo that people own and the configuration is made from."""
+"""The top-level entries of a state repo that hold the configuration; people own them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """What can be run, where, from which charts and images.
+    """What can run, where, and from which charts and images.
 
-    ``files`` keeps the texts that templates and chart schemas are read from, by path. ``overrides``
-    are all that lie there; ``ended`` maps those that ended to the time that they named then, and
+    ``files`` maps the paths of templates and chart schemas to their texts. ``overrides`` has every
+    override. ``ended_overrides`` maps the name of an ended override to the expiry that it had then.
     ``active_overrides`` are the others, in the order in which they apply.
     """
 
@@ -58,10 +58,10 @@ class Config:
     denial_cache: dict[Hashable, Override | None] = field(
         default_factory=dict, compare=False, repr=False
     )
-    """What was found denied, kept by :mod:`demandops.plan.overrides.claims_in_force`."""
+    """Filled by :mod:`demandops.plan.overrides.claims_in_force` only."""
 
     def with_ended_overrides(self, ended: Mapping[str, str]) -> Config:
-        """Return the configuration with these overrides ended."""
+        """Return the configuration with exactly these overrides ended."""
         active_overrides = by_rank(still_active(self.overrides, ended))
         ended = MappingProxyType(dict(ended))
         return replace(
@@ -69,7 +69,7 @@ class Config:
         )
 
     def without_overrides(self) -> Config:
-        """Return the configuration as it would be had nobody written an override."""
+        """Return the configuration without any override."""
         return replace(self, overrides={}, ended_overrides={}, active_overrides=(), denial_cache={})
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
@@ -80,10 +80,10 @@ class Config:
         return None
 
     def versions_of(self, appdef: str) -> list[str]:
-        """Return the channels and versions that a demand for an application may name."""
+        """Return the channels and versions that a demand for this appdef may request."""
         charts = {service.chart for service in self.appdefs[appdef].services.values()}
         return sorted({known for chart in charts for known in self.charts[chart].versions()})
 
     def values_template(self, appdef: str, service: Service) -> str:
-        """Return the path of the template that gives a service's Helm values."""
+        """Return the path of the template of a service's Helm values."""
         return f"appdefs/{appdef}/{service.values}"

@@ -1,6 +1,6 @@
-"""What shows only between files or entries: an unknown cluster, a prefix used twice.
+"""Checks across files and entries: an unknown cluster, a prefix that is used twice.
 
-Called once all files are parsed; every fault is noted, none stops the others.
+They run when all files are parsed. Every check runs, and the reader collects all faults.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _CONNECTION_PREFIXES = ("mqtt", "zenoh", "ros")
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:
-    """Note every fault that shows only between files or entries."""
+    """Add every fault across files or entries to the reader."""
     for check in (
         _check_inventory,
         _check_topics,
@@ -165,7 +165,7 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
 
 
 def _same(config: Config, one: tuple[str, str, Service], other: tuple[str, str, Service]) -> bool:
-    """Tell whether two appdefs mean the same shared service."""
+    """Return whether two appdefs define the same shared service."""
     texts = [
         config.files.get(config.values_template(appdef, service))
         for appdef, _, service in (one, other)
@@ -246,7 +246,7 @@ def _check_moved_to(node: str, override: Override, config: Config, reader: Confi
 
 
 def _versions_for(override: Override, config: Config) -> set[str]:
-    """Return the versions and channels of every chart that an override may pin."""
+    """Return the versions and channels of every chart that an override selects."""
     charts = {
         service.chart
         for appdef in config.appdefs.values()

@@ -1,7 +1,7 @@
-"""The inventory: which nodes, clusters and brokers there are, and who may use them.
+"""The inventory: nodes, clusters and brokers.
 
 A node is a vehicle, a roadside station, an edge or a cloud server. It belongs to one cluster and
-one access domain, and a node selector finds it there.
+one access domain. A node selector identifies it in its cluster.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A
 """A host name or an IP address."""
 
 SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
-"""A key inside a Kubernetes Secret; it becomes a file name."""
+"""A key in a Kubernetes Secret; it becomes a file name."""
 
 _ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
 Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$")]
@@ -26,14 +26,14 @@ Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$")]
 
 
 class Tls(FrozenModel):
-    """Encrypted connections to a broker; without ``caSecret`` the client image's own CAs count."""
+    """TLS to a broker; without ``caSecret``, the client trusts the CAs of its image."""
 
     ca_secret: DnsLabel | None = Field(default=None, alias="caSecret")
     ca_key: SecretKey = Field(default="ca.crt", alias="caKey")
 
 
 class Credentials(FrozenModel):
-    """The Secret with a broker's user name and password, and the keys that they stand under."""
+    """The Secret with a broker's user name and password, and their keys in it."""
 
     secret: DnsLabel
     user_key: SecretKey = Field(default="username", alias="userKey")
@@ -41,11 +41,11 @@ class Credentials(FrozenModel):
 
 
 class Zenoh(FrozenModel):
-    """That a node runs a Zenoh bridge where a connection needs it, and how bridges meet.
+    """The Zenoh bridge that a node runs when a connection needs it.
 
-    ``endpoint`` is where other nodes' bridges reach this one; ``listen`` where it listens for
-    them, by default on the endpoint's port at every address; ``connect`` are routers that it
-    always connects to. All may be left out: such a node connects to those that can be reached.
+    Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
+    the endpoint's port at every address. It always connects to the routers in ``connect``. A node
+    without any of these connects to nodes that have an endpoint.
     """
 
     endpoint: Endpoint | None = None
@@ -59,7 +59,7 @@ class Zenoh(FrozenModel):
         return self
 
     def listening(self) -> tuple[str, ...]:
-        """Return the endpoints that the node's bridge listens on, none where nobody connects."""
+        """Return the endpoints that the bridge listens on; none if no bridge can connect to it."""
         if self.listen or not self.endpoint:
             return self.listen
         protocol, _, address = self.endpoint.partition("/")
@@ -67,7 +67,7 @@ class Zenoh(FrozenModel):
 
 
 class Wan(FrozenModel):
-    """Where DDS Routers on a node can be reached, one port for each ROS connection."""
+    """The address of a node's DDS Routers, with one port for each ROS connection."""
 
     host: Host
     first_port: Annotated[int, Field(ge=1024, le=65535)] = Field(default=20000, alias="firstPort")
@@ -124,7 +124,7 @@ class Cluster(FrozenModel):
 
 
 class Toleration(FrozenModel):
-    """A taint of the node that workloads put up with (Kubernetes core/v1 Toleration)."""
+    """A taint of the node that workloads tolerate (Kubernetes core/v1 Toleration)."""
 
     key: str = ""
     operator: Literal["Exists", "Equal"] = "Equal"
@@ -141,7 +141,7 @@ class Toleration(FrozenModel):
 
 
 class Ros(FrozenModel):
-    """What a container on the node needs to join its ROS graph."""
+    """The settings that a container needs to join the node's ROS graph."""
 
     domain_id: Annotated[int, Field(ge=0, le=232)] = Field(default=0, alias="domainId")
     rmw: Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"] = (
@@ -153,11 +153,11 @@ class Node(FrozenModel):
     """A C-ITS entity that runs services.
 
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
-    ``topics`` names, for each input role, the node's usual topic: releases and derived topics
-    for it carry the node's name alone; those for its further topics carry the topic as well.
-    ``zenoh`` and ``wan`` say how Zenoh and ROS connections reach the node, ``types`` the message
-    types of topics that requests do not say. ``bridged`` names topics that the initial deployment
-    carries from here to another node, under the same name: no connection carries them again.
+    ``topics`` maps each input role to the node's usual topic. Names of releases and derived topics
+    contain only the node for a usual topic, and the topic as well for any other.
+    Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` has the
+    message types of topics for which a request gives none. ``bridged`` lists topics that the
+    initial deployment already carries to another node under the same name; connections skip them.
     """
 
     id: NodeId

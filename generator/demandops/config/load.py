@@ -1,6 +1,6 @@
-"""From the texts of the state repo's configuration to a :class:`Catalog`.
+"""Loading of the configuration: the files' texts become a :class:`Config`.
 
-Pure. A file set is taken whole or refused whole, with every fault of every file.
+Pure. If any file has a fault, the whole configuration is rejected, with every fault of every file.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _ANY = RepoSettings(
     gitops="flux",
     renderVersion=RENDER_VERSION,
     flux=Flux(url="https://unread.invalid/repo.git"),
-)  # stands in for one that could not be read, so that the rest is checked all the same
+)  # replaces an invalid one, so that the other files can be checked
 
 
 def load(files: Mapping[str, str]) -> Config:
-    """Parse the configuration files of a state repo.
+    """Return the configuration of a state repo.
 
     Args:
-        files: path in the state repo → text; files of other folders are passed over.
+        files: path in the state repo → text; other folders are ignored.
 
     Raises:
         InvalidInput: with every fault of every file.

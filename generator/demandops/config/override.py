@@ -1,8 +1,7 @@
 """Overrides: a person's declared deviations, one file each in ``overrides/``.
 
-The model and what it means on its own: whom a selector can match, what an effect may say. Whether
-two of them conflict is :mod:`demandops.config.override_conflict`; what they do to releases and
-claims is the plan's.
+This module has the model and the rules for one override. Conflicts between two are in
+:mod:`demandops.config.override_conflict`, effects on releases and claims in ``plan/overrides``.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ _MOMENT = re.compile(
 _SHAPING = ("values", "version", "images", "replicas", "node")
 _OF_SERVICES = ("values", "version", "replicas", "node", "keep")
 EFFECTS = (*_SHAPING, "hold", "deny", "keep")
-"""What an override may do, in the order in which it is told."""
+"""The effects of overrides, in the order of messages."""
 
 
 def parse_time(text: str) -> datetime:
-    """Return the moment that an RFC 3339 time with zone names, in UTC.
+    """Return an RFC 3339 time with a zone, in UTC.
 
     Raises:
-        ValueError: where it is none.
+        ValueError: if the text is not such a time.
     """
     match = _MOMENT.fullmatch(text)
     try:
@@ -53,7 +52,7 @@ def parse_time(text: str) -> datetime:
 
 
 def format_time(moment: datetime) -> str:
-    """Return a moment as messages and markers show it."""
+    """Return a time in the form of messages and markers."""
     text = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
     return re.sub(r"\.?0*\+00:00$", "Z", text)
 
@@ -102,17 +101,17 @@ Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_lin
 
 
 def _filled_in(model: FrozenModel) -> None:
-    """Raise for a field that is written down and empty: it would say less than it seems to."""
+    """Raise for a field without a value, which selects or changes less than it seems to."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
         raise ValueError(f"{' and '.join(empty)}: nothing stands there; fill it in, or remove it")
 
 
 class Selector(FrozenModel):
-    """What an override is for: a release or claim that every field given here fits.
+    """Selects the releases and claims that match every field given here.
 
-    Patterns take ``*`` and ``?``. ``requesters`` fits where one of the requesters does, ``labels``
-    where the node's selector has them all.
+    Patterns may contain ``*`` and ``?``. ``requesters`` matches if one of the requesters does,
+    ``labels`` if the node's selector has all of them.
     """
 
     applications: Patterns | None = None
@@ -137,7 +136,7 @@ class Selector(FrozenModel):
 
 
 class ImagePin(FrozenModel):
-    """What an override says of an image of the registry; what it leaves out stays."""
+    """Changes to an image of the registry; absent fields leave it unchanged."""
 
     repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")] | None = None
     tag: (
@@ -152,7 +151,7 @@ class ImagePin(FrozenModel):
         return self
 
     def over(self, image: Image) -> Image:
-        """Return the image as pinned; a tag or digest takes the place of both."""
+        """Return the pinned image; a tag or a digest replaces both."""
         anew = self.tag or self.digest
         return Image(
             repository=self.repository or image.repository,
@@ -162,7 +161,7 @@ class ImagePin(FrozenModel):
 
 
 class OverrideFile(FileModel):
-    """``overrides/<name>.yaml``. Of those that match the same, the higher priority wins."""
+    """``overrides/<name>.yaml``; if several match, the one with the higher priority wins."""
 
     kind: Literal["Override"]
     reason: Line
@@ -188,7 +187,7 @@ class OverrideFile(FileModel):
         return self
 
     def _misplaced(self) -> Iterable[str]:
-        """Yield effects that what is selected cannot have."""
+        """Yield a problem for each effect that the selected things cannot have."""
         effects = self.effects()
         for index, selector in enumerate(self.select):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
@@ -204,37 +203,37 @@ class OverrideFile(FileModel):
                 )
 
     def effects(self) -> tuple[str, ...]:
-        """Return the names of the effects that are given."""
+        """Return the names of this override's effects."""
         return tuple(name for name in EFFECTS if getattr(self, name) is not None)
 
     @property
     def end(self) -> datetime | None:
-        """When it ceases to apply."""
+        """The time from which it no longer applies."""
         return parse_time(self.expires) if self.expires else None
 
 
-class Override(OverrideFile):  # noqa: PLW1641 - with mappings in them overrides have no hash
-    """An override and its name, which is that of its file."""
+class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so they have no hash
+    """An override with its name, which is its file's name."""
 
     name: str
 
     @classmethod
     def from_file(cls, name: str, file: OverrideFile) -> Override:
-        """Return what a file says, by its name."""
+        """Return the override of a parsed file."""
         return cls.model_construct(file.model_fields_set | {"name"}, **dict(file), name=name)
 
     def __eq__(self, other: object) -> bool:
-        """Compare exactly: to Python 1 is True and 1.0, to a chart they are three values."""
+        """Compare exactly: in Python 1 equals True and 1.0, but a chart treats them differently."""
         return isinstance(other, Override) and self.model_dump_json() == other.model_dump_json()
 
     @property
     def path(self) -> str:
-        """The file."""
+        """The path of its file."""
         return f"{OVERRIDES_ROOT}/{self.name}.yaml"
 
     @property
     def rank(self) -> tuple[int, str]:
-        """Where it stands among others: the higher wins."""
+        """Its rank among overrides; the higher rank wins."""
         return (self.priority, self.name)
 
 
@@ -253,7 +252,7 @@ def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
 
 
 def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
-    """Return ``target`` with a JSON merge patch (RFC 7386) laid over; null removes."""
+    """Return ``target`` with a JSON merge patch (RFC 7386) applied; null removes a key."""
     if not isinstance(patch, Mapping):
         return patch
     result = dict(target) if isinstance(target, Mapping) else {}
@@ -266,12 +265,12 @@ def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
 
 
 def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
-    """Return overrides in the order in which they apply: who comes last wins."""
+    """Return overrides in the order in which they apply; the last one wins."""
     return tuple(sorted(overrides, key=lambda one: one.rank))
 
 
 def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
-    """Return the overrides that no marker says to have ended at the time that they name now."""
+    """Return the overrides that have not ended at their current expiry."""
     return [
         one
         for name, one in overrides.items()

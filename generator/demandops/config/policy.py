@@ -1,7 +1,7 @@
-"""Access domains: who may demand what, where, how much of it and for how long.
+"""Access domains: who may demand what, where, how much and for how long.
 
-A domain is a set of nodes with one namespace and one service account. What a demand asks of a node
-is held to the rules, quotas and leases of the node's domain.
+A domain is a set of nodes with one namespace and one service account. Its rules, quotas and leases
+apply to demands for these nodes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def seconds_of(text: str) -> int:
     """Return the seconds of a duration like ``1h30m``.
 
     Raises:
-        ValueError: where it is none.
+        ValueError: if the text is not a duration.
     """
     match = _DURATION.fullmatch(text)
     if not text or match is None:
@@ -45,15 +45,15 @@ Patterns = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    """Tell whether a name is one of ``patterns`` (``*`` and ``?``; a bracket is a bracket)."""
+    """Return whether a name matches one of ``patterns``; only ``*`` and ``?`` are special."""
     return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
 
 
 class Rule(FrozenModel):
-    """What some requesters may demand; a demand needs one rule for each of its requesters.
+    """What some requesters may demand; a demand needs a rule for each of its requesters.
 
-    ``nodes`` are those where it runs or where a connection ends, ``brokers`` the nodes of brokers.
-    ``approval`` is the access domain's where it is left out.
+    ``nodes`` are the nodes of applications and the ends of connections, ``brokers`` the nodes of
+    brokers. ``approval`` defaults to the access domain's.
     """
 
     name: DnsLabel
@@ -65,9 +65,9 @@ class Rule(FrozenModel):
 
 
 class Quotas(FrozenModel):
-    """How much at most; no limit where one is left out.
+    """The upper limits of an access domain; an absent one means no limit.
 
-    ``demands_per_minute`` counts what one generator receives from a requester.
+    ``demands_per_minute`` limits the demands that one generator receives from a requester.
     """
 
     claims_per_requester: Annotated[int, Field(ge=1)] | None = Field(
@@ -82,12 +82,12 @@ class Quotas(FrozenModel):
 
 
 class LeasePolicy(FrozenModel):
-    """How long a demand holds without being renewed.
+    """How long a demand's claims last without a renewal.
 
-    ``default`` is for demands that ask for no lease, for ever where it is left out. It covers the
-    reference's ``DeploymentRequest`` only where ``deployment_requests`` says so: its clients must
-    then send their demands again in time. ``slack`` is how far the recorded end may lag behind the
-    last renewal, and so how late a claim may go.
+    Demands that request no lease get ``default``; without it their claims last forever. With
+    ``deployment_requests`` that includes the reference's ``DeploymentRequest``, whose clients must
+    then repeat their demands in time. The recorded end of a lease may lag behind the last renewal
+    by ``slack``, so a claim may be released that much late.
     """
 
     default: Duration | None = None
@@ -109,9 +109,9 @@ class LeasePolicy(FrozenModel):
 
 
 class AccessDomain(FrozenModel):
-    """A namespace and service account, the nodes whose releases live in it, and who may use them.
+    """A namespace and service account, the nodes whose releases are in it, and who may use them.
 
-    Without ``rules`` everybody may demand everything on its nodes.
+    Without ``rules``, all requesters may demand anything on its nodes.
     """
 
     name: DnsLabel

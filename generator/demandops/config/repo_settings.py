@@ -1,4 +1,4 @@
-"""``demandops.yaml``: which GitOps controller reads the state repo, and how it reaches it."""
+"""The settings of a state repo in ``demandops.yaml``: its GitOps controller, source and forge."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GitUrl = Annotated[
 
 
 class Flux(FrozenModel):
-    """How the clusters' Flux reaches this repo: the GitRepository of each access domain."""
+    """Flux's access to this repo: the GitRepository of each access domain."""
 
     url: GitUrl
     interval: Annotated[
@@ -28,9 +28,9 @@ class Flux(FrozenModel):
 
 
 class ArgoCd(FrozenModel):
-    """How the clusters' Argo CD reaches this repo, and the namespace it runs in.
+    """Argo CD's access to this repo, and its namespace.
 
-    Credentials are Argo CD's own: a Secret of that namespace that names the URL.
+    Argo CD has its own credentials, in a Secret of that namespace that names the URL.
     """
 
     url: GitUrl
@@ -55,10 +55,11 @@ WebUrl = Annotated[str, AfterValidator(_web_url)]
 
 
 class Proposals(FrozenModel):
-    """Where demands that need approval are proposed.
+    """The forge on which demands that need approval are proposed.
 
-    ``none`` pushes the branch and asks nobody. GitLab opens a merge request by push options; GitHub
-    and Gitea (Forgejo) by their API, whose address follows from ``url`` unless ``api`` says it.
+    With ``none`` the branch is pushed and no pull request opened. GitLab opens a merge request by
+    push options. GitHub and Gitea (Forgejo) open one by their API, whose address follows from
+    ``url`` unless ``api`` gives it.
     """
 
     forge: Literal["none", "gitlab", "github", "gitea"] = "none"
@@ -84,15 +85,15 @@ class Proposals(FrozenModel):
 
     @property
     def project(self) -> tuple[str, ...]:
-        """Return owner and name of the project, the last two parts of its address."""
+        """The project's owner and name, the last two parts of its address."""
         path = (self.url or "").partition("://")[2].partition("/")[2]
         return tuple(path.strip("/").removesuffix(".git").split("/")[-2:]) if path else ()
 
 
 class RepoSettings(FileModel):
-    """``demandops.yaml``: what the whole state repo has in common.
+    """``demandops.yaml``: the settings of the whole state repo.
 
-    The section of the controller that is not chosen may stand there too, and waits.
+    It may also contain the section of the other controller, which is then not used.
     """
 
     kind: Literal["StateRepository"]

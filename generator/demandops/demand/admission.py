@@ -1,7 +1,6 @@
-"""Admission: can what is asked be run at all, by this configuration?
+"""Admission: can the configuration run what a request demands?
 
-Checks a request against appdefs, inventory, brokers and access domains. What is booked already
-does not matter here; that is the ledger's.
+This checks a request against appdefs, inventory, brokers and access domains, not the ledger.
 """
 
 from __future__ import annotations
@@ -22,20 +21,20 @@ from demandops.errors import Fault, fault, quoted, suggestion
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
-    """Yield every reason why ``request`` cannot be honoured, whatever is booked.
+    """Yield every reason why ``request`` cannot be fulfilled, whatever the ledger contains.
 
-    A shutdown is not held to the inventory: what a removed node still holds can be released.
+    A shutdown may name nodes that are not in the inventory, so that their claims can be released.
     """
     yield from shape.faults(request)
-    joining = request.operation.adds_claims
+    claiming = request.operation.adds_claims
     for index, app in enumerate(request.applications):
-        yield from _application(f"applications[{index}]", app, config, joining)
+        yield from _application(f"applications[{index}]", app, config, claiming)
     for index, connection in enumerate(request.connections):
-        yield from _connection(f"connections[{index}]", connection, config, joining)
+        yield from _connection(f"connections[{index}]", connection, config, claiming)
 
 
 def _application(
-    where: str, app: ApplicationDemand, config: Config, joining: bool
+    where: str, app: ApplicationDemand, config: Config, claiming: bool
 ) -> Iterator[Fault]:
     appdef = config.appdefs.get(app.appdef)
     if appdef is None:
@@ -59,7 +58,7 @@ def _application(
                 f"{quoted(app.version)} is no version or channel of {appdef.name} in "
                 "registry/charts.yaml" + suggestion(app.version, config.versions_of(appdef.name)),
             )
-    if not joining:
+    if not claiming:
         return
     yield from _node(f"{where}.node", app.node, config)
     for role, topics in app.inputs.items():
@@ -72,22 +71,22 @@ def _application(
         )
 
 
-def _unknown_application(where: str, asked: str, config: Config) -> Fault:
-    if asked.startswith("#"):  # the number of a DeploymentRequest
+def _unknown_application(where: str, name: str, config: Config) -> Fault:
+    if name.startswith("#"):  # the number of a DeploymentRequest
         known = "; known: " + ", ".join(
-            f"{one.deployment_request.type} ({one.name})"
-            for one in config.appdefs.values()
-            if one.deployment_request
+            f"{appdef.deployment_request.type} ({appdef.name})"
+            for appdef in config.appdefs.values()
+            if appdef.deployment_request
         )
     else:
-        known = suggestion(asked, config.appdefs)
-    named = asked.removeprefix("#") if asked.startswith("#") else quoted(asked)
-    message = f"{named} names no application definition{known}"
+        known = suggestion(name, config.appdefs)
+    shown = name.removeprefix("#") if name.startswith("#") else quoted(name)
+    message = f"{shown} names no application definition{known}"
     return fault(f"{where}.appdef", message, code="unknown-application")
 
 
 def _connection(
-    where: str, connection: ConnectionDemand, config: Config, joining: bool
+    where: str, connection: ConnectionDemand, config: Config, claiming: bool
 ) -> Iterator[Fault]:
     types = {known.value: known for known in ConnectionType}
     kind = types.get(connection.type)
@@ -98,7 +97,7 @@ def _connection(
             f"{connection.type} is no connection type; known: {known}",
             code="unknown-connection-type",
         )
-    if not joining:
+    if not claiming:
         return
     yield from _node(f"{where}.source", connection.source, config)
     yield from _node(f"{where}.target", connection.target, config)
@@ -114,13 +113,13 @@ def _connection(
 
 
 def _within(where: str, found: Fault) -> Fault:
-    """Return a fault of a part of the request, told to be at ``where``."""
+    """Return a fault of one part of the request, with its field below ``where``."""
     return replace(found, field=f"{where}.{found.field}")
 
 
 def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
     if not node:
-        return  # told by the request's own checks
+        return  # the request's own checks report it
     if node not in config.nodes:
         yield fault(
             where,

@@ -1,7 +1,7 @@
-"""Our own demand as plain data, parsed into a :class:`DemandRequest`.
+"""The goal of our own ``Demand`` action as plain data, parsed into a :class:`DemandRequest`.
 
-The action ``demandops_interfaces/action/Demand`` and YAML of the kind ``Demand`` come through
-:func:`parse`. It names its demand, carries any application type and replaces what it held before.
+:func:`parse` takes goals of ``demandops_interfaces/action/Demand`` and YAML of the kind ``Demand``.
+Such a goal names its demand, may list any type of application, and replaces the demand's claims.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _TYPES = {known.name.lower(): known.value for known in ConnectionType}
 
 
 class GoalTopic(FrozenModel):
-    """A topic that an application takes in, and the node that publishes it."""
+    """An input topic of an application, and the node that publishes it."""
 
     topic: str = ""
     source: str = ""
@@ -47,9 +47,9 @@ class GoalTopic(FrozenModel):
 class GoalApplication(FrozenModel):
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
-    ``parameters`` are values, ``parameters_json`` the same as JSON text. ``version`` is a version
-    or a channel of the registry. ``connect`` says by what inputs of other nodes come that no
-    connection of the demand carries.
+    ``parameters`` maps names to values, ``parameters_json`` to values as JSON text. ``version`` is
+    a version or a channel of the registry. ``connect`` is the connection type for inputs from other
+    nodes that no connection of the demand carries.
     """
 
     id: str = ""
@@ -63,7 +63,7 @@ class GoalApplication(FrozenModel):
 
 
 class GoalRoute(RouteOptions):
-    """A topic of a connection; it has the same name at both ends where ``target`` is left out."""
+    """A topic of a connection; without ``target`` it has the same name at both ends."""
 
     source: str = ""
     target: str = ""
@@ -89,7 +89,7 @@ def _lease_form(value: object) -> object:
 
 
 Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
-"""One validator for all that it may be: pydantic names each member of a union a field."""
+"""A duration or seconds; for a union, pydantic would report one fault for each member."""
 
 
 class DemandGoal(FrozenModel):
@@ -108,12 +108,12 @@ class DemandGoal(FrozenModel):
 
 
 _DEEPEST = 50
-"""Levels of a parameter's value: a claim's file is read to a depth of 100."""
+"""The deepest nesting of a parameter's value; a claim's file may have 100 levels."""
 _LISTS_OF_TEXT = ("requesters",)
 
 
 def is_demand_goal(data: dict[str, Any]) -> bool:
-    """Tell whether plain data is meant as a goal of our own action."""
+    """Return whether plain data is a goal of our own action."""
     return "kind" in data or "apiVersion" in data
 
 
@@ -121,7 +121,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
     """Parse a goal of our own action.
 
     Returns:
-        The request and the faults of its form; a request with faults must not be booked.
+        The request and the faults of its form. A request with faults must not be booked.
     """
     goal, faults = parse_valid_part(data, DemandGoal, _LISTS_OF_TEXT)
     requesters = tuple(goal.requesters)
@@ -141,7 +141,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 def form_faults(data: dict[str, Any]) -> list[Fault]:
-    """Return what of ``data`` has not the form of a goal."""
+    """Return the faults of the form of ``data``."""
     return parse(data)[1]
 
 
@@ -163,14 +163,14 @@ def _application(
 ) -> ApplicationDemand:
     parameters: dict[str, Any] = {}
     for name, value in app.parameters.items():
-        parameters[name] = _usable(f"{where}.parameters.{name}", value, faults)
+        parameters[name] = _storable(f"{where}.parameters.{name}", value, faults)
     for name, text in app.parameters_json.items():
         place = f"{where}.parameters_json.{name}"
         if name in parameters:
             faults.append(fault(place, "is given in parameters already; give it once"))
             continue
         try:
-            parameters[name] = _usable(place, json.loads(text), faults)
+            parameters[name] = _storable(place, json.loads(text), faults)
         except (ValueError, RecursionError):
             message = 'is no JSON; a text needs quotes of its own, as in "\\"fast\\""'
             faults.append(fault(place, message))
@@ -192,15 +192,15 @@ def _application(
     )
 
 
-def _usable(where: str, value: object, faults: list[Fault]) -> object:
-    """Return a parameter's value; what of it no ledger could keep is noted, and left out."""
-    problem = _unkeepable(value, 0)
+def _storable(where: str, value: object, faults: list[Fault]) -> object:
+    """Return a parameter's value; add a fault and return ``None`` if the ledger cannot store it."""
+    problem = _value_problem(value, 0)
     if problem:
         faults.append(fault(where, problem))
     return None if problem else value
 
 
-def _unkeepable(value: object, depth: int) -> str:
+def _value_problem(value: object, depth: int) -> str:
     if depth > _DEEPEST:
         return f"is nested deeper than {_DEEPEST} levels; make it flatter"
     if isinstance(value, float) and not math.isfinite(value):
@@ -209,7 +209,7 @@ def _unkeepable(value: object, depth: int) -> str:
         return f"holds {quoted(value)}, which is no Unicode text; write whole characters"
     parts = [*value, *value.values()] if isinstance(value, dict) else value
     nested = parts if isinstance(parts, list) else ()
-    return next(filter(None, (_unkeepable(part, depth + 1) for part in nested)), "")
+    return next(filter(None, (_value_problem(part, depth + 1) for part in nested)), "")
 
 
 def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> ConnectionDemand:
@@ -238,9 +238,9 @@ _OF_CONNECTION = re.compile(r"connections\[(\d+)\]")
 
 
 def goal_field(path: str, request: DemandRequest) -> str:
-    """Return the goal's name for a field of its request; of a derived connection, its input."""
+    """Return the goal's field for a request's field; for a derived connection, its input's."""
     for pattern, replacement in _NAMES:
         if pattern.match(path):
             return pattern.sub(replacement, path)
-    of = _OF_CONNECTION.match(path)
-    return (request.connections[int(of[1])].for_input if of else "") or path
+    match = _OF_CONNECTION.match(path)
+    return (request.connections[int(match[1])].for_input if match else "") or path

@@ -1,8 +1,8 @@
 """The reference's ``DeploymentRequest`` goal as plain data, parsed into a :class:`DemandRequest`.
 
-The ROS 2 node and ``demandops request FILE`` both come through :func:`parse`, so a file is judged
-exactly as a message is. Absent fields take ROS's defaults, enums are integers, unknown fields are
-errors. Faults name the wire's own fields (``apps[0].header.node_id``).
+The ROS 2 node and ``demandops request FILE`` both use :func:`parse`, so files and messages have
+the same rules. Absent fields have ROS's defaults, enums are integers, unknown fields are errors.
+Faults name the fields of the message (``apps[0].header.node_id``).
 """
 
 from __future__ import annotations
@@ -110,25 +110,24 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
     Args:
         data: the goal as a mapping, as ``ros2 action send_goal`` takes it.
-        appdef_by_type: the appdef that the wire's number names, or nothing.
+        appdef_by_type: returns the appdef of a number in the message, or ``None``.
 
     Returns:
-        The request and the faults of its form. Where a field has the wrong form it is left out
-        and the rest is parsed all the same, so that the caller can report further faults with
-        these; a request with faults must not be booked. No request where ``data`` is no mapping.
+        The request and the faults of its form. Fields of the wrong form are left out of the
+        request, so that the caller can check the others. A request with faults must not be booked.
+        The request is ``None`` if ``data`` is not a mapping.
     """
     if not isinstance(data, dict):
-        return None, [_no_mapping()]
+        return None, [_not_a_mapping()]
     goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
-    # where it does not say which, it is held to what a shutdown is held to: the rules of both
-    told = {found.field for found in faults}
-    unsaid = "shutdown" in told
+    faulty = {found.field for found in faults}
+    unclear = "shutdown" in faulty  # then only the rules of both operations apply: a shutdown's
     request = DemandRequest(
         id=goal.id,
-        operation=Operation.SHUTDOWN if goal.shutdown or unsaid else Operation.JOIN,
+        operation=Operation.SHUTDOWN if goal.shutdown or unclear else Operation.JOIN,
         applications=tuple(_application(app, appdef_by_type(app.type)) for app in goal.apps),
         connections=tuple(
-            _connection(connection, sound=f"connections[{index}].type" not in told)
+            _connection(connection, valid_type=f"connections[{index}].type" not in faulty)
             for index, connection in enumerate(goal.connections)
         ),
     )
@@ -146,18 +145,18 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
 
 def form_faults(data: object) -> list[Fault]:
-    """Return what of ``data`` has not the form of a goal: unknown fields, wrong types."""
+    """Return the faults of the form of ``data``: unknown fields, wrong types."""
     if not isinstance(data, dict):
-        return [_no_mapping()]
+        return [_not_a_mapping()]
     return parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]
 
 
-def _no_mapping() -> Fault:
+def _not_a_mapping() -> Fault:
     return fault("", "a request is a mapping with id, apps, connections and shutdown")
 
 
 def _wire_inputs(appdef: ApplicationDefinition | None) -> Mapping[str, str]:
-    """Return topic list of the message → role, as the appdef says."""
+    """Return the appdef's mapping of the message's topic lists to roles."""
     if appdef is None or appdef.deployment_request is None:
         return {}
     return {str(name): role for name, role in appdef.deployment_request.inputs.items()}
@@ -190,16 +189,16 @@ def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
     )
 
 
-def _connection(connection: WireConnection, *, sound: bool) -> ConnectionDemand:
-    """Return a connection; without a sound type it is held to no type's own rules."""
+def _connection(connection: WireConnection, *, valid_type: bool) -> ConnectionDemand:
+    """Return a connection; ``AUTO`` replaces an invalid type, so that no type's rules apply."""
     sources, targets = connection.source_topics, connection.target_topics
-    # where one list is shorter (told by the caller), the other's names stand in for its
+    # the caller reports lists of unequal length; names of the longer fill the shorter
     pairs = zip(
         [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
     )
     return ConnectionDemand(
         id=connection.id,
-        type=connection.type if sound else ConnectionType.AUTO.value,
+        type=connection.type if valid_type else ConnectionType.AUTO.value,
         source=connection.source_node_id,
         target=connection.target_node_id,
         topics=tuple(
@@ -211,10 +210,10 @@ def _connection(connection: WireConnection, *, sound: bool) -> ConnectionDemand:
 
 
 def goal_field(path: str, request: DemandRequest, appdefs: AppdefByName) -> str:
-    """Return the wire's name for a field of ``request``.
+    """Return the message's field for a field of ``request``.
 
-    ``applications[0].node`` is ``apps[0].header.node_id`` in the message, and a role is the topic
-    list that the appdef says it comes from.
+    ``applications[0].node`` is ``apps[0].header.node_id`` in the message. A role is the topic list
+    that the appdef maps to it.
     """
     for pattern, replacement in _WIRE_NAMES:
         if pattern.match(path):

@@ -1,7 +1,7 @@
-"""The form of a goal: what of plain data fits a model, and every fault of what does not.
+"""Validation of the form of a goal: the valid part of plain data, and the faults of the rest.
 
-A field of the wrong form is left out and the rest is taken all the same, so that faults of form
-and of content are told together.
+Fields of the wrong form are left out and the others kept, so that faults of form and of content
+can be reported together.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from demandops.config.base_model import faults_of, field_path
 from demandops.errors import Fault, fault
 
 _DEEPEST = 100
-"""Levels of a goal, as many as of one in YAML."""
+"""The deepest nesting of a goal, the same as in YAML."""
 
 Goal = TypeVar("Goal", bound=BaseModel)
 
@@ -24,12 +24,12 @@ Goal = TypeVar("Goal", bound=BaseModel)
 def parse_valid_part(
     data: dict[str, Any], model: type[Goal], lists_of_text: Container[str]
 ) -> tuple[Goal, list[Fault]]:
-    """Return what of ``data`` has the form of ``model``, and the faults of the rest.
+    """Return the part of ``data`` that has the form of ``model``, and the faults of the rest.
 
     Args:
-        data: the goal as it came.
-        model: one whose every field has a default.
-        lists_of_text: its fields that are lists of text.
+        data: the goal.
+        model: a model with a default for every field.
+        lists_of_text: the fields of the model that are lists of text.
     """
     faults: list[Fault] = []
     pruned = _with_keys_of_text(data, (), faults)
@@ -45,7 +45,7 @@ def parse_valid_part(
 def _with_keys_of_text(
     data: object, location: tuple[int | str, ...], faults: list[Fault]
 ) -> object:
-    """Return ``data`` without the entries whose key is no text, which are told."""
+    """Return ``data`` without the entries whose key is not text; add a fault for each."""
     if len(location) > _DEEPEST and isinstance(data, dict | list):
         message = f"is nested deeper than {_DEEPEST} levels; make it flatter"
         faults.append(fault(field_path(location[:2]), message))
@@ -70,12 +70,12 @@ def _blanked(
     lists_of_text: Container[str],
     within: str = "",
 ) -> object:
-    """Return ``data`` without what stands at ``location``.
+    """Return ``data`` without the value at ``location``.
 
-    A field goes, so that its default holds; a list's item becomes an empty one, so that those
-    behind it keep their places.
+    A field is removed, so that its default applies. An item of a list is replaced by an empty one,
+    so that later items keep their positions.
     """
-    if not location:  # the whole of it, as for a key that is no Unicode text
+    if not location:  # the fault concerns all of it, for example a key with a lone surrogate
         return {}
     head, *rest = location
     if isinstance(data, list) and isinstance(head, int):
