@@ -32,11 +32,11 @@ def id_problem(value: str) -> str:
     if not value:
         return "is empty; give an id"
     if len(value) > MAX_ID:
-        return f"has {len(value)} characters; at most {MAX_ID} are taken"
+        return f"has {len(value)} characters; at most {MAX_ID} are allowed"
     if ".." in value:
         return f"{quoted(value)} holds '..'; choose an id without it"
     if value != value.strip():
-        return f"{quoted(value)} starts or ends with white space; take it away"
+        return f"{quoted(value)} starts or ends with white space; remove it"
     for char in value:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return (
@@ -66,4 +66,4 @@ def message_type_problem(name: str) -> str:
     """Return why a name is not a ROS 2 message type with its package, or an empty string."""
     if _MESSAGE_TYPE.fullmatch(name):
         return ""
-    return f"{quoted(name)} is no message type; write it like std_msgs/msg/String"
+    return f"{quoted(name)} is not a message type; write it like std_msgs/msg/String"

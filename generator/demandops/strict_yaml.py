@@ -54,7 +54,7 @@ def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:  # noqa: AN
             )
         if key in seen:
             raise yaml.constructor.ConstructorError(
-                None, None, f"the key {key!r} stands twice", key_node.start_mark
+                None, None, f"the key {key!r} appears twice", key_node.start_mark
             )
         seen[key] = loader.construct_object(value_node, deep=True)
     return seen
@@ -125,7 +125,12 @@ def load_all(text: str) -> Iterator[Any]:
             if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
                 where = f"line {event.start_mark.line + 1}" if event.start_mark else ""
                 raise InvalidInput(
-                    [fault(where, "anchors and aliases (& and *) are not taken; write it out")]
+                    [
+                        fault(
+                            where,
+                            "anchors and aliases (& and *) are not allowed; write the value out",
+                        )
+                    ]
                 )
         yield from yaml.load_all(text, Loader=_StrictLoader)
     except yaml.YAMLError as error:
@@ -139,7 +144,7 @@ def load(text: str) -> Any:  # noqa: ANN401 - the caller parses raw YAML into mo
     """Return the only document of ``text``, or ``None`` if it is empty."""
     documents = list(load_all(text))
     if len(documents) > 1:
-        raise InvalidInput([fault("", f"holds {len(documents)} documents; only one is taken")])
+        raise InvalidInput([fault("", f"holds {len(documents)} documents; only one is allowed")])
     return documents[0] if documents else None
 
 
@@ -198,7 +203,7 @@ def set_key(text: str, key: str, value: object) -> str:
         succeeded = False
     if not succeeded:
         raise InvalidInput(
-            [fault(key, f"cannot be set by the program; write {short_repr(value)} there")]
+            [fault(key, f"cannot be set automatically; write {short_repr(value)} there")]
         )
     return changed
 

@@ -50,9 +50,7 @@ class Scaling(FrozenModel):
     @model_validator(mode="after")
     def _ordered(self) -> Scaling:
         if self.min > self.max:
-            raise ValueError(
-                f"min {self.min} is above max {self.max}; lower the one or raise the other"
-            )
+            raise ValueError(f"min {self.min} is above max {self.max}; lower min or raise max")
         return self
 
 
@@ -78,9 +76,9 @@ class Service(FrozenModel):
     @model_validator(mode="after")
     def _consistent(self) -> Service:
         if self.each and self.inputs:
-            raise ValueError("'each' already says what the service takes in; remove 'inputs'")
+            raise ValueError("'each' already names the service's input; remove 'inputs'")
         if self.placement == "source" and not self.each:
-            raise ValueError("placement 'source' needs 'each': an application has no one source")
+            raise ValueError("placement 'source' needs 'each': an application has no single source")
         return self
 
 

@@ -77,7 +77,7 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
     if kind == "extra_forbidden":
         name = str(item["loc"][-1])
         known = _fields(model) if len(item["loc"]) == 1 else []
-        return "is not a field here; remove it or mend its spelling" + (
+        return "is not a field here; remove it or correct its spelling" + (
             suggestion(name, known) if known else ""
         )
     if kind == "string_type" and isinstance(value, int | float):

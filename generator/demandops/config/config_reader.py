@@ -34,7 +34,7 @@ class ConfigReader:
         """Return a file as ``model``; if it is missing or invalid, add the faults."""
         text = self.files.get(file)
         if text is None:
-            self.add_fault(file, "", "is missing; `demandops init` shows what it holds")
+            self.add_fault(file, "", "is missing; `demandops init` creates an example")
             return None
         try:
             return parse_file(model, text, file)
@@ -54,7 +54,7 @@ class ConfigReader:
             name = entry.get(key) if isinstance(entry, dict) else None
             if isinstance(name, str) and name in positions:
                 self.add_fault(
-                    file, f"{field}[{index}].{key}", f"'{name}' stands twice; remove one"
+                    file, f"{field}[{index}].{key}", f"'{name}' appears twice; remove one"
                 )
                 continue
             parsed = self._item(file, f"{field}[{index}]", item, entry)

@@ -72,7 +72,7 @@ def _check_topics(config: Config, reader: ConfigReader) -> None:
                 reader.add_fault(
                     NODES_FILE,
                     f"nodes[{reader.index_of(NODES_FILE, node.id)}].topics.{role}",
-                    f"'{role}' is an input of no application" + suggestion(role, roles),
+                    f"'{role}' is not an input of any application" + suggestion(role, roles),
                 )
 
 
@@ -84,7 +84,7 @@ def _check_namespaces(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 DOMAINS_FILE,
                 f"domains[{reader.index_of(DOMAINS_FILE, domain.name)}].namespace",
-                f"'{domain.namespace}' is the namespace of '{other}' already; give each its own",
+                f"'{domain.namespace}' is already the namespace of '{other}'; give each its own",
             )
 
 
@@ -95,8 +95,8 @@ def _check_controllers_namespace(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 DOMAINS_FILE,
                 f"domains[{reader.index_of(DOMAINS_FILE, domain.name)}].namespace",
-                f"'{domain.namespace}' is Argo CD's own, where whoever may write an Application "
-                "may do all that Argo CD may; choose another",
+                f"'{domain.namespace}' is Argo CD's own namespace, where an Application may do "
+                "all that Argo CD may; choose another",
             )
 
 
@@ -113,7 +113,7 @@ def _check_chart(where: str, chart: ChartSource, config: Config, reader: ConfigR
     path = f"{chart.folder}/Chart.yaml"
     text = config.files.get(path)
     if text is None:
-        message = f"'{path}' does not exist; mend the folder"
+        message = f"'{path}' does not exist; correct the folder"
         reader.add_fault(CHARTS_FILE, f"{where}.folder", message)
         return
     try:
@@ -126,7 +126,7 @@ def _check_chart(where: str, chart: ChartSource, config: Config, reader: ConfigR
         reader.add_fault(
             CHARTS_FILE,
             f"{where}.version",
-            f"is {chart.version}, but {path} says {version}; make them one",
+            f"is {chart.version}, but {path} says {version}; make them equal",
         )
 
 
@@ -151,7 +151,7 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
                 message = f"'{service.values}' does not exist; add it beside appdef.yaml"
                 reader.add_fault(file, f"{where}.values", message)
             if service.prefix in _CONNECTION_PREFIXES:
-                message = f"'{service.prefix}' names connections; choose another"
+                message = f"'{service.prefix}' is the prefix of connections; choose another"
                 reader.add_fault(file, f"{where}.prefix", message)
                 continue
             other = prefixes.setdefault(service.prefix, (appdef.name, name, service))
@@ -159,8 +159,8 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
                 reader.add_fault(
                     file,
                     f"{where}.prefix",
-                    f"'{service.prefix}' is used by '{other[1]}' already; only a service for each "
-                    "topic may stand in several appdefs, and then must be the same in all",
+                    f"'{service.prefix}' is used by '{other[1]}' already; choose another (only "
+                    "identical services with 'each' may share a prefix)",
                 )
 
 
@@ -175,7 +175,7 @@ def _same(config: Config, one: tuple[str, str, Service], other: tuple[str, str, 
 
 def _check_clients(config: Config, reader: ConfigReader) -> None:
     if config.brokers and reader.is_missing(IMAGES_FILE, MQTT_CLIENT_IMAGE):
-        message = f"'{MQTT_CLIENT_IMAGE}' is missing; MQTT connections run it"
+        message = f"'{MQTT_CLIENT_IMAGE}' is missing; add it, because MQTT connections run it"
         reader.add_fault(IMAGES_FILE, "images", message)
 
 
@@ -196,8 +196,8 @@ def _check_links(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 NODES_FILE,
                 f"{where}.zenoh",
-                f"'{other}' runs a bridge on the same host and ROS domain, and two do not work; "
-                "keep one",
+                f"'{other}' already runs a bridge on the same host and ROS domain; remove one of "
+                "them",
             )
 
 
@@ -234,14 +234,14 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 override.path,
                 "version",
-                f"'{override.version}' is no version or channel in {CHARTS_FILE} of a chart that "
-                f"is selected{suggestion(override.version, versions)}",
+                f"'{override.version}' is not a version or channel in {CHARTS_FILE} of a "
+                f"selected chart{suggestion(override.version, versions)}",
             )
 
 
 def _check_moved_to(node: str, override: Override, config: Config, reader: ConfigReader) -> None:
     if node in config.nodes and node not in config.domain_of and config.domains:
-        message = f"'{node}' is in no access domain; add it to one in {DOMAINS_FILE}"
+        message = f"'{node}' is not in any access domain; add it to one in {DOMAINS_FILE}"
         reader.add_fault(override.path, "node", message)
 
 

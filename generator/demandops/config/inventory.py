@@ -182,7 +182,8 @@ class Node(FrozenModel):
     def _findable(self) -> Node:
         if self.selector is None and not _LABEL_VALUE.fullmatch(self.id):
             raise ValueError(
-                "the id is no label value, so nodes cannot carry it as node_id; add a selector"
+                "the id is not a valid label value, so nodes cannot have it as node_id; add a "
+                "selector"
             )
         return self
 

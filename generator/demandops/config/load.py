@@ -96,7 +96,7 @@ def _read_appdefs(reader: ConfigReader) -> Mapping[str, ApplicationDefinition]:
             continue
         if appdef.name != parts[1]:
             reader.add_fault(
-                path, "name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them one"
+                path, "name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them equal"
             )
             appdef = appdef.model_copy(update={"name": parts[1]})
         appdefs[appdef.name] = appdef
@@ -114,8 +114,8 @@ def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
             reader.add_fault(
                 path,
                 "",
-                "is no override: one is overrides/<name>.yaml, the name of small letters, digits "
-                "and '-'; rename the file, or remove it",
+                "is not an override file; rename it to overrides/<name>.yaml, with lower-case "
+                "letters, digits and '-', or remove it",
             )
             continue
         file = reader.read_file(path, OverrideFile)

@@ -47,7 +47,7 @@ def parse_time(text: str) -> datetime:
         return moment.astimezone(timezone.utc)
     except (ValueError, OverflowError):
         raise ValueError(
-            f"{quoted(text)} is no time with a time zone; write one like 2026-01-31T12:00:00Z"
+            f"{quoted(text)} is not a time with a time zone; write one like 2026-01-31T12:00:00Z"
         ) from None
 
 
@@ -66,7 +66,7 @@ def _one_line(text: str) -> str:
     if not text.strip() or text != text.strip():
         raise ValueError("is empty or starts or ends with white space; write one line of text")
     if not text.isprintable():
-        raise ValueError(f"{quoted(text)} is more than one line of plain text; make it one")
+        raise ValueError(f"{quoted(text)} is more than one line of plain text; write one line")
     return text
 
 
@@ -79,7 +79,7 @@ def _owner(text: str) -> str:
 
 def _finite(value: Any) -> None:  # noqa: ANN401 - Helm values are any data
     if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"holds {value}, which JSON has no number for; choose another value")
+        raise ValueError(f"contains {value}, which is not a number in JSON; choose another value")
     inner = value.values() if isinstance(value, dict) else value
     for item in inner if isinstance(value, dict | list) else ():
         _finite(item)
@@ -92,7 +92,7 @@ def _patch(value: dict[str, Any]) -> dict[str, Any]:
 
 def _some(items: tuple[Any, ...]) -> tuple[Any, ...]:
     if not items or "" in items:
-        raise ValueError("is empty or holds nothing; say what is selected")
+        raise ValueError("is empty or has an empty item; name what to select")
     return items
 
 
@@ -104,7 +104,7 @@ def _filled_in(model: FrozenModel) -> None:
     """Raise for a field without a value, which selects or changes less than it seems to."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
-        raise ValueError(f"{' and '.join(empty)}: nothing stands there; fill it in, or remove it")
+        raise ValueError(f"{' and '.join(empty)}: has no value; fill it in, or remove it")
 
 
 class Selector(FrozenModel):
@@ -125,12 +125,12 @@ class Selector(FrozenModel):
     @model_validator(mode="after")
     def _sensible(self) -> Selector:
         if not self.model_fields_set:
-            raise ValueError("selects nothing; give at least one field, nodes: ['*'] say")
+            raise ValueError("selects nothing; give at least one field, for example nodes: ['*']")
         _filled_in(self)
         others = [name for name in ("applications", "appdefs", "services") if getattr(self, name)]
         if self.connections and others:
             raise ValueError(
-                f"connections and {others[0]} never fit the same thing; write two selectors"
+                f"connections and {others[0]} never match the same thing; write two selectors"
             )
         return self
 
@@ -147,7 +147,7 @@ class ImagePin(FrozenModel):
     @model_validator(mode="after")
     def _says_something(self) -> ImagePin:
         if not (self.repository or self.tag or self.digest):
-            raise ValueError("says nothing; give a tag, a digest or a repository")
+            raise ValueError("changes nothing; give a tag, a digest or a repository")
         return self
 
     def over(self, image: Image) -> Image:
@@ -193,8 +193,8 @@ class OverrideFile(FileModel):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
             if selector.connections and wrong:
                 yield (
-                    f"select[{index}].connections: {wrong[0]} is for services, and a connection "
-                    "has none; remove the one or the other"
+                    f"select[{index}].connections: {wrong[0]} is for services, and connections "
+                    "have none; remove one of the two"
                 )
             if selector.services and "keep" in effects:
                 yield (
@@ -242,12 +242,12 @@ def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
         yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
     if "deny" in effects and len(effects) > 1:
         others = " and ".join(name for name in effects if name != "deny")
-        yield f"deny keeps it from running, so {others} can do nothing; keep one of them"
+        yield f"deny prevents it from running, so {others} cannot apply; remove one of them"
     frozen = [name for name in effects if name in _SHAPING]
     if "hold" in effects and frozen:
         yield (
-            f"hold freezes the release as it is, so {' and '.join(frozen)} cannot change it; keep "
-            "one of them"
+            f"hold freezes the release, so {' and '.join(frozen)} cannot change it; remove one "
+            "of them"
         )
 
 

@@ -28,7 +28,7 @@ def seconds_of(text: str) -> int:
     """
     match = _DURATION.fullmatch(text)
     if not text or match is None:
-        raise ValueError(f"{quoted(text)} is no duration; write one like 90s, 10m, 1h30m or 2d")
+        raise ValueError(f"{quoted(text)} is not a duration; write one like 90s, 10m, 1h30m or 2d")
     seconds = sum(int(part) * unit for part, unit in zip(match.groups("0"), _UNITS_S, strict=True))
     if seconds > _YEAR_S:
         raise ValueError(f"'{text}' is longer than a year; choose a shorter duration")
@@ -100,7 +100,7 @@ class LeasePolicy(FrozenModel):
         for name in ("default", "longest"):
             value = getattr(self, name)
             if value is not None and seconds_of(value) < 1:
-                raise ValueError(f"{name} is no time at all; leave it out for no limit")
+                raise ValueError(f"{name} is zero; leave it out for no limit")
         if self.deployment_requests and self.default is None:
             raise ValueError("deploymentRequests needs a default: such a demand names no lease")
         if self.default and self.longest and seconds_of(self.default) > seconds_of(self.longest):
@@ -129,7 +129,7 @@ class AccessDomain(FrozenModel):
         names = [rule.name for rule in self.rules]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"rules: two are called '{name}'; refusals name the rule")
+                raise ValueError(f"rules: two have the name '{name}'; give each its own")
         return self
 
 

@@ -37,7 +37,8 @@ class ChartSource(FrozenModel):
             )
         if re.search(r"://[^/\s]*@", self.http or self.oci or ""):
             raise ValueError(
-                "must hold no user or password; give it to the GitOps controller as a Secret"
+                "must not contain a user or password; give them to the GitOps controller as a "
+                "Secret"
             )
         if self.folder and ".." in self.folder.split("/"):
             raise ValueError("folder must stay inside the state repo; remove '..'")

@@ -45,8 +45,8 @@ _WEB_URL = re.compile(
 def _web_url(text: str) -> str:
     if not _WEB_URL.fullmatch(text):
         raise ValueError(
-            f"{quoted(text)} is no address that a token is sent to; write https://HOST/PATH, "
-            "without a user (plain http only for this machine)"
+            f"{quoted(text)} is not an address that a token may be sent to; write "
+            "https://HOST/PATH, without a user (plain http only for this machine)"
         )
     return text
 

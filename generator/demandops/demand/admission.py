@@ -44,7 +44,7 @@ def _application(
             if role not in appdef.inputs and topics:
                 yield fault(
                     f"{where}.inputs.{role}",
-                    f"{appdef.name} takes no such input" + suggestion(role, appdef.inputs),
+                    f"{appdef.name} has no such input" + suggestion(role, appdef.inputs),
                 )
         for name in app.parameters:
             if name not in appdef.parameters:
@@ -55,7 +55,7 @@ def _application(
         if app.version and app.version not in config.versions_of(appdef.name):
             yield fault(
                 f"{where}.version",
-                f"{quoted(app.version)} is no version or channel of {appdef.name} in "
+                f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
                 "registry/charts.yaml" + suggestion(app.version, config.versions_of(appdef.name)),
             )
     if not claiming:
@@ -81,7 +81,7 @@ def _unknown_application(where: str, name: str, config: Config) -> Fault:
     else:
         known = suggestion(name, config.appdefs)
     shown = name.removeprefix("#") if name.startswith("#") else quoted(name)
-    message = f"{shown} names no application definition{known}"
+    message = f"{shown} is not a known application type{known}"
     return fault(f"{where}.appdef", message, code="unknown-application")
 
 
@@ -94,7 +94,7 @@ def _connection(
         known = ", ".join(f"{n} ({item.name})" for n, item in types.items() if n >= 0)
         yield fault(
             f"{where}.type",
-            f"{connection.type} is no connection type; known: {known}",
+            f"{connection.type} is not a connection type; known: {known}",
             code="unknown-connection-type",
         )
     if not claiming:
@@ -129,7 +129,7 @@ def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
     elif node not in config.domain_of:
         yield fault(
             where,
-            f"{quoted(node)} is in no access domain; a platform engineer adds it to "
+            f"{quoted(node)} is not in any access domain; a platform engineer adds it to "
             "policy/access-domains.yaml",
             code="no-access-domain",
         )

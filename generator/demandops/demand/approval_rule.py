@@ -14,10 +14,12 @@ from demandops.config.policy import AccessDomain, matches
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim, Subject, SubjectKind
 from demandops.demand.demand_request import ConnectionType, DemandRequest
 from demandops.demand.lease import Term
-from demandops.demand.permission import access_of_connection, first_uncovered, service_nodes
-
-Access = Iterable[tuple[str, str]]
-"""Fields of a rule (``nodes``, ``applications``) and the values that a claim needs in them."""
+from demandops.demand.permission import (
+    Access,
+    access_of_application,
+    access_of_connection,
+    first_uncovered,
+)
 
 
 def approval_reasons(
@@ -63,7 +65,7 @@ def _reasons(claim: Claim, config: Config) -> Iterator[str]:
             yield f"application definition '{appdef.name}'"
     for domain, access in _access(claim, config):
         for requester in claim.requesters:
-            yield from _domain_reasons(domain, requester, list(access))
+            yield from _domain_reasons(domain, requester, access)
 
 
 def _access(claim: Claim, config: Config) -> Iterator[tuple[AccessDomain, Access]]:
@@ -71,11 +73,8 @@ def _access(claim: Claim, config: Config) -> Iterator[tuple[AccessDomain, Access
     if isinstance(claim, ConnectionClaim):
         mqtt = claim.type is ConnectionType.MQTT
         yield from access_of_connection(claim.source, claim.target, claim.broker, mqtt, config)
-        return
-    for node in service_nodes(claim, config):
-        domain = config.domain_of.get(node)
-        if domain is not None:
-            yield domain, (("applications", claim.appdef), ("nodes", node))
+    else:
+        yield from access_of_application(claim, config)
 
 
 def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Iterator[str]:

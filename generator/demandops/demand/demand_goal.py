@@ -172,7 +172,7 @@ def _application(
         try:
             parameters[name] = _storable(place, json.loads(text), faults)
         except (ValueError, RecursionError):
-            message = 'is no JSON; a text needs quotes of its own, as in "\\"fast\\""'
+            message = 'is not JSON; text needs its own quotes, as in "\\"fast\\""'
             faults.append(fault(place, message))
     return ApplicationDemand(
         id=app.id,
@@ -204,9 +204,9 @@ def _value_problem(value: object, depth: int) -> str:
     if depth > _DEEPEST:
         return f"is nested deeper than {_DEEPEST} levels; make it flatter"
     if isinstance(value, float) and not math.isfinite(value):
-        return f"holds {value}, which is no finite number; give one, or leave it out"
+        return f"holds {value}, which is not a finite number; give one, or leave it out"
     if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
-        return f"holds {quoted(value)}, which is no Unicode text; write whole characters"
+        return f"holds {quoted(value)}, which is not Unicode text; write whole characters"
     parts = [*value, *value.values()] if isinstance(value, dict) else value
     nested = parts if isinstance(parts, list) else ()
     return next(filter(None, (_value_problem(part, depth + 1) for part in nested)), "")

@@ -154,7 +154,7 @@ def faults(request: DemandRequest) -> Iterator[Fault]:
     if needs_subjects and not (request.applications or request.connections):
         yield fault(
             "id" if request.operation.is_reference else "applications",
-            "the request lists no application and no connection; list what it is for",
+            "the request lists no application and no connection; list at least one",
             code="empty",
         )
     for index, app in enumerate(request.applications):
@@ -177,7 +177,9 @@ def _own_fields(request: DemandRequest) -> Iterator[Fault]:
     yield from _id("demand", request.demand)
     if request.demand.startswith(OVERRIDE_PREFIX):
         yield fault(
-            "demand", f"starts with '{OVERRIDE_PREFIX}', as overrides do; choose another demand id"
+            "demand",
+            f"starts with '{OVERRIDE_PREFIX}', which only overrides may use; choose "
+            "another demand id",
         )
     if not (request.applications or request.connections):  # else each of them is checked
         yield from _requesters("requesters", request.own_requesters)
@@ -188,8 +190,8 @@ def _own_fields(request: DemandRequest) -> Iterator[Fault]:
     if request.operation is not Operation.PUT and (request.applications or request.connections):
         yield fault(
             "applications" if request.applications else "connections",
-            f"a {request.operation.value} names its demand alone; put the demand with less to give "
-            "up a part of it",
+            f"a {request.operation.value} names only its demand; to release a part, put the "
+            "demand without it",
         )
 
 
@@ -220,7 +222,7 @@ def _connection(where: str, connection: ConnectionDemand, claiming: bool) -> Ite
         if claiming and same_place and route.source == route.target:
             yield fault(
                 f"{where}.topics[{index}].target",
-                f"'{route.target}' would feed itself, for source and target are both "
+                f"'{route.target}' would feed itself, because source and target are both "
                 f"'{connection.source}'; name another target node or topic",
             )
 
@@ -237,4 +239,4 @@ def _requesters(where: str, requesters: Iterable[str]) -> Iterator[Fault]:
         empty = False
         yield from _id(f"{where}[{index}]", requester)
     if empty:
-        yield fault(where, "is empty; say for whom this is asked")
+        yield fault(where, "is empty; list at least one requester")

@@ -121,7 +121,8 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
         return None, [_not_a_mapping()]
     goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
     faulty = {found.field for found in faults}
-    unclear = "shutdown" in faulty  # then only the rules of both operations apply: a shutdown's
+    # without a valid "shutdown", only the rules of both operations apply, which are a shutdown's
+    unclear = "shutdown" in faulty
     request = DemandRequest(
         id=goal.id,
         operation=Operation.SHUTDOWN if goal.shutdown or unclear else Operation.JOIN,

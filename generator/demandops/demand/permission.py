@@ -22,6 +22,9 @@ from demandops.demand.lease import Term
 from demandops.demand.transport_choice import choose_broker
 from demandops.errors import Fault, fault
 
+Access = list[tuple[str, str]]
+"""Fields of a rule (``nodes``, ``applications``) and the values that a demand needs in them."""
+
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
     """Yield a fault for everything that the access domains do not allow the requesters.
@@ -32,22 +35,29 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         return
     for index, app in enumerate(request.applications):
         where = f"applications[{index}]"
-        for node in service_nodes(app, config):
-            domain = config.domain_of.get(node)
-            if domain is not None:
-                access = (("applications", app.appdef), ("nodes", node))
-                yield from _not_allowed(where, app.requesters, domain, access)
+        for domain, access in access_of_application(app, config):
+            yield from _not_allowed(where, app.requesters, domain, access)
         home = config.domain_of.get(app.node)
         if home is not None:
             yield from _too_long(request, home)
     for index, connection in enumerate(request.connections):
         yield from _connection(f"connections[{index}]", connection, config)
-        domain = config.domain_of.get(connection.target)
+        home = config.domain_of.get(connection.target)
+        if home is not None:
+            yield from _too_long(request, home)
+
+
+def access_of_application(
+    app: ApplicationDemand | ApplicationClaim, config: Config
+) -> Iterator[tuple[AccessDomain, Access]]:
+    """Yield the access that an application needs to the access domain of each of its nodes."""
+    for node in _service_nodes(app, config):
+        domain = config.domain_of.get(node)
         if domain is not None:
-            yield from _too_long(request, domain)
+            yield domain, [("applications", app.appdef), ("nodes", node)]
 
 
-def service_nodes(app: ApplicationDemand | ApplicationClaim, config: Config) -> Iterable[str]:
+def _service_nodes(app: ApplicationDemand | ApplicationClaim, config: Config) -> Iterable[str]:
     """Return the nodes on which services of an application run: its node, and sources."""
     appdef = config.appdefs.get(app.appdef)
     services = appdef.services.values() if appdef else ()
@@ -65,7 +75,7 @@ def _connection(where: str, connection: ConnectionDemand, config: Config) -> Ite
 
 def access_of_connection(
     source: str, target: str, requested_broker: str, mqtt: bool, config: Config
-) -> Iterator[tuple[AccessDomain, list[tuple[str, str]]]]:
+) -> Iterator[tuple[AccessDomain, Access]]:
     """Yield the access that a connection needs to the access domain of each end."""
     broker = choose_broker(requested_broker, source, target, config) if mqtt else None
     for node in dict.fromkeys((source, target)):
@@ -82,10 +92,9 @@ def _not_allowed(
     where: str,
     requesters: Iterable[str],
     domain: AccessDomain,
-    access: Iterable[tuple[str, str]],
+    access: Access,
 ) -> Iterator[Fault]:
     """Yield a fault for each requester without a rule of the domain that grants the access."""
-    access = list(access)
     for index, requester in enumerate(requesters if domain.rules else ()):
         own = [rule for rule in domain.rules if matches(requester, rule.requesters)]
         misses = [first_uncovered(rule, access) for rule in own]
@@ -107,7 +116,7 @@ def _not_allowed(
         yield fault(place, message, code="not-allowed")
 
 
-def first_uncovered(rule: Rule, access: Iterable[tuple[str, str]]) -> tuple[str, str] | None:
+def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
     """Return the first access that a rule does not grant, or ``None`` if it grants all."""
     return next(
         ((kind, value) for kind, value in access if not matches(value, getattr(rule, kind))), None
@@ -121,7 +130,7 @@ def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
     yield fault(
         "lease",
         f"is {request.lease_s} s, above leases.longest of access domain '{domain.name}', "
-        f"{longest}; ask for that, and renew",
+        f"{longest}; request that, and renew",
         code="not-allowed",
     )
 

@@ -135,7 +135,7 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             yield fault(
                 f"{where}[{index}].target",
                 f"{quoted(route.source)} goes to {quoted(first.target)} and to "
-                f"{quoted(route.target)}; a source topic has one target, use a second connection",
+                f"{quoted(route.target)}; one source topic has one target, use a second connection",
             )
         for name, value, other in contradictions(first, route):
             yield fault(
@@ -146,7 +146,8 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             yield fault(
                 f"{where}[{index}].target",
                 f"{quoted(route.target)} is carried back to {quoted(carried_back[route.target])} "
-                f"and to {quoted(route.source)}; a topic has one target, use a second connection",
+                f"and to {quoted(route.source)}; one topic goes to one place, use a second "
+                "connection",
             )
 
 

@@ -81,7 +81,7 @@ def no_type_fault(connection: ConnectionDemand, config: Config) -> Fault:
         reason = next(type_faults(kind, connection, config))
         field = "" if reason.field == "type" else f"{reason.field} "
         reasons.append(f"{kind.name}: {field}{reason.message}")
-    message = f"is open, and nothing can carry it. {'; '.join(reasons)}"
+    message = f"is not given, and no type can carry it. {'; '.join(reasons)}"
     return fault("type", message, code=_UNSUPPORTED)
 
 
@@ -136,7 +136,7 @@ def _end_faults(
             yield _no_broker(connection, config)
         return
     if connection.broker:
-        yield fault("broker", f"is of MQTT only, and this is {kind.name}; leave it out")
+        yield fault("broker", f"is for MQTT only, and the type is {kind.name}; leave it out")
     if source is None or target is None:
         return
     for end, node in (("source", source), ("target", target)):
@@ -151,7 +151,7 @@ def _end_faults(
         if source.wan is None and target.wan is None:
             yield fault(
                 "type",
-                f"0 (ROS) needs an address that one end can be reached at; add wan: {{host: …}} to "
+                f"0 (ROS) needs an end with a reachable address; add wan: {{host: …}} to "
                 f"'{source.id}' or '{target.id}' in {NODES_FILE}",
                 code=_UNSUPPORTED,
             )
@@ -165,7 +165,7 @@ def _zenoh_end_faults(source: Node, target: Node) -> Iterator[Fault]:
             yield fault(
                 end,
                 f"'{node.id}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to it in "
-                f"{NODES_FILE}, or zenoh: {{}} where others can be reached from it",
+                f"{NODES_FILE}, or zenoh: {{}} if it can reach others",
                 code=_UNSUPPORTED,
             )
     if source.zenoh is None or target.zenoh is None:
@@ -176,8 +176,8 @@ def _zenoh_end_faults(source: Node, target: Node) -> Iterator[Fault]:
     ):
         yield fault(
             "type",
-            f"2 (ZENOH) finds no way between '{source.id}' and '{target.id}'; give one of them an "
-            f"endpoint under zenoh in {NODES_FILE}, or both one router under connect",
+            f"2 (ZENOH) finds no route between '{source.id}' and '{target.id}'; give one of them "
+            f"an endpoint under zenoh in {NODES_FILE}, or both one router under connect",
             code=_UNSUPPORTED,
         )
 
@@ -190,7 +190,7 @@ def _option_faults(where: str, kind: ConnectionType, route: Route) -> Iterator[F
         names = " or ".join(f"{other.value} ({other.name})" for other in able)
         yield fault(
             f"{where}.{name}",
-            f"{name} of '{route.source}' is nothing that {kind.name} can do; leave it out, or use "
+            f"{name} of '{route.source}' is not supported by {kind.name}; leave it out, or use "
             f"type {names}",
         )
 
@@ -199,13 +199,13 @@ def _ros_route_faults(where: str, route: Route, node: str, config: Config) -> It
     if node in config.nodes and not message_type(route, node, config):
         yield fault(
             f"{where}.type",
-            f"the message type of '{route.source}' is not known, and ROS needs it; say it in the "
-            f"request where it has a field for it, or add it to types of '{node}' in {NODES_FILE}",
+            f"the message type of '{route.source}' is not known, and ROS needs it; give it in "
+            f"the request if it has a field for it, or add it to types of '{node}' in {NODES_FILE}",
         )
     if route.durability and not route.reliability:
         yield fault(
             f"{where}.reliability",
-            f"is open while durability of '{route.source}' is set; ROS needs both, add it",
+            f"is not given, but durability of '{route.source}' is set; ROS needs both, add it",
         )
 
 

@@ -71,11 +71,11 @@ def test_every_option_does_something_in_some_client() -> None:
         ),
         (
             {"type": "String"},
-            "t.type: 'String' is no message type; write it like std_msgs/msg/String",
+            "t.type: 'String' is not a message type; write it like std_msgs/msg/String",
         ),
         (
             {"qso": 1},
-            "t.qso: is not a field here; remove it or mend its spelling; did you mean 'qos'?",
+            "t.qso: is not a field here; remove it or correct its spelling; did you mean 'qos'?",
         ),
     ],
 )
