@@ -58,7 +58,7 @@ class Config:
     denial_cache: dict[Hashable, Override | None] = field(
         default_factory=dict, compare=False, repr=False
     )
-    """Filled by :mod:`demandops.plan.overrides.claims_in_force` only."""
+    """The override that denies a claim, if any; ``claims_in_force`` fills it."""
 
     def with_ended_overrides(self, ended: Mapping[str, str]) -> Config:
         """Return the configuration with exactly these overrides ended."""

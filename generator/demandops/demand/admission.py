@@ -1,6 +1,6 @@
-"""Admission: can the configuration run what a request demands?
+"""Admission: the check that the configuration can run what a request demands.
 
-This checks a request against appdefs, inventory, brokers and access domains, not the ledger.
+It uses appdefs, inventory, brokers and access domains, but not the ledger.
 """
 
 from __future__ import annotations

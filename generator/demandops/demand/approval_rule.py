@@ -1,7 +1,7 @@
-"""Approval: which claims need a person's approval before they are booked?
+"""The approval rules: which claims need a person's approval before they are booked.
 
-An access domain, one of its rules or an application definition requires it. How a person approves
-is not known here.
+An access domain, one of its rules or an application definition can require it. How a person
+approves is not known here.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Permission: may these requesters demand this, on these nodes, for this long?
+"""Permission: the check that requesters may demand this, on these nodes, for this long.
 
-The access domains of the request's nodes decide. Every refusal names the rule.
+The access domains of the nodes decide. Every refusal names the rule.
 """
 
 from __future__ import annotations
