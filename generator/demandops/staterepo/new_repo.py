@@ -36,9 +36,9 @@ def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
     found = _read(data_folder("skeleton"), "")
     found |= _read(data_folder("appdefs"), "appdefs/")
     roots = {"flux": found.pop(ROOT_FILE), "argocd": found.pop("demandops.argocd.yaml")}
-    root = strict_yaml.edited(roots[gitops], "renderVersion", RENDER_VERSION)
+    root = strict_yaml.set_key(roots[gitops], "renderVersion", RENDER_VERSION)
     if url:
-        root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {strict_yaml.scalar(url)}", root)
+        root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {strict_yaml.to_json(url)}", root)
     found[ROOT_FILE] = root
     for path in PIPELINES:
         found[path] = re.sub(r"demandops==\S+", f"demandops=={__version__}", found[path])

@@ -132,11 +132,11 @@ def _planned(
     before = files[ROOT_FILE]
     files[ROOT_FILE] = _root(before, old, wish)
     marked = last_valid_config.markers_at(tree)
-    config = load(files).with_ended(ended_override_file.read(marked))
+    config = load(files).with_ended_overrides(ended_override_file.read(marked))
     state = State.of(config, snapshot.state.ledger)
     taken = _taken_in(repository, snapshot, state, marked, now)
     state = replace(state, ledger=taken.ledger, config=taken.config)
-    if old.repository.gitops != config.repository.gitops:
+    if old.repo_settings.gitops != config.repo_settings.gitops:
         _refuse_held(state)
     found = dict(line.everything(state, taken.files).files)
     if files[ROOT_FILE] != before:
@@ -181,18 +181,18 @@ def _refuse_held(state: State) -> None:
 
 def _root(text: str, config: Config, wish: UpgradeRequest) -> str:
     """Return ``demandops.yaml`` as wished, with whatever else a person wrote in it."""
-    repository = config.repository
+    repository = config.repo_settings
     gitops = wish.gitops or repository.gitops
     try:
         if repository.render_version != RENDER_VERSION:
-            text = strict_yaml.edited(text, "renderVersion", RENDER_VERSION)
+            text = strict_yaml.set_key(text, "renderVersion", RENDER_VERSION)
         if repository.gitops != gitops:
-            text = strict_yaml.edited(text, "gitops", gitops)
+            text = strict_yaml.set_key(text, "gitops", gitops)
         section = getattr(repository, gitops)
         if section is None:
             # both fetch the same repo, so the one that stands says from where
             known = getattr(repository, repository.gitops)
-            text = strict_yaml.edited(text, gitops, {"url": wish.url or known.url})
+            text = strict_yaml.set_key(text, gitops, {"url": wish.url or known.url})
         elif wish.url not in (None, section.url):
             told = f"is {section.url} already; change it there, or leave out --url"
             raise InvalidInput([fault(f"{gitops}.url", told)])
@@ -211,7 +211,7 @@ def _person(objects: Repository, now: datetime) -> Signature:
 
 
 def _message(made: Upgrade, taken: LedgerUpdate) -> str:
-    old, new = made.old.repository, made.new.repository
+    old, new = made.old.repo_settings, made.new.repo_settings
     moved = old.gitops != new.gitops
     title = "Render everything anew"
     if moved:

@@ -109,7 +109,7 @@ class BranchSync:
             stands = head and self._branches.is_fresh(snapshot.commit, head, record.base, made)
             if not stands and not self._lay(proposal, steps, snapshot, head):
                 return False
-        forge = snapshot.state.config.repository.proposals
+        forge = snapshot.state.config.repo_settings.proposals
         message = self._branches.message(proposal.record.commits[-1])
         title, body = message.split("\n", 1)[0], markdown(message, proposal.reasons)
         if forge.forge in ("github", "gitea"):
@@ -145,7 +145,10 @@ class BranchSync:
         for ticket, decision in left:
             try:
                 step = decide(
-                    state, approval_rule.proposed(decision.request), ticket.received, read
+                    state,
+                    approval_rule.with_leases_from_approval(decision.request),
+                    ticket.received,
+                    read,
                 )
             except InvalidInput as error:
                 faulty.append((ticket, error))
@@ -179,7 +182,7 @@ class BranchSync:
         return True
 
     def _options(self, proposal: Proposal, snapshot: Snapshot, made: str) -> list[str]:
-        forge = snapshot.state.config.repository.proposals
+        forge = snapshot.state.config.repo_settings.proposals
         if forge.forge != "gitlab":
             return []
         message = self._branches.message(made)

@@ -43,11 +43,13 @@ class OverrideClock:
 
     def anything(self, config: Config, now: datetime) -> bool:
         """Tell whether an override is to be ended now."""
-        return any(self._when(one.name, one.end) <= now for one in config.in_force if one.end)
+        return any(
+            self._when(one.name, one.end) <= now for one in config.active_overrides if one.end
+        )
 
     def pause(self, config: Config, now: datetime, longest: float) -> float:
         """Return the seconds until the next look is due: ``longest`` at most, one at least."""
-        ends = [self._when(one.name, one.end) for one in config.in_force if one.end]
+        ends = [self._when(one.name, one.end) for one in config.active_overrides if one.end]
         wait = min((end - now).total_seconds() + 0.01 for end in ends) if ends else longest
         return min(max(wait, _SHORTEST_S), longest)
 

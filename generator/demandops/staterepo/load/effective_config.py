@@ -55,7 +55,9 @@ def at(repo: Repository, commit: Commit, told: LogEntry) -> Snapshot:
     source = _source(told)
     advance = snapshots.advance(repo, sound, commit.id)
     config = load_config(source.texts(repo))
-    config = config.with_ended(ended_override_file.read(last_valid_config.markers_at(commit.tree)))
+    config = config.with_ended_overrides(
+        ended_override_file.read(last_valid_config.markers_at(commit.tree))
+    )
     state = State.of(config, advance.snapshot.state.ledger)
     snapshot, _, _ = quarantine.held_back(
         repo,

@@ -118,7 +118,7 @@ def load_last_valid(
     except InvalidInput as error:
         problems += error.faults
         config = last_valid_config.newest_valid(commit, error)
-        config = config.with_ended(
+        config = config.with_ended_overrides(
             ended_override_file.read(last_valid_config.markers_at(commit.tree))
         )
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
@@ -204,12 +204,12 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
         problems += now.faults
         source = now.source if problems else None
         if now.config is not None:
-            config = now.config.with_ended(state.config.ended)
+            config = now.config.with_ended_overrides(state.config.ended_overrides)
             config_changed = config_changed or config != state.config
             state = State(config, State.of(config, state.ledger).engine, state.ledger)
     ended = ended_override_file.read(last_valid_config.markers_at(after))
-    if ended != state.config.ended:
-        state = replace(state, config=state.config.with_ended(ended))
+    if ended != state.config.ended_overrides:
+        state = replace(state, config=state.config.with_ended_overrides(ended))
         config_changed = True
     ledger, keys, subjects, held = state.ledger, snapshot.keys, list[Subject](), list[str]()
     changed = dict(
@@ -253,7 +253,7 @@ def _tried(files: Mapping[str, str], state: State) -> Config:
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config = load_config(files)
-    if config.with_ended(state.config.ended) != state.config:
+    if config.with_ended_overrides(state.config.ended_overrides) != state.config:
         try_configuration(State.of(config, Ledger()))
     return config
 

@@ -125,7 +125,7 @@ class CommitLine:
                 state, change, keys = self._taken_in(state, before, good, now)
             except InvalidInput as error:
                 problems += error.faults
-                config = before.state.config.with_ended(state.config.ended)
+                config = before.state.config.with_ended_overrides(state.config.ended_overrides)
                 state = replace(before.state, ledger=state.ledger, config=config)
                 snapshot, good, found = self._held_back(
                     replace(snapshot, state=state), before, good
@@ -299,7 +299,7 @@ def _with_leases_begun(state: State, now: datetime) -> tuple[State, dict[str, st
     ledger, files = state.ledger, {}
     for claim in ledger.unstarted_claims():
         assert claim.lease is not None  # noqa: S101 - that is what was looked for
-        begun = replace(claim, lease=claim.lease.begun(now))
+        begun = replace(claim, lease=claim.lease.restarted(now))
         ledger = ledger.replace(claim.key, begun)
         files[claim_file.path_of(claim.key)] = claim_file.text_of(begun)
     return replace(state, ledger=ledger), files
