@@ -74,7 +74,7 @@ class TestFiles:
         ("written", "expected"),
         [
             ("{qos: 1}", "topics./a.target: is missing; add it"),
-            ("{target: /b, qso: 1}", "topics./a.qso: is not a field here; remove it or mend its"),
+            ("{target: /b, qso: 1}", "topics./a.qso: is not a field here; remove it or correct its"),
             ("{target: /b, qos: 7}", "topics./a.qos: input should be less than or equal to 2"),
             ("{target: /b, reverse: 1}", "topics./a.reverse: must be true or false, not 1"),
             ("[/b]", "topics./a: must be a mapping, not ['/b']"),
