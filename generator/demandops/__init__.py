@@ -1,7 +1,7 @@
-"""DemandOps: from a demand of a connected vehicle to desired state in Git.
+"""DemandOps turns demands of connected vehicles into desired state in Git.
 
-The folders are the stages, in the order that data takes: config → demand → ledger → plan →
-render → decision → staterepo → service → cli. ``docs/architecture.md`` has one paragraph for each.
+Each folder is a stage. Data flows through them in this order: config → demand → ledger → plan →
+render → decision → staterepo → service → cli. ``docs/architecture.md`` describes each stage.
 """
 
 __all__ = ["__version__"]

@@ -156,7 +156,7 @@ def decide(
             *rendered.blocked,
             *denial.warnings(request, ledger, state.config),
         ),
-        approval=approval_rule.asked_by(
+        approval=approval_rule.approval_reasons(
             request, ((c.before, c.after) for c in changes.claims), state.config
         ),
         overrides=rendered.overrides,
@@ -191,14 +191,14 @@ def admit(
         return decommission_goal.parse(goal)
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         request, faults = demand_goal.parse(goal)
-        request = permission.with_terms(request, config)
+        request = permission.with_lease_terms(request, config)
         request = implied_connections.with_implied_connections(request, state.ledger, config)
     else:
         parsed, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if parsed is None:
             raise Refused(faults)
-        request = permission.with_terms(parsed, config)
-    request = transport_choice.resolved(request, config, state.ledger.type_of)
+        request = permission.with_lease_terms(parsed, config)
+    request = transport_choice.with_chosen_types(request, config, state.ledger.type_of)
     malformed = {found.field for found in faults}
     content_faults = [*admission.faults(request, config), *permission.faults(request, config)]
     content = _with_goal_fields(content_faults, request, config)
@@ -269,15 +269,15 @@ def _with_goal_fields(
         if request.operation is Operation.DECOMMISSION:
             return path
         if request.operation.is_reference:
-            return deployment_request_goal.wire_field(path, request, config.appdefs)
-        return demand_goal.field(path, request)
+            return deployment_request_goal.goal_field(path, request, config.appdefs)
+        return demand_goal.goal_field(path, request)
 
     return [replace(found, field=field(found.field)) for found in faults]
 
 
 def _missing_connections(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
     """Yield a warning for each input that no connection brings to the application's node."""
-    if not request.operation.asks:
+    if not request.operation.adds_claims:
         return
     ledger = without_suspended(ledger, config)
     for app in request.applications:
@@ -292,13 +292,13 @@ def _missing_connections(request: DemandRequest, ledger: Ledger, config: Config)
 
 def _already_bridged(request: DemandRequest, config: Config) -> Iterator[str]:
     """Yield a warning for each topic that the initial deployment already carries."""
-    if not request.operation.asks:
+    if not request.operation.adds_claims:
         return
     for connection in request.connections:
         for route in connection.topics:
             if is_bridged(route, connection.source, connection.target, config):
                 yield (
-                    f"connection '{connection.id}': {route.read} is bridged between "
+                    f"connection '{connection.id}': {route.read_topic} is bridged between "
                     f"'{connection.source}' and '{connection.target}' already, so no client "
                     "carries it"
                 )

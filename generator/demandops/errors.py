@@ -1,9 +1,8 @@
-"""The one vocabulary of failure.
+"""The errors that every stage raises, and the faults that they carry.
 
-First in the flow: every stage raises these and none formats its own. A :class:`Fault` says where,
-what and how to mend it; an error carries all faults that were found together, so that a person
-mends a file or a request in one go. Exit codes and action results are made from these in one
-place each (``cli.main`` and ``demandops_ros.node``).
+A :class:`Fault` says where the problem is, what it is and how to fix it. An error carries all
+faults that were found together, so that a person can fix a file or a request in one go.
+``cli.main`` maps errors to exit codes, ``demandops_ros.node`` maps them to action results.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ from difflib import get_close_matches
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing wrong with an input.
+    """One problem in an input.
 
-    ``code`` is a stable word for programs (``unknown-node``), ``field`` the path inside the input
-    (``apps[0].header.node_id``), ``message`` says what is wrong and how to mend it, ``file`` names
-    the file where there is one.
+    ``code`` is a stable word for programs (``unknown-node``). ``field`` is the path inside the
+    input (``apps[0].header.node_id``). ``message`` says what is wrong and how to fix it. ``file``
+    names the file, if the input is one.
     """
 
     code: str
@@ -28,20 +27,20 @@ class Fault:
     file: str = ""
 
     def __str__(self) -> str:
-        """Return ``file: field: message`` without the parts that are empty."""
+        """Return ``file: field: message`` without the empty parts."""
         return ": ".join(part for part in (self.file, self.field, self.message) if part)
 
     def within(self, file: str) -> Fault:
-        """Return the same fault, told to be in ``file``."""
+        """Return the same fault, located in ``file``."""
         return replace(self, file=file)
 
 
 class DemandOpsError(Exception):
-    """Anything this program raises on purpose."""
+    """Base of every error that this program raises on purpose."""
 
 
 class InvalidInput(DemandOpsError):
-    """Something a person wrote is wrong and theirs to mend; nothing was changed."""
+    """Raised when something that a person wrote is invalid; nothing was changed."""
 
     def __init__(self, faults: Iterable[Fault]) -> None:
         self.faults = tuple(faults)
@@ -49,25 +48,25 @@ class InvalidInput(DemandOpsError):
 
 
 class Refused(InvalidInput):
-    """A demand that cannot be honoured; nothing of it was booked."""
+    """Raised when a demand cannot be fulfilled; no part of it was booked."""
 
 
 class StateRepoError(DemandOpsError):
-    """The state repo cannot be read or written; the message says how to mend it."""
+    """Raised when the state repo cannot be read or written; the message says how to fix it."""
 
 
 class Withdrawn(DemandOpsError):
-    """A demand that its requester took back before it was committed."""
+    """Raised when the requester canceled its demand before the commit."""
 
 
 class TurnedDown(DemandOpsError):
-    """A demand that needed approval, and that a person did not approve."""
+    """Raised when a person did not approve a demand that needed approval."""
 
 
 class NotReached(DemandOpsError):
-    """A demand that is booked and published, and was not as far as asked in time.
+    """Raised when a published demand did not reach the requested level in time.
 
-    ``level`` is how far it was to be: reconciled or healthy.
+    ``level`` is the requested level: reconciled or healthy.
     """
 
     def __init__(self, level: str, message: str) -> None:
@@ -76,31 +75,34 @@ class NotReached(DemandOpsError):
 
 
 class ShuttingDown(DemandOpsError):
-    """A demand that came after the generator was told to stop."""
+    """Raised when a demand arrives while the generator stops."""
 
 
 class QueueFull(DemandOpsError):
-    """More demands are waiting than the generator is set to hold."""
+    """Raised when the demand queue is full."""
 
 
 def fault(field: str, message: str, *, code: str = "invalid") -> Fault:
-    """Return a fault; short because it is written often."""
+    """Return a fault that is not in a file yet."""
     return Fault(code=code, field=field, message=message)
 
 
-def shown(value: str, most: int = 80) -> str:
-    """Return what somebody wrote, in quotes, for a message: of one line, short, without tricks."""
+def quoted(value: str, most: int = 80) -> str:
+    """Return foreign text for a message: quoted, printable, on one line and not too long."""
     text = value if value.isprintable() else value.encode("unicode_escape").decode()
     return f"'{text if len(text) <= most else text[: most - 1] + '…'}'"
 
 
-def near(word: str, known: Iterable[str], *, most: int = 8) -> str:
-    """Return ``; did you mean 'x'?``, or what is known where nothing comes near, or nothing."""
+def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
+    """Return ``; did you mean 'x'?`` for a similar word, else the known words.
+
+    Return an empty string if no words are known.
+    """
     names = sorted(known)
     close = get_close_matches(word, names, n=1)
     if close:
         return f"; did you mean '{close[0]}'?"
     if not names:
         return ""
-    shown = ", ".join(names[:most]) + (", …" if len(names) > most else "")
-    return f"; known: {shown}"
+    listed = ", ".join(names[:most]) + (", …" if len(names) > most else "")
+    return f"; known: {listed}"

@@ -1,17 +1,17 @@
-"""What ids and topic names may be, wherever they come from: requests, inventory, ledger."""
+"""The rules for ids, topic names and message types in requests, inventory and ledger."""
 
 from __future__ import annotations
 
 import re
 import unicodedata
 
-from demandops.errors import shown
+from demandops.errors import quoted
 
 MAX_ID = 1024
-"""Characters that an id may have; file and object names are shortened and hashed anyway."""
+"""The longest id, in characters; file and object names are shortened and hashed."""
 
 MAX_TOPIC = 247
-"""Characters of a topic name, ``RMW_TOPIC_MAX_NAME_LENGTH`` of ROS 2's rmw."""
+"""The longest topic name, in characters: ``RMW_TOPIC_MAX_NAME_LENGTH`` of ROS 2's rmw."""
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _MESSAGE_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
@@ -19,43 +19,42 @@ _UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
 _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
-def absolute(topic: str) -> str:
-    """Return a topic name as ROS resolves it in the root namespace: ``scan`` is ``/scan``."""
+def absolute_topic(topic: str) -> str:
+    """Return a topic name as ROS resolves it in the root namespace: ``scan`` gives ``/scan``."""
     return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
 
 
 def id_problem(value: str) -> str:
-    """Return what is wrong with an id, or nothing.
+    """Return what is wrong with an id, or an empty string.
 
-    Ids name entities of the field, so nearly all text is taken; what could hide from a reader or
-    climb out of a folder is not.
+    Nearly all text is valid. Invisible characters and paths out of a folder are not.
     """
     if not value:
         return "is empty; give an id"
     if len(value) > MAX_ID:
-        return f"has {len(value)} characters; at most {MAX_ID} are taken"
+        return f"has {len(value)} characters; at most {MAX_ID} are allowed"
     if ".." in value:
-        return f"{shown(value)} holds '..'; choose an id without it"
+        return f"{quoted(value)} holds '..'; choose an id without it"
     if value != value.strip():
-        return f"{shown(value)} starts or ends with white space; take it away"
+        return f"{quoted(value)} starts or ends with white space; remove it"
     for char in value:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return (
-                f"{shown(value)} holds the control character U+{ord(char):04X}; "
+                f"{quoted(value)} holds the control character U+{ord(char):04X}; "
                 "choose an id without it"
             )
     return ""
 
 
 def topic_problem(name: str) -> str:
-    """Return what ROS 2 forbids in a fully qualified topic name (rmw's validation), or nothing."""
+    """Return why ROS 2 (rmw) rejects a fully qualified topic name, or an empty string."""
     if not name:
         return "is empty; give a topic name"
     if name.startswith("~"):
-        return f"{shown(name)} is private to a node; give the full name, starting with '/'"
+        return f"{quoted(name)} is private to a node; give the full name, starting with '/'"
     if not _TOPIC.fullmatch(name):
         return (
-            f"{shown(name)} is not a topic name that ROS 2 allows; use letters, digits and '_' "
+            f"{quoted(name)} is not a topic name that ROS 2 allows; use letters, digits and '_' "
             "between single '/', no part starting with a digit"
         )
     if len(name) > MAX_TOPIC:
@@ -64,7 +63,7 @@ def topic_problem(name: str) -> str:
 
 
 def message_type_problem(name: str) -> str:
-    """Return why a name is no ROS 2 message type with its package, or nothing."""
+    """Return why a name is not a ROS 2 message type with its package, or an empty string."""
     if _MESSAGE_TYPE.fullmatch(name):
         return ""
-    return f"{shown(name)} is no message type; write it like std_msgs/msg/String"
+    return f"{quoted(name)} is not a message type; write it like std_msgs/msg/String"

@@ -1,7 +1,6 @@
-"""Constants of the program and where its own files are.
+"""Constants of the program, and the locations of its own files.
 
-Known to every stage; knows none. Versions stand here because files carry them: a state repo
-written by a newer generator is refused by its number, never guessed at.
+Files carry the versions below. A generator refuses a state repo with a higher version.
 """
 
 from __future__ import annotations
@@ -12,32 +11,31 @@ from pathlib import Path
 from typing import Final
 
 API_VERSION: Final = "demandops/v1"
-"""``apiVersion`` of every file that people write."""
+"""``apiVersion`` of every configuration file."""
 
 LEDGER_API_VERSION = "demandops.ledger/v1"
 """``apiVersion`` of every claim file."""
 
 RENDER_VERSION = 1
-"""Raised whenever the same ledger and configuration would give other bytes than before."""
+"""Increased whenever the same ledger and configuration render to different bytes."""
 
 MAIN_BRANCH = "main"
 """The branch that Flux and Argo CD read and the generator writes."""
 
 DEFAULT_ACTION_NAME = "/event_detector_operator_plugin/operator_plugin/deployment_request"
-"""Where the reference's clients send their goals (robotkube's event detector)."""
+"""The action that the reference's clients send goals to (robotkube's event detector)."""
 
 DEFAULT_DEMAND_ACTION_NAME = "/demandops/demand"
-"""Where our own clients send theirs."""
+"""The action that our own clients send goals to."""
 
 QUEUE_LIMIT = 10_000
-"""Demands that may wait at once; beyond it a new one is rejected rather than kept in memory."""
+"""The number of demands that may be queued; a further demand is rejected."""
 
 GENERATED_ROOTS = ("bootstrap", "clusters")
-"""The top-level folders whose every file follows from ledger and configuration."""
+"""The top-level folders whose files are all rendered from ledger and configuration."""
 
 NOTES_ROOT = ".demandops"
-"""The top-level folder of what the generator tells people by files; nothing is read back from it
-that a decision depends on."""
+"""The top-level folder of the generator's reports to people; no decision depends on them."""
 
 _PACKAGE = Path(__file__).parent
 _CHECKOUT = _PACKAGE.parents[1]
@@ -46,8 +44,8 @@ _CHECKOUT = _PACKAGE.parents[1]
 def data_folder(name: str) -> Path:
     """Return the folder of packaged data: ``templates``, ``appdefs`` or ``skeleton``.
 
-    In an installed wheel the folders lie inside the package; in a checkout or an editable
-    install they are the repository's own top-level folders.
+    An installed wheel has these folders inside the package. In a checkout or an editable install
+    they are the repository's own top-level folders.
     """
     packaged = _PACKAGE / "_data" / name
     if packaged.is_dir():
@@ -56,18 +54,18 @@ def data_folder(name: str) -> Path:
 
 
 def forge_token_file() -> Path | None:
-    """Return the file with the token for the forge, as ``DEMANDOPS_FORGE_TOKEN_FILE`` names it."""
+    """Return the forge token's file, which ``DEMANDOPS_FORGE_TOKEN_FILE`` names."""
     named = os.environ.get("DEMANDOPS_FORGE_TOKEN_FILE")
     return Path(named).expanduser() if named else None
 
 
 def data_home(state_repo: str) -> Path:
-    """Return where the generator keeps its outbox and clone for one state repo.
+    """Return the folder of the generator's journal and clone for one state repo.
 
-    ``DEMANDOPS_DATA_HOME`` wins, else ``$XDG_STATE_HOME/demandops``; below it one folder for each
-    state repo, named by a digest of its address (which may hold a password, so it is not shown).
+    It is inside ``DEMANDOPS_DATA_HOME`` or else ``$XDG_STATE_HOME/demandops``. Its name is a digest
+    of the state repo's address, because the address may contain a password.
     """
-    if Path(state_repo).exists():  # however the folder is written, it is one
+    if Path(state_repo).exists():  # every spelling of a path gives one folder
         state_repo = str(Path(state_repo).resolve())
     root = os.environ.get("DEMANDOPS_DATA_HOME")
     if root:

@@ -1,8 +1,8 @@
-"""YAML in and out, strictly and always the same way.
+"""Strict reading and deterministic writing of YAML.
 
-Every file that the program reads passes :func:`load` (duplicate keys, anchors and several
-documents are errors with a line number), every file it writes passes :func:`dump`, whose strings
-mean the same in YAML 1.1 and 1.2: PyYAML, Go's parsers and a person must read one value.
+The program reads every file with :func:`load`. Duplicate keys, anchors and further documents are
+errors. It writes every file with :func:`dump`. Strings are written so that YAML 1.1 and 1.2,
+PyYAML and Go's parsers read the same value.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*(?:[:@=][A-Za-z0-9_./-]+)*")
 _WORDS = frozenset(
     ["y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "none"]
-)  # some parser somewhere reads one of these as something other than text
+)  # some parsers do not read these words as text
 
 _OPENING = (yaml.MappingStartEvent, yaml.SequenceStartEvent)
 _CLOSING = (yaml.MappingEndEvent, yaml.SequenceEndEvent)
 _MAX_DEPTH = 100
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
-_MISFIT = "not valid YAML: a tag or number stands where it has no meaning"
+_MISFIT = "not valid YAML: a tag or number is not allowed there"
 
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
 class _StrictLoader(_Loader):  # type: ignore[misc]
-    """A safe loader that refuses duplicate keys and leaves dates as text."""
+    """A safe loader that rejects duplicate keys and keeps dates as text."""
 
 
 def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:  # noqa: ANN401
@@ -49,12 +49,12 @@ def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:  # noqa: AN
             raise yaml.constructor.ConstructorError(
                 None,
                 None,
-                f"the key {brief(key)} must be text; put it in quotes",
+                f"the key {short_repr(key)} must be text; put it in quotes",
                 key_node.start_mark,
             )
         if key in seen:
             raise yaml.constructor.ConstructorError(
-                None, None, f"the key {key!r} stands twice", key_node.start_mark
+                None, None, f"the key {key!r} appears twice", key_node.start_mark
             )
         seen[key] = loader.construct_object(value_node, deep=True)
     return seen
@@ -67,10 +67,10 @@ _StrictLoader.add_constructor(
 
 
 class _PlainDumper(_Dumper):  # type: ignore[misc]
-    """A dumper that never writes anchors and quotes whatever a parser could misread."""
+    """A dumper that writes no anchors and quotes every string that a parser could misread."""
 
     def ignore_aliases(self, data: object) -> bool:
-        """Say yes always: the same list twice is written out twice."""
+        """Return True, so that a value that occurs twice is written twice."""
         return True
 
 
@@ -83,7 +83,7 @@ def _text(dumper: Any, text: str) -> yaml.ScalarNode:  # noqa: ANN401
 
 
 def _readable_block(text: str) -> bool:
-    """Tell whether a literal block shows ``text`` unchanged (a parameter file in a ConfigMap)."""
+    """Return whether a literal block can hold ``text`` unchanged."""
     return (
         text.endswith("\n")
         and not text.endswith("\n\n")
@@ -96,12 +96,12 @@ def _readable_block(text: str) -> bool:
 _PlainDumper.add_representer(str, _text)
 
 
-def brief(value: object) -> str:
-    """Return a value for a message, whatever it is."""
+def short_repr(value: object) -> str:
+    """Return a short form of any value for a message."""
     try:
         text = repr(value)
-    except ValueError:  # Python writes no number of over 4300 digits
-        return "a number of thousands of digits"
+    except ValueError:  # Python does not print numbers of more than 4300 digits
+        return "a number with thousands of digits"
     return text if len(text) <= 60 else text[:57] + "…"
 
 
@@ -111,7 +111,11 @@ def _mark(error: yaml.YAMLError) -> str:
 
 
 def load_all(text: str) -> Iterator[Any]:
-    """Yield the documents of ``text``; raise :class:`InvalidInput` for what is not strict YAML."""
+    """Yield the documents of ``text``.
+
+    Raises:
+        InvalidInput: if it is not strict YAML.
+    """
     try:
         depth = 0
         for event in yaml.parse(text, Loader=_Loader):
@@ -121,7 +125,12 @@ def load_all(text: str) -> Iterator[Any]:
             if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
                 where = f"line {event.start_mark.line + 1}" if event.start_mark else ""
                 raise InvalidInput(
-                    [fault(where, "anchors and aliases (& and *) are not taken; write it out")]
+                    [
+                        fault(
+                            where,
+                            "anchors and aliases (& and *) are not allowed; write the value out",
+                        )
+                    ]
                 )
         yield from yaml.load_all(text, Loader=_StrictLoader)
     except yaml.YAMLError as error:
@@ -131,21 +140,21 @@ def load_all(text: str) -> Iterator[Any]:
         raise InvalidInput([fault("", _MISFIT)]) from error
 
 
-def load(text: str) -> Any:  # noqa: ANN401 - raw YAML is parsed into models right behind this
-    """Return the one document of ``text`` (``None`` where it is empty)."""
+def load(text: str) -> Any:  # noqa: ANN401 - the caller parses raw YAML into models
+    """Return the only document of ``text``, or ``None`` if it is empty."""
     documents = list(load_all(text))
     if len(documents) > 1:
-        raise InvalidInput([fault("", f"holds {len(documents)} documents; only one is taken")])
+        raise InvalidInput([fault("", f"holds {len(documents)} documents; only one is allowed")])
     return documents[0] if documents else None
 
 
 def load_rendered(text: str) -> Any:  # noqa: ANN401
-    """Parse one document that a template of ours or of an appdef gave.
+    """Return the document that a template produced.
 
-    Strict on duplicate keys, but without the look for anchors: one pass less for each release.
+    Duplicate keys are errors; anchors are not checked, which saves a pass for each release.
 
     Raises:
-        InvalidInput: where it is not valid YAML.
+        InvalidInput: if it is not valid YAML.
     """
     try:
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
@@ -157,7 +166,7 @@ def load_rendered(text: str) -> Any:  # noqa: ANN401
 
 
 def dump(data: Mapping[str, Any]) -> str:
-    """Return ``data`` as block YAML in the order given, ending in a newline."""
+    """Return ``data`` as block YAML in the given order, with a newline at the end."""
     return str(
         yaml.dump(
             data,
@@ -170,40 +179,39 @@ def dump(data: Mapping[str, Any]) -> str:
     )
 
 
-def edited(text: str, key: str, value: object) -> str:
-    """Return a file with one top-level key set; all else stays, comments included.
+def set_key(text: str, key: str, value: object) -> str:
+    """Return a file's text with one top-level key set; the rest stays, comments included.
 
-    A key that holds one plain value has it replaced where it stands; one that is missing is added
-    at the end.
+    A plain value is replaced in place. A missing key is added at the end.
 
     Raises:
-        InvalidInput: where the file is not of a form in which that is possible.
+        InvalidInput: if the file's form does not allow that.
     """
     node = yaml.compose(text, Loader=yaml.SafeLoader)
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
-    standing = next((held for name, held in pairs if name.value == key), None)
-    if isinstance(standing, yaml.ScalarNode):
-        start, end = standing.start_mark.index, standing.end_mark.index
+    current = next((value for name, value in pairs if name.value == key), None)
+    if isinstance(current, yaml.ScalarNode):
+        start, end = current.start_mark.index, current.end_mark.index
         changed = text[:start] + dump({key: value}).partition(": ")[2].rstrip("\n") + text[end:]
     else:
-        ended = "" if text.endswith("\n") else "\n"
-        added = f"{ended}\n{dump({key: value})}"
+        newline = "" if text.endswith("\n") else "\n"
+        added = f"{newline}\n{dump({key: value})}"
         changed = text + (added.replace("\n", "\r\n") if "\r\n" in text else added)
     try:
-        done = load(changed) == {**load(text), key: value}
+        succeeded = load(changed) == {**load(text), key: value}
     except (InvalidInput, TypeError):
-        done = False
-    if not done:
+        succeeded = False
+    if not succeeded:
         raise InvalidInput(
-            [fault(key, f"cannot be set by the program; write {brief(value)} there")]
+            [fault(key, f"cannot be set automatically; write {short_repr(value)} there")]
         )
     return changed
 
 
-def scalar(value: object) -> str:
-    """Return ``value`` as JSON that is also YAML: what a template's ``{{ … }}`` writes.
+def to_json(value: object) -> str:
+    """Return ``value`` as JSON that is also valid YAML; a template's ``{{ … }}`` writes this.
 
-    Characters that YAML does not print are written as ``\\uXXXX``; others stay readable.
+    Characters that YAML cannot print become ``\\uXXXX``; the others stay readable.
     """
     text = json.dumps(value, ensure_ascii=False, sort_keys=False, default=_unknown)
     return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
@@ -214,5 +222,5 @@ def _unknown(value: object) -> object:
 
 
 def faults_in(error: InvalidInput, file: str) -> list[Fault]:
-    """Return the faults of ``error``, told to be in ``file``."""
+    """Return the faults of ``error``, located in ``file``."""
     return [fault.within(file) for fault in error.faults]

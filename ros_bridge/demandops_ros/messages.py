@@ -10,7 +10,7 @@ from typing import Any
 from builtin_interfaces.msg import Duration
 from demandops.config.policy import seconds_of
 from demandops.demand.route import RouteOptions
-from demandops.errors import near
+from demandops.errors import suggestion
 from demandops.settings import API_VERSION
 from demandops_interfaces import msg as messages
 from demandops_interfaces.action import Demand as DemandMessage
@@ -132,7 +132,7 @@ def _route_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
 def _reject_unknown(data: Mapping[str, Any], known: set[str], what: str) -> None:
     for name in data:
         if name not in known:
-            raise ValueError(f"'{name}' is not a field of {what}{near(name, known)}")
+            raise ValueError(f"'{name}' is not a field of {what}{suggestion(name, known)}")
 
 
 def _number(words: tuple[str, ...], word: str, field: str) -> int:

@@ -253,7 +253,7 @@ def test_replicas_go_down_again_when_topics_are_released(books: Books) -> None:
 
 def test_a_list_of_the_message_that_it_does_not_take_is_refused(books: Books) -> None:
     assert books.faults(goal([record(ego=[("/ego", "vehicle00")])])) == [
-        f"{BODY}.ego_data_topics: recorder takes no such input; known: point_cloud"
+        f"{BODY}.ego_data_topics: recorder has no such input; known: point_cloud"
     ]
 
 
@@ -267,7 +267,7 @@ def test_another_kind_for_a_claimed_application_is_refused(books: Books) -> None
 
 def test_an_unknown_type_is_told_with_all_that_are_known(books: Books) -> None:
     assert books.faults(goal([application(type=9)])) == [
-        "apps[0].type: 9 names no application definition; known: 3 (monitor), "
+        "apps[0].type: 9 is not a known application type; known: 3 (monitor), "
         "1 (object-detection-fusion), 2 (recorder)"
     ]
 

@@ -108,7 +108,8 @@ class TestDefectsOfTheReference:
         assert refused(request_json(asked)) == [
             (
                 "connections[0].broker_node_id",
-                "is open, and no broker runs on 'vehicle01' or 'vehicle00'; name one of: cloud, "
+                "is not given, and no broker runs on 'vehicle01' or 'vehicle00'; name one of: "
+                "cloud, "
                 "edge",
             )
         ]
@@ -141,12 +142,12 @@ class TestDefectsOfTheReference:
             (
                 goal([], [connection(type=7)]),
                 "connections[0].type",
-                "7 is no connection type; known: 0 (ROS), 1 (MQTT), 2 (ZENOH)",
+                "7 is not a connection type; known: 0 (ROS), 1 (MQTT), 2 (ZENOH)",
             ),
             (
                 goal([application(type=7)]),
                 "apps[0].type",
-                "7 names no application definition; known: 1 (object-detection-fusion)",
+                "7 is not a known application type; known: 1 (object-detection-fusion)",
             ),
         ],
         ids=["ROS", "Zenoh", "an unknown connection", "an unknown application"],
@@ -175,7 +176,7 @@ class TestDefectsOfTheReference:
                 "apps[0].header.node_id",
                 "'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",
             ),
-            (f"{BODY}.requester_ids", "is empty; say for whom this is asked"),
+            (f"{BODY}.requester_ids", "is empty; list at least one requester"),
             ("connections[0].source_topics[0]", f"'/a b' {ROS_NAMES}"),
             ("connections[0].target_topics[0]", f"'/a b' {ROS_NAMES}"),
         ]
@@ -343,7 +344,7 @@ class TestDefectsOfTheReference:
         assert refused(request_json(perception())) == [
             (
                 field,
-                "'edge' is in no access domain; a platform engineer adds it to "
+                "'edge' is not in any access domain; a platform engineer adds it to "
                 "policy/access-domains.yaml",
             )
             for field in ("apps[0].header.node_id", "connections[0].target_node_id")
@@ -530,19 +531,21 @@ ATTACKS: dict[str, tuple[str | bytes, str]] = {
     ),
     "a key twice": (
         "id: a\napps: []\nid: b\n",
-        "error: {file}: line 3, column 1: not valid YAML: the key 'id' stands twice\n",
+        "error: {file}: line 3, column 1: not valid YAML: the key 'id' appears twice\n",
     ),
     "a key twice, deep down": (
         "apps:\n- header:\n    id: a\n    id: b\n",
-        "error: {file}: line 4, column 5: not valid YAML: the key 'id' stands twice\n",
+        "error: {file}: line 4, column 5: not valid YAML: the key 'id' appears twice\n",
     ),
     "an anchor": (
         "id: &a x\n",
-        "error: {file}: line 1: anchors and aliases (& and *) are not taken; write it out\n",
+        "error: {file}: line 1: anchors and aliases (& and *) are not allowed; write the value "
+        "out\n",
     ),
     "an alias of itself": (
         "id: x\napps: &a [*a]\n",
-        "error: {file}: line 2: anchors and aliases (& and *) are not taken; write it out\n",
+        "error: {file}: line 2: anchors and aliases (& and *) are not allowed; write the value "
+        "out\n",
     ),
     "a billion laughs": (
         "a: &a [x, x]\n"
@@ -550,7 +553,8 @@ ATTACKS: dict[str, tuple[str | bytes, str]] = {
             f"{b}: &{b} [*{a}, *{a}]\n"
             for a, b in zip("abcdefghijklmnopqrstuvwxy", "bcdefghijklmnopqrstuvwxyz", strict=True)
         ),
-        "error: {file}: line 1: anchors and aliases (& and *) are not taken; write it out\n",
+        "error: {file}: line 1: anchors and aliases (& and *) are not allowed; write the value "
+        "out\n",
     ),
     "binary": (bytes(range(256)), "error: {file}: is not UTF-8 text\n"),
     "UTF-16": ("id: a\n".encode("utf-16"), "error: {file}: is not UTF-8 text\n"),
@@ -614,7 +618,7 @@ ATTACKS: dict[str, tuple[str | bytes, str]] = {
     ),
     "a misspelt field": (
         "shutdwon: true\n",
-        "{file}: request 0 '' refused\n  shutdwon: is not a field here; remove it or mend its "
+        "{file}: request 0 '' refused\n  shutdwon: is not a field here; remove it or correct its "
         "spelling; did you mean 'shutdown'?\n",
     ),
 }

@@ -118,7 +118,7 @@ def test_a_chart_and_the_registry_that_disagree_are_told(checkout: Path, check: 
     assert code == 1
     assert errors == (
         "error: registry/charts.yaml: charts.object-fusion.version: is 0.1.0, but "
-        f"{CHART}/Chart.yaml says 0.2.0; make them one\n"
+        f"{CHART}/Chart.yaml says 0.2.0; make them equal\n"
     )
 
 

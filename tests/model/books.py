@@ -424,7 +424,7 @@ def in_model_words(
         else:
             subject = f"{entry['source']} {entry['source_topic']}"
         key = (entry["service"], node, subject)
-        assert key not in services, f"{key} stands twice"
+        assert key not in services, f"{key} appears twice"
         for topics in entry["inputs"].values():
             assert topics == sorted(set(topics)), topics
         inputs = {role: list(topics) for role, topics in entry["inputs"].items() if topics}

@@ -124,7 +124,7 @@ def test_a_refusal_names_code_field_and_remedy(serve: Serve, client: DemandClien
     with pytest.raises(DemandError) as caught:
         client.put("d", [RECORDER | {"type": "recoder", "node": "egde"}])
     assert caught.value.code == "unknown-application"
-    assert "applications[0].type: 'recoder' names no application definition" in str(caught.value)
+    assert "applications[0].type: 'recoder' is not a known application type" in str(caught.value)
     assert "applications[0].node: 'egde' is not in inventory/nodes.yaml" in str(caught.value)
     with pytest.raises(DemandError) as caught:
         client.release("d")

@@ -126,8 +126,8 @@ def test_a_push_that_the_webhook_hears_of_is_followed_at_once(
 @pytest.mark.parametrize(
     ("args", "code", "message"),
     [
-        (["--fetch-interval", "often"], 2, "fetch interval: 'often' is no duration; write one"),
-        (["--ros-args", "-p", "fetch_interval:=-3"], 2, "fetch interval: '-3' is no duration"),
+        (["--fetch-interval", "often"], 2, "fetch interval: 'often' is not a duration; write one"),
+        (["--ros-args", "-p", "fetch_interval:=-3"], 2, "fetch interval: '-3' is not a duration"),
         (["--webhook", "0.0.0.0:0"], 1, "error: --webhook: '0.0.0.0:0' can be reached from other"),
         (
             ["--webhook", "127.0.0.1:0", "--webhook-secret-file", "/nowhere/secret"],

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
+from demandops.config.base_model import FrozenModel, parse_file
 from demandops.config.config import CONFIG_ROOTS
-from demandops.config.file_model import Frozen, parse_file
 from demandops.config.load import load
 from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered_files
@@ -37,7 +37,7 @@ START = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
 # ---- what a scenario says ----
 
 
-class Told(Frozen):
+class Told(FrozenModel):
     """A fault that must be told: its code, its field, and words of its message."""
 
     code: str = "invalid"
@@ -56,7 +56,7 @@ _CHECKS = (
 )  # fmt: skip
 
 
-class Step(Frozen):
+class Step(FrozenModel):
     """One thing that happens and what must come of it; only what is listed is compared.
 
     ``after`` lets time pass, ``clock`` sets the wall clock alone, by a duration that may be
@@ -97,7 +97,7 @@ class Step(Frozen):
         return self
 
 
-class Scenario(Frozen):
+class Scenario(FrozenModel):
     """A whole scenario. ``config`` is laid over what ``demandops init`` lays down.
 
     Mappings in it are merged, all else replaces what stands. ``appdefs`` are further folders of

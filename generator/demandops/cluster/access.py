@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen, parse_file
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, parse_file
 from demandops.errors import Fault, InvalidInput, fault
 
 
@@ -20,7 +20,7 @@ class NoAccess(ValueError):
     """Raised when the operator's files give no usable access; the message contains no secret."""
 
 
-class ClusterAccess(Frozen):
+class ClusterAccess(FrozenModel):
     """The access to a cluster: its API, a webhook of its controller, or both.
 
     ``receiver`` is the URL of a Flux Receiver and ``webhook`` that of an Argo CD. ``secret_file``

@@ -109,7 +109,7 @@ class ReconcileTrigger:
         return max(0.0, self._woken_at + _SPACING_S - time.monotonic())
 
     def _wake(self, name: str, access: ClusterAccess, config: Config) -> None:
-        argocd = config.repository.argocd if config.repository.gitops == "argocd" else None
+        argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
         if argocd and access.webhook:
             self._call_argocd(name, access.webhook, access, config, argocd.url)
         elif access.receiver and not argocd:
@@ -145,7 +145,7 @@ class ReconcileTrigger:
         now = datetime.now(timezone.utc).isoformat()
         for domain in _domains(name, config):
             self._api(name, access).patch_namespaced_custom_object(
-                *_refresh_patch(domain, config.repository, now), _request_timeout=_TIMEOUT_S
+                *_refresh_patch(domain, config.repo_settings, now), _request_timeout=_TIMEOUT_S
             )
 
     def _api(self, name: str, access: ClusterAccess) -> Any:  # noqa: ANN401

@@ -1,5 +1,5 @@
-"""Stage 1, what can be run: application definitions, inventory, registry and access domains.
+"""Stage 1, the configuration: application definitions, inventory, registry, policy, overrides.
 
-People write these files in the state repo; :func:`demandops.config.load.load` parses them all
-and reports every fault of every file together. Knows nothing of demands.
+People write these files in the state repo. :func:`demandops.config.load.load` parses all of them
+and reports every fault of every file together. This stage does not know demands.
 """

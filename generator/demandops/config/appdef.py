@@ -1,8 +1,8 @@
-"""Application definitions: one YAML file and a folder make a new type of application.
+"""Application definitions (appdefs): a YAML file and a folder define a type of application.
 
-An appdef names its inputs and parameters and the services to run for them. A service runs once
-for each application, or once for each topic of an input, and in the second case is shared by all
-applications that ask for the same topic on the same node (paper, section on object detection).
+An appdef lists inputs, parameters and services. A service runs once for each application, or once
+for each topic of an input. In the second case, all applications that demand the same topic on the
+same node share it (paper, section on object detection).
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.file_model import Approval, DnsLabel, FileModel, Frozen, Word
-from demandops.errors import near
+from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel, Word
+from demandops.errors import suggestion
 
 TopicPattern = Annotated[
     str,
@@ -20,26 +20,26 @@ TopicPattern = Annotated[
         pattern=r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
     ),
 ]
-"""A topic name; ``{instance}`` stands for the source or the application that the service is for."""
+"""A topic name; ``{instance}`` is replaced by the service's source or application."""
 
 
-class Input(Frozen):
-    """A role that demanded topics play, ``point_cloud`` say."""
+class Input(FrozenModel):
+    """A role of demanded topics, for example ``point_cloud``."""
 
     description: str = ""
     type: str = ""
 
 
-class Parameter(Frozen):
-    """A value that a demand may give, and what holds when several demands give different ones."""
+class Parameter(FrozenModel):
+    """A value that demands may set, and how the values of several demands are merged."""
 
     description: str = ""
     default: Any = None
     merge: Literal["union", "max", "min", "latest"] | None = None
 
 
-class Scaling(Frozen):
-    """How many replicas a service has: one for ``topics_per_replica`` inputs, within bounds."""
+class Scaling(FrozenModel):
+    """The number of replicas: one for ``topics_per_replica`` inputs, from ``min`` to ``max``."""
 
     min: Annotated[int, Field(ge=0, le=1000)] = 1
     max: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -50,18 +50,16 @@ class Scaling(Frozen):
     @model_validator(mode="after")
     def _ordered(self) -> Scaling:
         if self.min > self.max:
-            raise ValueError(
-                f"min {self.min} is above max {self.max}; lower the one or raise the other"
-            )
+            raise ValueError(f"min {self.min} is above max {self.max}; lower min or raise max")
         return self
 
 
-class Service(Frozen):
-    """One deployable part of an application: one Helm release for each instance.
+class Service(FrozenModel):
+    """One deployable part of an application, with one Helm release for each instance.
 
-    ``each`` names the input whose every topic gets an instance of its own, shared between
-    applications; without it there is one instance for each application. ``inputs`` of an
-    application-wide service name roles of the appdef, or ``<service>.<output>``.
+    ``each`` names an input; every topic of it gets its own instance, which applications share.
+    Without ``each``, every application gets one instance. Its ``inputs`` name roles of the appdef
+    or ``<service>.<output>``.
     """
 
     prefix: Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9]{0,9}$")]
@@ -78,17 +76,17 @@ class Service(Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> Service:
         if self.each and self.inputs:
-            raise ValueError("'each' already says what the service takes in; remove 'inputs'")
+            raise ValueError("'each' already names the service's input; remove 'inputs'")
         if self.placement == "source" and not self.each:
-            raise ValueError("placement 'source' needs 'each': an application has no one source")
+            raise ValueError("placement 'source' needs 'each': an application has no single source")
         return self
 
 
-class WireNames(Frozen):
-    """How the reference's ``DeploymentRequest`` names this application.
+class WireNames(FrozenModel):
+    """The names of this application in the reference's ``DeploymentRequest``.
 
-    ``type`` is the number in ``Application.type``; ``inputs`` says which role each topic list of
-    the message's body plays.
+    ``type`` is the number in ``Application.type``. ``inputs`` maps the topic lists of the
+    message's body to roles.
     """
 
     type: Annotated[int, Field(ge=1, le=255)]
@@ -114,19 +112,20 @@ class ApplicationDefinition(FileModel):
             if service.each and service.each not in self.inputs:
                 problems.append(
                     f"services.{name}.each: '{service.each}' is not an input"
-                    + near(service.each, self.inputs)
+                    + suggestion(service.each, self.inputs)
                 )
             sources = self.sources()
             problems += [
                 f"services.{name}.inputs.{role}: '{source}' is neither an input nor an output of "
-                "a service that runs for each topic" + near(source, sources)
+                "a service that runs for each topic" + suggestion(source, sources)
                 for role, source in service.inputs.items()
                 if source not in sources
             ]
         for role in (self.deployment_request.inputs if self.deployment_request else {}).values():
             if role not in self.inputs:
                 problems.append(
-                    f"deploymentRequest.inputs: '{role}' is not an input" + near(role, self.inputs)
+                    f"deploymentRequest.inputs: '{role}' is not an input"
+                    + suggestion(role, self.inputs)
                 )
         if problems:
             raise ValueError("; ".join(problems))

@@ -1,4 +1,4 @@
-"""All that people configured, indexed: the :class:`Catalog`, one frozen value."""
+"""The whole configuration as one frozen, indexed value: :class:`Config`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 from demandops.config.appdef import ApplicationDefinition, Service
 from demandops.config.inventory import Broker, Cluster, Node
-from demandops.config.override import OVERRIDES_ROOT, Override, in_order, still_in_force
+from demandops.config.override import OVERRIDES_ROOT, Override, by_rank, still_active
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import Chart, Image
 from demandops.config.repo_settings import RepoSettings
@@ -21,28 +21,28 @@ CHARTS_FILE = "registry/charts.yaml"
 IMAGES_FILE = "registry/images.yaml"
 
 MQTT_CLIENT_IMAGE = "mqtt-client"
-"""The image of the registry that both ends of an MQTT connection run."""
+"""The registry image that both ends of an MQTT connection run."""
 
 ZENOH_BRIDGE_IMAGE = "zenoh-bridge"
-"""The image of the registry that carries a node's Zenoh connections."""
+"""The registry image that carries a node's Zenoh connections."""
 
 DDS_ROUTER_IMAGE = "dds-router"
-"""The image of the registry that both ends of a ROS connection run."""
+"""The registry image that both ends of a ROS connection run."""
 
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
-"""The top-level entries of a state repo that people own and the configuration is made from."""
+"""The top-level entries of a state repo that hold the configuration; people own them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """What can be run, where, from which charts and images.
+    """What can run, where, and from which charts and images.
 
-    ``files`` keeps the texts that templates and chart schemas are read from, by path. ``overrides``
-    are all that lie there; ``ended`` maps those that ended to the time that they named then, and
-    ``in_force`` are the others, in the order in which they apply.
+    ``files`` maps the paths of templates and chart schemas to their texts. ``overrides`` has every
+    override. ``ended_overrides`` maps the name of an ended override to the expiry that it had then.
+    ``active_overrides`` are the others, in the order in which they apply.
     """
 
-    repository: RepoSettings
+    repo_settings: RepoSettings
     clusters: Mapping[str, Cluster]
     nodes: Mapping[str, Node]
     brokers: Mapping[str, Broker]
@@ -53,20 +53,24 @@ class Config:
     domain_of: Mapping[str, AccessDomain]
     files: Mapping[str, str]
     overrides: Mapping[str, Override] = field(default_factory=dict)
-    ended: Mapping[str, str] = field(default_factory=dict)
-    in_force: tuple[Override, ...] = ()
-    judged: dict[Hashable, Override | None] = field(default_factory=dict, compare=False, repr=False)
-    """What was found denied, kept by :mod:`demandops.plan.overrides.suspended_claims`."""
+    ended_overrides: Mapping[str, str] = field(default_factory=dict)
+    active_overrides: tuple[Override, ...] = ()
+    denial_cache: dict[Hashable, Override | None] = field(
+        default_factory=dict, compare=False, repr=False
+    )
+    """The override that denies a claim, if any; ``suspended_claims`` fills it."""
 
-    def with_ended(self, ended: Mapping[str, str]) -> Config:
-        """Return the configuration with these overrides ended."""
-        in_force = in_order(still_in_force(self.overrides, ended))
+    def with_ended_overrides(self, ended: Mapping[str, str]) -> Config:
+        """Return the configuration with exactly these overrides ended."""
+        active_overrides = by_rank(still_active(self.overrides, ended))
         ended = MappingProxyType(dict(ended))
-        return replace(self, ended=ended, in_force=in_force, judged={})
+        return replace(
+            self, ended_overrides=ended, active_overrides=active_overrides, denial_cache={}
+        )
 
     def without_overrides(self) -> Config:
-        """Return the configuration as it would be had nobody written an override."""
-        return replace(self, overrides={}, ended={}, in_force=(), judged={})
+        """Return the configuration without any override."""
+        return replace(self, overrides={}, ended_overrides={}, active_overrides=(), denial_cache={})
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
         """Return the appdef that ``DeploymentRequest`` names by ``number``."""
@@ -76,10 +80,10 @@ class Config:
         return None
 
     def versions_of(self, appdef: str) -> list[str]:
-        """Return the channels and versions that a demand for an application may name."""
+        """Return the channels and versions that a demand for this appdef may request."""
         charts = {service.chart for service in self.appdefs[appdef].services.values()}
         return sorted({known for chart in charts for known in self.charts[chart].versions()})
 
     def values_template(self, appdef: str, service: Service) -> str:
-        """Return the path of the template that gives a service's Helm values."""
+        """Return the path of the template of a service's Helm values."""
         return f"appdefs/{appdef}/{service.values}"

@@ -1,6 +1,6 @@
-"""What shows only between files or entries: an unknown cluster, a prefix used twice.
+"""Checks across files and entries: an unknown cluster, a prefix that is used twice.
 
-Called once all files are parsed; every fault is noted, none stops the others.
+They run when all files are parsed. Every check runs, and the reader collects all faults.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from demandops.config.config import (
     NODES_FILE,
     Config,
 )
-from demandops.config.item_reader import ItemReader
+from demandops.config.config_reader import ConfigReader
 from demandops.config.override import Override
 from demandops.config.override_conflict import check_override_conflicts
 from demandops.config.policy import matches
 from demandops.config.registry import ChartSource
-from demandops.errors import InvalidInput, near
+from demandops.errors import InvalidInput, suggestion
 
 _CONNECTION_PREFIXES = ("mqtt", "zenoh", "ros")
 
 
-def cross_check(config: Config, reading: ItemReader) -> None:
-    """Note every fault that shows only between files or entries."""
+def cross_check(config: Config, reader: ConfigReader) -> None:
+    """Add every fault across files or entries to the reader."""
     for check in (
         _check_inventory,
         _check_topics,
@@ -42,130 +42,130 @@ def cross_check(config: Config, reading: ItemReader) -> None:
         _check_overrides,
         check_override_conflicts,
     ):
-        check(config, reading)
+        check(config, reader)
 
 
-def _check_inventory(config: Config, reading: ItemReader) -> None:
+def _check_inventory(config: Config, reader: ConfigReader) -> None:
     for node in config.nodes.values():
-        if reading.lacks(CLUSTERS_FILE, node.cluster):
-            reading.tell(
+        if reader.is_missing(CLUSTERS_FILE, node.cluster):
+            reader.add_fault(
                 NODES_FILE,
-                f"nodes[{reading.place(NODES_FILE, node.id)}].cluster",
+                f"nodes[{reader.index_of(NODES_FILE, node.id)}].cluster",
                 f"'{node.cluster}' is not in clusters.yaml"
-                + near(node.cluster, reading.names(CLUSTERS_FILE)),
+                + suggestion(node.cluster, reader.item_names(CLUSTERS_FILE)),
             )
     for broker in config.brokers.values():
-        if reading.lacks(NODES_FILE, broker.node):
-            reading.tell(
+        if reader.is_missing(NODES_FILE, broker.node):
+            reader.add_fault(
                 BROKERS_FILE,
-                f"brokers[{reading.place(BROKERS_FILE, broker.node)}].node",
+                f"brokers[{reader.index_of(BROKERS_FILE, broker.node)}].node",
                 f"'{broker.node}' is not in nodes.yaml"
-                + near(broker.node, reading.names(NODES_FILE)),
+                + suggestion(broker.node, reader.item_names(NODES_FILE)),
             )
 
 
-def _check_topics(config: Config, reading: ItemReader) -> None:
+def _check_topics(config: Config, reader: ConfigReader) -> None:
     roles = {role for appdef in config.appdefs.values() for role in appdef.inputs}
     for node in config.nodes.values() if roles else ():
         for role in node.topics:
             if role not in roles:
-                reading.tell(
+                reader.add_fault(
                     NODES_FILE,
-                    f"nodes[{reading.place(NODES_FILE, node.id)}].topics.{role}",
-                    f"'{role}' is an input of no application" + near(role, roles),
+                    f"nodes[{reader.index_of(NODES_FILE, node.id)}].topics.{role}",
+                    f"'{role}' is not an input of any application" + suggestion(role, roles),
                 )
 
 
-def _check_namespaces(config: Config, reading: ItemReader) -> None:
+def _check_namespaces(config: Config, reader: ConfigReader) -> None:
     seen: dict[str, str] = {}
     for domain in config.domains.values():
         other = seen.setdefault(domain.namespace, domain.name)
         if other != domain.name:
-            reading.tell(
+            reader.add_fault(
                 DOMAINS_FILE,
-                f"domains[{reading.place(DOMAINS_FILE, domain.name)}].namespace",
-                f"'{domain.namespace}' is the namespace of '{other}' already; give each its own",
+                f"domains[{reader.index_of(DOMAINS_FILE, domain.name)}].namespace",
+                f"'{domain.namespace}' is already the namespace of '{other}'; give each its own",
             )
 
 
-def _check_controllers_namespace(config: Config, reading: ItemReader) -> None:
-    argocd = config.repository.argocd if config.repository.gitops == "argocd" else None
+def _check_controllers_namespace(config: Config, reader: ConfigReader) -> None:
+    argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
     for domain in config.domains.values():
         if argocd and domain.namespace == argocd.namespace:
-            reading.tell(
+            reader.add_fault(
                 DOMAINS_FILE,
-                f"domains[{reading.place(DOMAINS_FILE, domain.name)}].namespace",
-                f"'{domain.namespace}' is Argo CD's own, where whoever may write an Application "
-                "may do all that Argo CD may; choose another",
+                f"domains[{reader.index_of(DOMAINS_FILE, domain.name)}].namespace",
+                f"'{domain.namespace}' is Argo CD's own namespace, where an Application may do "
+                "all that Argo CD may; choose another",
             )
 
 
-def _check_charts(config: Config, reading: ItemReader) -> None:
+def _check_charts(config: Config, reader: ConfigReader) -> None:
     for name, chart in config.charts.items():
-        _check_chart(f"charts.{name}", chart, config, reading)
+        _check_chart(f"charts.{name}", chart, config, reader)
         for channel, source in chart.channels.items():
-            _check_chart(f"charts.{name}.channels.{channel}", source, config, reading)
+            _check_chart(f"charts.{name}.channels.{channel}", source, config, reader)
 
 
-def _check_chart(where: str, chart: ChartSource, config: Config, reading: ItemReader) -> None:
+def _check_chart(where: str, chart: ChartSource, config: Config, reader: ConfigReader) -> None:
     if not chart.folder:
         return
     path = f"{chart.folder}/Chart.yaml"
     text = config.files.get(path)
     if text is None:
-        message = f"'{path}' does not exist; mend the folder"
-        reading.tell(CHARTS_FILE, f"{where}.folder", message)
+        message = f"'{path}' does not exist; correct the folder"
+        reader.add_fault(CHARTS_FILE, f"{where}.folder", message)
         return
     try:
         metadata = strict_yaml.load(text)
     except InvalidInput as error:
-        reading.faults += strict_yaml.faults_in(error, path)
+        reader.faults += strict_yaml.faults_in(error, path)
         return
     version = metadata.get("version") if isinstance(metadata, dict) else None
     if version != chart.version:
-        reading.tell(
+        reader.add_fault(
             CHARTS_FILE,
             f"{where}.version",
-            f"is {chart.version}, but {path} says {version}; make them one",
+            f"is {chart.version}, but {path} says {version}; make them equal",
         )
 
 
-def _check_services(config: Config, reading: ItemReader) -> None:
+def _check_services(config: Config, reader: ConfigReader) -> None:
     prefixes: dict[str, tuple[str, str, Service]] = {}
     for appdef in config.appdefs.values():
         file = f"appdefs/{appdef.name}/appdef.yaml"
         for name, service in appdef.services.items():
             where = f"services.{name}"
-            if reading.lacks(CHARTS_FILE, service.chart):
-                known = near(service.chart, reading.names(CHARTS_FILE))
-                reading.tell(
+            if reader.is_missing(CHARTS_FILE, service.chart):
+                known = suggestion(service.chart, reader.item_names(CHARTS_FILE))
+                reader.add_fault(
                     file, f"{where}.chart", f"'{service.chart}' is not in {CHARTS_FILE}{known}"
                 )
             for image in service.images:
-                if reading.lacks(IMAGES_FILE, image):
-                    known = near(image, reading.names(IMAGES_FILE))
-                    reading.tell(
+                if reader.is_missing(IMAGES_FILE, image):
+                    known = suggestion(image, reader.item_names(IMAGES_FILE))
+                    reader.add_fault(
                         file, f"{where}.images", f"'{image}' is not in {IMAGES_FILE}{known}"
                     )
             if config.values_template(appdef.name, service) not in config.files:
                 message = f"'{service.values}' does not exist; add it beside appdef.yaml"
-                reading.tell(file, f"{where}.values", message)
+                reader.add_fault(file, f"{where}.values", message)
             if service.prefix in _CONNECTION_PREFIXES:
-                message = f"'{service.prefix}' names connections; choose another"
-                reading.tell(file, f"{where}.prefix", message)
+                message = f"'{service.prefix}' is the prefix of connections; choose another"
+                reader.add_fault(file, f"{where}.prefix", message)
                 continue
             other = prefixes.setdefault(service.prefix, (appdef.name, name, service))
             if other[2] is not service and not _same(config, other, (appdef.name, name, service)):
-                reading.tell(
+                reader.add_fault(
                     file,
                     f"{where}.prefix",
-                    f"'{service.prefix}' is used by '{other[1]}' already; only a service for each "
-                    "topic may stand in several appdefs, and then must be the same in all",
+                    f"'{service.prefix}' is used by '{other[1]}' already; choose another (only "
+                    "identical services with 'each' may share a prefix)",
                 )
 
 
 def _same(config: Config, one: tuple[str, str, Service], other: tuple[str, str, Service]) -> bool:
-    """Tell whether two appdefs mean the same shared service."""
+    """Return whether two appdefs define the same shared service."""
     texts = [
         config.files.get(config.values_template(appdef, service))
         for appdef, _, service in (one, other)
@@ -173,35 +173,35 @@ def _same(config: Config, one: tuple[str, str, Service], other: tuple[str, str, 
     return bool(one[2].each) and one[1:] == other[1:] and texts[0] == texts[1]
 
 
-def _check_clients(config: Config, reading: ItemReader) -> None:
-    if config.brokers and reading.lacks(IMAGES_FILE, MQTT_CLIENT_IMAGE):
-        message = f"'{MQTT_CLIENT_IMAGE}' is missing; MQTT connections run it"
-        reading.tell(IMAGES_FILE, "images", message)
+def _check_clients(config: Config, reader: ConfigReader) -> None:
+    if config.brokers and reader.is_missing(IMAGES_FILE, MQTT_CLIENT_IMAGE):
+        message = f"'{MQTT_CLIENT_IMAGE}' is missing; add it, because MQTT connections run it"
+        reader.add_fault(IMAGES_FILE, "images", message)
 
 
-def _check_links(config: Config, reading: ItemReader) -> None:
+def _check_links(config: Config, reader: ConfigReader) -> None:
     hosts: dict[tuple[object, ...], str] = {}
     for node in config.nodes.values():
-        where = f"nodes[{reading.place(NODES_FILE, node.id)}]"
+        where = f"nodes[{reader.index_of(NODES_FILE, node.id)}]"
         for peer in node.bridged:
-            if reading.lacks(NODES_FILE, peer):
-                known = near(peer, reading.names(NODES_FILE))
+            if reader.is_missing(NODES_FILE, peer):
+                known = suggestion(peer, reader.item_names(NODES_FILE))
                 message = f"'{peer}' is not in nodes.yaml{known}"
-                reading.tell(NODES_FILE, f"{where}.bridged.{peer}", message)
+                reader.add_fault(NODES_FILE, f"{where}.bridged.{peer}", message)
         if node.zenoh is None:
             continue
         host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
         other = hosts.setdefault(host, node.id)
         if other != node.id:
-            reading.tell(
+            reader.add_fault(
                 NODES_FILE,
                 f"{where}.zenoh",
-                f"'{other}' runs a bridge on the same host and ROS domain, and two do not work; "
-                "keep one",
+                f"'{other}' already runs a bridge on the same host and ROS domain; remove one of "
+                "them",
             )
 
 
-def _check_wire_types(config: Config, reading: ItemReader) -> None:
+def _check_wire_types(config: Config, reader: ConfigReader) -> None:
     seen: dict[int, str] = {}
     for appdef in config.appdefs.values():
         if appdef.deployment_request is None:
@@ -209,44 +209,44 @@ def _check_wire_types(config: Config, reading: ItemReader) -> None:
         number = appdef.deployment_request.type
         other = seen.setdefault(number, appdef.name)
         if other != appdef.name:
-            reading.tell(
+            reader.add_fault(
                 f"appdefs/{appdef.name}/appdef.yaml",
                 "deploymentRequest.type",
                 f"{number} already names '{other}'; choose another number",
             )
 
 
-def _check_overrides(config: Config, reading: ItemReader) -> None:
+def _check_overrides(config: Config, reader: ConfigReader) -> None:
     for override in config.overrides.values():
         for image in override.images or ():
-            if reading.lacks(IMAGES_FILE, image):
-                known = near(image, reading.names(IMAGES_FILE))
+            if reader.is_missing(IMAGES_FILE, image):
+                known = suggestion(image, reader.item_names(IMAGES_FILE))
                 message = f"'{image}' is not in {IMAGES_FILE}{known}"
-                reading.tell(override.path, f"images.{image}", message)
+                reader.add_fault(override.path, f"images.{image}", message)
         node = override.node
-        if node is not None and reading.lacks(NODES_FILE, node):
-            known = near(node, reading.names(NODES_FILE))
-            reading.tell(override.path, "node", f"'{node}' is not in nodes.yaml{known}")
-        elif node is not None and not reading.lacks(NODES_FILE, node):
-            _check_moved_to(node, override, config, reading)
+        if node is not None and reader.is_missing(NODES_FILE, node):
+            known = suggestion(node, reader.item_names(NODES_FILE))
+            reader.add_fault(override.path, "node", f"'{node}' is not in nodes.yaml{known}")
+        elif node is not None and not reader.is_missing(NODES_FILE, node):
+            _check_moved_to(node, override, config, reader)
         versions = _versions_for(override, config)
         if override.version and versions and override.version not in versions:
-            reading.tell(
+            reader.add_fault(
                 override.path,
                 "version",
-                f"'{override.version}' is no version or channel in {CHARTS_FILE} of a chart that "
-                f"is selected{near(override.version, versions)}",
+                f"'{override.version}' is not a version or channel in {CHARTS_FILE} of a "
+                f"selected chart{suggestion(override.version, versions)}",
             )
 
 
-def _check_moved_to(node: str, override: Override, config: Config, reading: ItemReader) -> None:
+def _check_moved_to(node: str, override: Override, config: Config, reader: ConfigReader) -> None:
     if node in config.nodes and node not in config.domain_of and config.domains:
-        message = f"'{node}' is in no access domain; add it to one in {DOMAINS_FILE}"
-        reading.tell(override.path, "node", message)
+        message = f"'{node}' is not in any access domain; add it to one in {DOMAINS_FILE}"
+        reader.add_fault(override.path, "node", message)
 
 
 def _versions_for(override: Override, config: Config) -> set[str]:
-    """Return the versions and channels of every chart that an override may pin."""
+    """Return the versions and channels of every chart that an override selects."""
     charts = {
         service.chart
         for appdef in config.appdefs.values()

@@ -1,7 +1,7 @@
-"""The inventory: which nodes, clusters and brokers there are, and who may use them.
+"""The inventory: nodes, clusters and brokers.
 
 A node is a vehicle, a roadside station, an edge or a cloud server. It belongs to one cluster and
-one access domain, and a node selector finds it there.
+one access domain. A node selector identifies it in its cluster.
 """
 
 from __future__ import annotations
@@ -11,41 +11,41 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen, Word
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Word
 from demandops.identifiers import id_problem, message_type_problem, topic_problem
 
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
 """A host name or an IP address."""
 
 SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
-"""A key inside a Kubernetes Secret; it becomes a file name."""
+"""A key in a Kubernetes Secret; it becomes a file name."""
 
 _ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
 Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$")]
 """A Zenoh endpoint without certificates: ``tcp/host:7447``."""
 
 
-class Tls(Frozen):
-    """Encrypted connections to a broker; without ``caSecret`` the client image's own CAs count."""
+class Tls(FrozenModel):
+    """TLS to a broker; without ``caSecret``, the client trusts the CAs of its image."""
 
     ca_secret: DnsLabel | None = Field(default=None, alias="caSecret")
     ca_key: SecretKey = Field(default="ca.crt", alias="caKey")
 
 
-class Credentials(Frozen):
-    """The Secret with a broker's user name and password, and the keys that they stand under."""
+class Credentials(FrozenModel):
+    """The Secret with a broker's user name and password, and their keys in it."""
 
     secret: DnsLabel
     user_key: SecretKey = Field(default="username", alias="userKey")
     password_key: SecretKey = Field(default="password", alias="passwordKey")
 
 
-class Zenoh(Frozen):
-    """That a node runs a Zenoh bridge where a connection needs it, and how bridges meet.
+class Zenoh(FrozenModel):
+    """The Zenoh bridge that a node runs when a connection needs it.
 
-    ``endpoint`` is where other nodes' bridges reach this one; ``listen`` where it listens for
-    them, by default on the endpoint's port at every address; ``connect`` are routers that it
-    always connects to. All may be left out: such a node connects to those that can be reached.
+    Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
+    the endpoint's port at every address. It always connects to the routers in ``connect``. A node
+    without any of these connects to nodes that have an endpoint.
     """
 
     endpoint: Endpoint | None = None
@@ -59,15 +59,15 @@ class Zenoh(Frozen):
         return self
 
     def listening(self) -> tuple[str, ...]:
-        """Return the endpoints that the node's bridge listens on, none where nobody connects."""
+        """Return the endpoints that the bridge listens on; none if no bridge can connect to it."""
         if self.listen or not self.endpoint:
             return self.listen
         protocol, _, address = self.endpoint.partition("/")
         return (f"{protocol}/0.0.0.0:{address.rpartition(':')[2]}",)
 
 
-class Wan(Frozen):
-    """Where DDS Routers on a node can be reached, one port for each ROS connection."""
+class Wan(FrozenModel):
+    """The address of a node's DDS Routers, with one port for each ROS connection."""
 
     host: Host
     first_port: Annotated[int, Field(ge=1024, le=65535)] = Field(default=20000, alias="firstPort")
@@ -116,15 +116,15 @@ _LABEL_VALUE = re.compile(r"([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?")
 LabelValue = Annotated[str, StringConstraints(pattern=f"^{_LABEL_VALUE.pattern}$")]
 
 
-class Cluster(Frozen):
+class Cluster(FrozenModel):
     """A Kubernetes cluster whose GitOps controller reads ``clusters/<name>/``."""
 
     name: DnsLabel
     description: str = ""
 
 
-class Toleration(Frozen):
-    """A taint of the node that workloads put up with (Kubernetes core/v1 Toleration)."""
+class Toleration(FrozenModel):
+    """A taint of the node that workloads tolerate (Kubernetes core/v1 Toleration)."""
 
     key: str = ""
     operator: Literal["Exists", "Equal"] = "Equal"
@@ -140,8 +140,8 @@ class Toleration(Frozen):
         return self
 
 
-class Ros(Frozen):
-    """What a container on the node needs to join its ROS graph."""
+class Ros(FrozenModel):
+    """The settings that a container needs to join the node's ROS graph."""
 
     domain_id: Annotated[int, Field(ge=0, le=232)] = Field(default=0, alias="domainId")
     rmw: Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"] = (
@@ -149,15 +149,15 @@ class Ros(Frozen):
     )
 
 
-class Node(Frozen):
+class Node(FrozenModel):
     """A C-ITS entity that runs services.
 
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
-    ``topics`` names, for each input role, the node's usual topic: releases and derived topics
-    for it carry the node's name alone; those for its further topics carry the topic as well.
-    ``zenoh`` and ``wan`` say how Zenoh and ROS connections reach the node, ``types`` the message
-    types of topics that requests do not say. ``bridged`` names topics that the initial deployment
-    carries from here to another node, under the same name: no connection carries them again.
+    ``topics`` maps each input role to the node's usual topic. Names of releases and derived topics
+    contain only the node for a usual topic, and the topic as well for any other.
+    Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` has the
+    message types of topics for which a request gives none. ``bridged`` lists topics that the
+    initial deployment already carries to another node under the same name; connections skip them.
     """
 
     id: NodeId
@@ -182,7 +182,8 @@ class Node(Frozen):
     def _findable(self) -> Node:
         if self.selector is None and not _LABEL_VALUE.fullmatch(self.id):
             raise ValueError(
-                "the id is no label value, so nodes cannot carry it as node_id; add a selector"
+                "the id is not a valid label value, so nodes cannot have it as node_id; add a "
+                "selector"
             )
         return self
 
@@ -191,7 +192,7 @@ class Node(Frozen):
         return dict(self.selector) if self.selector is not None else {"node_id": self.id}
 
 
-class Broker(Frozen):
+class Broker(FrozenModel):
     """A message broker and the node that it runs on."""
 
     node: NodeId

@@ -1,6 +1,6 @@
-"""From the texts of the state repo's configuration to a :class:`Catalog`.
+"""Loading of the configuration: the files' texts become a :class:`Config`.
 
-Pure. A file set is taken whole or refused whole, with every fault of every file.
+Pure. If any file has a fault, the whole configuration is rejected, with every fault of every file.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from demandops.config.config import (
     NODES_FILE,
     Config,
 )
+from demandops.config.config_reader import ConfigReader
 from demandops.config.cross_check import cross_check
 from demandops.config.inventory import Broker, BrokersFile, Cluster, ClustersFile, Node, NodesFile
-from demandops.config.item_reader import ItemReader
 from demandops.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.config.policy import AccessDomain, AccessDomainsFile, matches
 from demandops.config.registry import Chart, ChartsFile, Image, ImagesFile
@@ -36,105 +36,105 @@ _ANY = RepoSettings(
     gitops="flux",
     renderVersion=RENDER_VERSION,
     flux=Flux(url="https://unread.invalid/repo.git"),
-)  # stands in for one that could not be read, so that the rest is checked all the same
+)  # replaces an invalid one, so that the other files can be checked
 
 
 def load(files: Mapping[str, str]) -> Config:
-    """Parse the configuration files of a state repo.
+    """Return the configuration of a state repo.
 
     Args:
-        files: path in the state repo → text; files of other folders are passed over.
+        files: path in the state repo → text; other folders are ignored.
 
     Raises:
         InvalidInput: with every fault of every file.
     """
-    reading = ItemReader(files)
-    repository = reading.one(ROOT_FILE, RepoSettings)
+    reader = ConfigReader(files)
+    repository = reader.read_file(ROOT_FILE, RepoSettings)
     if repository and repository.render_version > RENDER_VERSION:
-        reading.tell(
+        reader.add_fault(
             ROOT_FILE,
             "renderVersion",
             f"is {repository.render_version}, but this generator renders version "
             f"{RENDER_VERSION}; update the generator",
         )
     if repository and getattr(repository, repository.gitops) is None:
-        reading.tell(
+        reader.add_fault(
             ROOT_FILE,
             repository.gitops,
             f"is missing, but gitops is {repository.gitops}; add it with the url that the "
             "clusters fetch this repo from",
         )
-    nodes = reading.listed(NODES_FILE, NodesFile, "nodes", Node, "id")
-    domains = reading.listed(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
+    nodes = reader.read_list(NODES_FILE, NodesFile, "nodes", Node, "id")
+    domains = reader.read_list(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
     config = Config(
-        repository=repository or _ANY,
-        clusters=reading.listed(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
+        repo_settings=repository or _ANY,
+        clusters=reader.read_list(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
         nodes=nodes,
-        brokers=reading.listed(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
+        brokers=reader.read_list(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
         domains=domains,
-        charts=reading.named(CHARTS_FILE, ChartsFile, "charts", Chart),
-        images=reading.named(IMAGES_FILE, ImagesFile, "images", Image),
-        appdefs=_read_appdefs(reading),
-        domain_of=_domains_of_nodes(reading, nodes, domains),
+        charts=reader.read_mapping(CHARTS_FILE, ChartsFile, "charts", Chart),
+        images=reader.read_mapping(IMAGES_FILE, ImagesFile, "images", Image),
+        appdefs=_read_appdefs(reader),
+        domain_of=_domains_of_nodes(reader, nodes, domains),
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
-        overrides=_read_overrides(reading),
-    ).with_ended({})
-    cross_check(config, reading)
-    if reading.faults:
-        raise InvalidInput(dict.fromkeys(reading.faults))
+        overrides=_read_overrides(reader),
+    ).with_ended_overrides({})
+    cross_check(config, reader)
+    if reader.faults:
+        raise InvalidInput(dict.fromkeys(reader.faults))
     return config
 
 
-def _read_appdefs(reading: ItemReader) -> Mapping[str, ApplicationDefinition]:
+def _read_appdefs(reader: ConfigReader) -> Mapping[str, ApplicationDefinition]:
     appdefs = {}
-    for path in sorted(reading.files):
+    for path in sorted(reader.files):
         parts = path.split("/")
         if len(parts) != 3 or parts[0] != "appdefs" or parts[2] != "appdef.yaml":
             continue
-        appdef = reading.one(path, ApplicationDefinition)
+        appdef = reader.read_file(path, ApplicationDefinition)
         if appdef is None:
             continue
         if appdef.name != parts[1]:
-            reading.tell(
-                path, "name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them one"
+            reader.add_fault(
+                path, "name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them equal"
             )
             appdef = appdef.model_copy(update={"name": parts[1]})
         appdefs[appdef.name] = appdef
     return MappingProxyType(appdefs)
 
 
-def _read_overrides(reading: ItemReader) -> Mapping[str, Override]:
+def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
     overrides = {}
-    for path in sorted(reading.files):
+    for path in sorted(reader.files):
         folder, _, name = path.partition("/")
         if folder != OVERRIDES_ROOT or name.startswith(".") or name.endswith(".md"):
             continue
         stem = name.removesuffix(".yaml")
         if stem == name or not _NAME.fullmatch(stem):
-            reading.tell(
+            reader.add_fault(
                 path,
                 "",
-                "is no override: one is overrides/<name>.yaml, the name of small letters, digits "
-                "and '-'; rename the file, or remove it",
+                "is not an override file; rename it to overrides/<name>.yaml, with lower-case "
+                "letters, digits and '-', or remove it",
             )
             continue
-        file = reading.one(path, OverrideFile)
+        file = reader.read_file(path, OverrideFile)
         if file is not None:
-            overrides[stem] = Override.of(stem, file)
+            overrides[stem] = Override.from_file(stem, file)
     return MappingProxyType(overrides)
 
 
 def _domains_of_nodes(
-    reading: ItemReader, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
+    reader: ConfigReader, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
 ) -> Mapping[str, AccessDomain]:
     owner: dict[str, AccessDomain] = {}
     for node in nodes:
         matching = [d for d in domains.values() if matches(node, d.nodes)]
         if len(matching) > 1:
             names = " and ".join(f"'{domain.name}'" for domain in matching)
-            reading.tell(
+            reader.add_fault(
                 NODES_FILE,
-                f"nodes[{reading.place(NODES_FILE, node)}].id",
+                f"nodes[{reader.index_of(NODES_FILE, node)}].id",
                 f"'{node}' is in the access domains {names}; narrow their patterns so that it is "
                 "in one",
             )

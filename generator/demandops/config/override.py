@@ -1,8 +1,7 @@
 """Overrides: a person's declared deviations, one file each in ``overrides/``.
 
-The model and what it means on its own: whom a selector can match, what an effect may say. Whether
-two of them conflict is :mod:`demandops.config.override_conflict`; what they do to releases and
-claims is the plan's.
+This module has the model and the rules for one override. Conflicts between two are in
+:mod:`demandops.config.override_conflict`, effects on releases and claims in ``plan/overrides``.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.config.registry import Image
-from demandops.errors import shown
+from demandops.errors import quoted
 from demandops.identifiers import id_problem
 
 OVERRIDES_ROOT = "overrides"
@@ -29,14 +28,14 @@ _MOMENT = re.compile(
 _SHAPING = ("values", "version", "images", "replicas", "node")
 _OF_SERVICES = ("values", "version", "replicas", "node", "keep")
 EFFECTS = (*_SHAPING, "hold", "deny", "keep")
-"""What an override may do, in the order in which it is told."""
+"""The effects of overrides, in the order of messages."""
 
 
-def moment_of(text: str) -> datetime:
-    """Return the moment that an RFC 3339 time with zone names, in UTC.
+def parse_time(text: str) -> datetime:
+    """Return an RFC 3339 time with a zone, in UTC.
 
     Raises:
-        ValueError: where it is none.
+        ValueError: if the text is not such a time.
     """
     match = _MOMENT.fullmatch(text)
     try:
@@ -48,18 +47,18 @@ def moment_of(text: str) -> datetime:
         return moment.astimezone(timezone.utc)
     except (ValueError, OverflowError):
         raise ValueError(
-            f"{shown(text)} is no time with a time zone; write one like 2026-01-31T12:00:00Z"
+            f"{quoted(text)} is not a time with a time zone; write one like 2026-01-31T12:00:00Z"
         ) from None
 
 
-def written(moment: datetime) -> str:
-    """Return a moment as messages and markers show it."""
+def format_time(moment: datetime) -> str:
+    """Return a time in the form of messages and markers."""
     text = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
     return re.sub(r"\.?0*\+00:00$", "Z", text)
 
 
 def _moment(text: str) -> str:
-    moment_of(text)
+    parse_time(text)
     return text
 
 
@@ -67,7 +66,7 @@ def _one_line(text: str) -> str:
     if not text.strip() or text != text.strip():
         raise ValueError("is empty or starts or ends with white space; write one line of text")
     if not text.isprintable():
-        raise ValueError(f"{shown(text)} is more than one line of plain text; make it one")
+        raise ValueError(f"{quoted(text)} is more than one line of plain text; write one line")
     return text
 
 
@@ -80,7 +79,7 @@ def _owner(text: str) -> str:
 
 def _finite(value: Any) -> None:  # noqa: ANN401 - Helm values are any data
     if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"holds {value}, which JSON has no number for; choose another value")
+        raise ValueError(f"contains {value}, which is not a number in JSON; choose another value")
     inner = value.values() if isinstance(value, dict) else value
     for item in inner if isinstance(value, dict | list) else ():
         _finite(item)
@@ -93,7 +92,7 @@ def _patch(value: dict[str, Any]) -> dict[str, Any]:
 
 def _some(items: tuple[Any, ...]) -> tuple[Any, ...]:
     if not items or "" in items:
-        raise ValueError("is empty or holds nothing; say what is selected")
+        raise ValueError("is empty or has an empty item; name what to select")
     return items
 
 
@@ -101,18 +100,18 @@ Patterns = Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_some)
 Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)]
 
 
-def _filled_in(model: Frozen) -> None:
-    """Raise for a field that is written down and empty: it would say less than it seems to."""
+def _filled_in(model: FrozenModel) -> None:
+    """Raise for a field without a value, which selects or changes less than it seems to."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
-        raise ValueError(f"{' and '.join(empty)}: nothing stands there; fill it in, or remove it")
+        raise ValueError(f"{' and '.join(empty)}: has no value; fill it in, or remove it")
 
 
-class Selector(Frozen):
-    """What an override is for: a release or claim that every field given here fits.
+class Selector(FrozenModel):
+    """Selects the releases and claims that match every field given here.
 
-    Patterns take ``*`` and ``?``. ``requesters`` fits where one of the requesters does, ``labels``
-    where the node's selector has them all.
+    Patterns may contain ``*`` and ``?``. ``requesters`` matches if one of the requesters does,
+    ``labels`` if the node's selector has all of them.
     """
 
     applications: Patterns | None = None
@@ -126,18 +125,18 @@ class Selector(Frozen):
     @model_validator(mode="after")
     def _sensible(self) -> Selector:
         if not self.model_fields_set:
-            raise ValueError("selects nothing; give at least one field, nodes: ['*'] say")
+            raise ValueError("selects nothing; give at least one field, for example nodes: ['*']")
         _filled_in(self)
         others = [name for name in ("applications", "appdefs", "services") if getattr(self, name)]
         if self.connections and others:
             raise ValueError(
-                f"connections and {others[0]} never fit the same thing; write two selectors"
+                f"connections and {others[0]} never match the same thing; write two selectors"
             )
         return self
 
 
-class ImagePin(Frozen):
-    """What an override says of an image of the registry; what it leaves out stays."""
+class ImagePin(FrozenModel):
+    """Changes to an image of the registry; absent fields leave it unchanged."""
 
     repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")] | None = None
     tag: (
@@ -148,11 +147,11 @@ class ImagePin(Frozen):
     @model_validator(mode="after")
     def _says_something(self) -> ImagePin:
         if not (self.repository or self.tag or self.digest):
-            raise ValueError("says nothing; give a tag, a digest or a repository")
+            raise ValueError("changes nothing; give a tag, a digest or a repository")
         return self
 
     def over(self, image: Image) -> Image:
-        """Return the image as pinned; a tag or digest takes the place of both."""
+        """Return the pinned image; a tag or a digest replaces both."""
         anew = self.tag or self.digest
         return Image(
             repository=self.repository or image.repository,
@@ -162,7 +161,7 @@ class ImagePin(Frozen):
 
 
 class OverrideFile(FileModel):
-    """``overrides/<name>.yaml``. Of those that match the same, the higher priority wins."""
+    """``overrides/<name>.yaml``; if several match, the one with the higher priority wins."""
 
     kind: Literal["Override"]
     reason: Line
@@ -188,14 +187,14 @@ class OverrideFile(FileModel):
         return self
 
     def _misplaced(self) -> Iterable[str]:
-        """Yield effects that what is selected cannot have."""
+        """Yield a problem for each effect that the selected things cannot have."""
         effects = self.effects()
         for index, selector in enumerate(self.select):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
             if selector.connections and wrong:
                 yield (
-                    f"select[{index}].connections: {wrong[0]} is for services, and a connection "
-                    "has none; remove the one or the other"
+                    f"select[{index}].connections: {wrong[0]} is for services, and connections "
+                    "have none; remove one of the two"
                 )
             if selector.services and "keep" in effects:
                 yield (
@@ -204,37 +203,37 @@ class OverrideFile(FileModel):
                 )
 
     def effects(self) -> tuple[str, ...]:
-        """Return the names of the effects that are given."""
+        """Return the names of this override's effects."""
         return tuple(name for name in EFFECTS if getattr(self, name) is not None)
 
     @property
     def end(self) -> datetime | None:
-        """When it ceases to apply."""
-        return moment_of(self.expires) if self.expires else None
+        """The time from which it no longer applies."""
+        return parse_time(self.expires) if self.expires else None
 
 
-class Override(OverrideFile):  # noqa: PLW1641 - with mappings in them overrides have no hash
-    """An override and its name, which is that of its file."""
+class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so they have no hash
+    """An override with its name, which is its file's name."""
 
     name: str
 
     @classmethod
-    def of(cls, name: str, file: OverrideFile) -> Override:
-        """Return what a file says, by its name."""
+    def from_file(cls, name: str, file: OverrideFile) -> Override:
+        """Return the override of a parsed file."""
         return cls.model_construct(file.model_fields_set | {"name"}, **dict(file), name=name)
 
     def __eq__(self, other: object) -> bool:
-        """Compare exactly: to Python 1 is True and 1.0, to a chart they are three values."""
+        """Compare exactly: in Python 1 equals True and 1.0, but a chart treats them differently."""
         return isinstance(other, Override) and self.model_dump_json() == other.model_dump_json()
 
     @property
     def path(self) -> str:
-        """The file."""
+        """The path of its file."""
         return f"{OVERRIDES_ROOT}/{self.name}.yaml"
 
     @property
     def rank(self) -> tuple[int, str]:
-        """Where it stands among others: the higher wins."""
+        """Its rank among overrides; the higher rank wins."""
         return (self.priority, self.name)
 
 
@@ -243,17 +242,17 @@ def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
         yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
     if "deny" in effects and len(effects) > 1:
         others = " and ".join(name for name in effects if name != "deny")
-        yield f"deny keeps it from running, so {others} can do nothing; keep one of them"
+        yield f"deny prevents it from running, so {others} cannot apply; remove one of them"
     frozen = [name for name in effects if name in _SHAPING]
     if "hold" in effects and frozen:
         yield (
-            f"hold freezes the release as it is, so {' and '.join(frozen)} cannot change it; keep "
-            "one of them"
+            f"hold freezes the release, so {' and '.join(frozen)} cannot change it; remove one "
+            "of them"
         )
 
 
-def merged(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
-    """Return ``target`` with a JSON merge patch (RFC 7386) laid over; null removes."""
+def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
+    """Return ``target`` with a JSON merge patch (RFC 7386) applied; null removes a key."""
     if not isinstance(patch, Mapping):
         return patch
     result = dict(target) if isinstance(target, Mapping) else {}
@@ -261,19 +260,19 @@ def merged(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
         if value is None:
             result.pop(key, None)
         else:
-            result[key] = merged(result.get(key), value)
+            result[key] = merge_patch(result.get(key), value)
     return result
 
 
-def in_order(overrides: Iterable[Override]) -> tuple[Override, ...]:
-    """Return overrides in the order in which they apply: who comes last wins."""
+def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
+    """Return overrides in the order in which they apply; the last one wins."""
     return tuple(sorted(overrides, key=lambda one: one.rank))
 
 
-def still_in_force(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
-    """Return the overrides that no marker says to have ended at the time that they name now."""
+def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
+    """Return the overrides that have not ended at their current expiry."""
     return [
         one
         for name, one in overrides.items()
-        if one.end is None or ended.get(name) != written(one.end)
+        if one.end is None or ended.get(name) != format_time(one.end)
     ]

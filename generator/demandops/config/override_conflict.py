@@ -1,9 +1,8 @@
-"""Ties: may two overrides of equal priority ever meet on one release and say different things?
+"""Conflicts: two overrides of equal priority that may change one release differently.
 
-Answered from the files alone and on the safe side, so that no later demand can run into one. A
-dimension tells two selectors apart only where a release has one value in it: one service, one node.
-A service that applications share has many applications and requesters, a Zenoh bridge many
-connections.
+The check uses the configuration only and rejects doubtful pairs, so that no later demand meets a
+conflict. A field separates two selectors only if a release has a single value for it, like service
+and node. A shared service has many applications and requesters, a Zenoh bridge many connections.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from itertools import combinations
 
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
-from demandops.config.item_reader import ItemReader
-from demandops.config.override import Override, Selector, in_order
+from demandops.config.config_reader import ConfigReader
+from demandops.config.override import Override, Selector, by_rank
 from demandops.config.policy import matches
 
 _MERGED = ("values", "images")
@@ -23,32 +22,33 @@ _SINGLE = ("version", "replicas", "node")
 _FROZEN = (*_SINGLE, *_MERGED)
 
 
-def check_override_conflicts(config: Config, reading: ItemReader) -> None:
-    """Note every pair of overrides whose order decides what runs, and that have none."""
-    for one, other in combinations(in_order(config.overrides.values()), 2):
+def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
+    """Add a fault for each pair of overrides that needs an order but has the same priority."""
+    for one, other in combinations(by_rank(config.overrides.values()), 2):
         if one.priority != other.priority:
             continue
-        touched = contested(one, other)
-        if touched and can_meet(one.select, other.select, config):
-            reading.tell(
+        contested = contested_effects(one, other)
+        if contested and can_meet(one.select, other.select, config):
+            reader.add_fault(
                 other.path,
                 "priority",
-                f"is {other.priority}, as in {one.path}, and both may set {' and '.join(touched)} "
-                "of the same release; give one of them another priority, or select apart",
+                f"is {other.priority}, as in {one.path}, and both may set "
+                f"{' and '.join(contested)} of the same release; give one of them another "
+                "priority, or select different releases",
             )
 
 
-def contested(one: Override, other: Override) -> list[str]:
-    """Return the effects of two overrides for which it matters who comes last."""
-    touched = [
+def contested_effects(one: Override, other: Override) -> list[str]:
+    """Return the effects for which the order of two overrides matters."""
+    contested = [
         name
         for name in _SINGLE
         if None not in (left := getattr(one, name), right := getattr(other, name)) and left != right
     ]
-    if one.values and other.values and not commute(one.values, other.values):
-        touched.append("values")
+    if one.values and other.values and not patches_commute(one.values, other.values):
+        contested.append("values")
     pins = (one.images or {}, other.images or {})
-    touched += [
+    contested += [
         f"images.{name}"
         for name in sorted({*pins[0]} & {*pins[1]})
         if pins[0][name] != pins[1][name]
@@ -56,40 +56,44 @@ def contested(one: Override, other: Override) -> list[str]:
     for holding, shaping in ((one, other), (other, one)):
         effects = [name for name in shaping.effects() if name in _FROZEN]
         if holding.hold and effects:
-            touched += ["hold", *effects]
-    return touched
+            contested += ["hold", *effects]
+    return contested
 
 
-def commute(one: object, other: object) -> bool:
-    """Tell whether two merge patches give the same whichever comes first."""
+def patches_commute(one: object, other: object) -> bool:
+    """Return whether two merge patches have the same result in either order."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return all(commute(one[key], other[key]) for key in one if key in other)
-    return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)  # 1 is not True
+        return all(patches_commute(one[key], other[key]) for key in one if key in other)
+    return json.dumps(one, sort_keys=True) == json.dumps(
+        other, sort_keys=True
+    )  # unlike ==, it tells 1 from True
 
 
 def can_meet(one: Iterable[Selector], other: Iterable[Selector], config: Config) -> bool:
-    """Tell whether some release, now or later, may fit a selector of each."""
+    """Return whether any release, now or later, may match a selector of each."""
     others = list(other)
     return any(_meet(left, right, config) for left in one for right in others)
 
 
 def _meet(one: Selector, other: Selector, config: Config) -> bool:
-    if (one.connections and _of_services(other)) or (other.connections and _of_services(one)):
+    if (one.connections and _selects_services(other)) or (
+        other.connections and _selects_services(one)
+    ):
         return False
-    for name in _telling_apart(one, other, config):
+    for name in _separating_fields(one, other, config):
         left, right = getattr(one, name), getattr(other, name)
-        if left and right and not any(overlap(a, b) for a in left for b in right):
+        if left and right and not any(patterns_overlap(a, b) for a in left for b in right):
             return False
     left, right = one.labels or {}, other.labels or {}
     return all(left[key] == right[key] for key in left if key in right)
 
 
-def _of_services(selector: Selector) -> bool:
+def _selects_services(selector: Selector) -> bool:
     return bool(selector.applications or selector.appdefs or selector.services)
 
 
-def _telling_apart(one: Selector, other: Selector, config: Config) -> Iterator[str]:
-    """Yield the dimensions in which no release that both may fit has several values."""
+def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterator[str]:
+    """Yield the fields for which a release that both may match has a single value."""
     yield from ("services", "nodes")
     if not any(_shared(one, other, appdef) for appdef in config.appdefs.values()):
         yield from ("applications", "appdefs")
@@ -98,7 +102,7 @@ def _telling_apart(one: Selector, other: Selector, config: Config) -> Iterator[s
 
 
 def _shared(one: Selector, other: Selector, appdef: ApplicationDefinition) -> bool:
-    """Tell whether both may fit a service of an appdef that several applications share."""
+    """Return whether both may match a shared service of an appdef."""
     return any(
         service.each is not None
         and all(not s.services or matches(name, s.services) for s in (one, other))
@@ -106,29 +110,31 @@ def _shared(one: Selector, other: Selector, appdef: ApplicationDefinition) -> bo
     )
 
 
-def overlap(one: str, other: str) -> bool:
-    """Tell whether some text fits both patterns (``*`` any characters, ``?`` one)."""
-    reached = {0}  # places in ``other`` that what is read of ``one`` can stand at
+def patterns_overlap(one: str, other: str) -> bool:
+    """Return whether any text matches both patterns (``*`` any characters, ``?`` one)."""
+    reached = {0}  # positions in ``other`` that the part of ``one`` read so far can match
     reached |= _past_stars(other, reached)
     for part in one:
-        if part == "*":  # swallows whatever follows in the other
+        if part == "*":  # it matches everything that follows in the other
             reached = set(range(min(reached), len(other) + 1)) if reached else set()
             continue
         after = set()
-        for place in reached:
-            if place < len(other) and other[place] == "*":
-                after.add(place)
-            elif place < len(other) and (part == other[place] or "?" in (part, other[place])):
-                after.add(place + 1)
+        for position in reached:
+            if position < len(other) and other[position] == "*":
+                after.add(position)
+            elif position < len(other) and (
+                part == other[position] or "?" in (part, other[position])
+            ):
+                after.add(position + 1)
         reached = after | _past_stars(other, after)
     return len(other) in reached
 
 
-def _past_stars(pattern: str, places: set[int]) -> set[int]:
-    """Return the places reached when each star on the way stands for nothing."""
+def _past_stars(pattern: str, positions: set[int]) -> set[int]:
+    """Return the positions reached if each star on the way matches no characters."""
     found = set()
-    for place in places:
-        here = place
+    for position in positions:
+        here = position
         while here < len(pattern) and pattern[here] == "*":
             here += 1
             found.add(here)

@@ -1,7 +1,7 @@
-"""Access domains: who may demand what, where, how much of it and for how long.
+"""Access domains: who may demand what, where, how much and for how long.
 
-A domain is a set of nodes with one namespace and one service account. What a demand asks of a node
-is held to the rules, quotas and leases of the node's domain.
+A domain is a set of nodes with one namespace and one service account. Its rules, quotas and leases
+apply to demands for these nodes.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from demandops.config.file_model import Approval, DnsLabel, FileModel, Frozen
-from demandops.errors import shown
+from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel
+from demandops.errors import quoted
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
 _UNITS_S = (86_400, 3_600, 60, 1)
@@ -24,11 +24,11 @@ def seconds_of(text: str) -> int:
     """Return the seconds of a duration like ``1h30m``.
 
     Raises:
-        ValueError: where it is none.
+        ValueError: if the text is not a duration.
     """
     match = _DURATION.fullmatch(text)
     if not text or match is None:
-        raise ValueError(f"{shown(text)} is no duration; write one like 90s, 10m, 1h30m or 2d")
+        raise ValueError(f"{quoted(text)} is not a duration; write one like 90s, 10m, 1h30m or 2d")
     seconds = sum(int(part) * unit for part, unit in zip(match.groups("0"), _UNITS_S, strict=True))
     if seconds > _YEAR_S:
         raise ValueError(f"'{text}' is longer than a year; choose a shorter duration")
@@ -45,15 +45,15 @@ Patterns = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    """Tell whether a name is one of ``patterns`` (``*`` and ``?``; a bracket is a bracket)."""
+    """Return whether a name matches one of ``patterns``; only ``*`` and ``?`` are special."""
     return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
 
 
-class Rule(Frozen):
-    """What some requesters may demand; a demand needs one rule for each of its requesters.
+class Rule(FrozenModel):
+    """What some requesters may demand; a demand needs a rule for each of its requesters.
 
-    ``nodes`` are those where it runs or where a connection ends, ``brokers`` the nodes of brokers.
-    ``approval`` is the access domain's where it is left out.
+    ``nodes`` are the nodes of applications and the ends of connections, ``brokers`` the nodes of
+    brokers. ``approval`` defaults to the access domain's.
     """
 
     name: DnsLabel
@@ -64,10 +64,10 @@ class Rule(Frozen):
     approval: Approval | None = None
 
 
-class Quotas(Frozen):
-    """How much at most; no limit where one is left out.
+class Quotas(FrozenModel):
+    """The upper limits of an access domain; an absent one means no limit.
 
-    ``demands_per_minute`` counts what one generator receives from a requester.
+    ``demands_per_minute`` limits the demands that one generator receives from a requester.
     """
 
     claims_per_requester: Annotated[int, Field(ge=1)] | None = Field(
@@ -81,13 +81,13 @@ class Quotas(Frozen):
     )
 
 
-class LeasePolicy(Frozen):
-    """How long a demand holds without being renewed.
+class LeasePolicy(FrozenModel):
+    """How long a demand's claims last without a renewal.
 
-    ``default`` is for demands that ask for no lease, for ever where it is left out. It covers the
-    reference's ``DeploymentRequest`` only where ``deployment_requests`` says so: its clients must
-    then send their demands again in time. ``slack`` is how far the recorded end may lag behind the
-    last renewal, and so how late a claim may go.
+    Demands that request no lease get ``default``; without it their claims last forever. With
+    ``deployment_requests`` that includes the reference's ``DeploymentRequest``, whose clients must
+    then repeat their demands in time. The recorded end of a lease may lag behind the last renewal
+    by ``slack``, so a claim may be released that much late.
     """
 
     default: Duration | None = None
@@ -100,7 +100,7 @@ class LeasePolicy(Frozen):
         for name in ("default", "longest"):
             value = getattr(self, name)
             if value is not None and seconds_of(value) < 1:
-                raise ValueError(f"{name} is no time at all; leave it out for no limit")
+                raise ValueError(f"{name} is zero; leave it out for no limit")
         if self.deployment_requests and self.default is None:
             raise ValueError("deploymentRequests needs a default: such a demand names no lease")
         if self.default and self.longest and seconds_of(self.default) > seconds_of(self.longest):
@@ -108,10 +108,10 @@ class LeasePolicy(Frozen):
         return self
 
 
-class AccessDomain(Frozen):
-    """A namespace and service account, the nodes whose releases live in it, and who may use them.
+class AccessDomain(FrozenModel):
+    """A namespace and service account, the nodes whose releases are in it, and who may use them.
 
-    Without ``rules`` everybody may demand everything on its nodes.
+    Without ``rules``, all requesters may demand anything on its nodes.
     """
 
     name: DnsLabel
@@ -129,7 +129,7 @@ class AccessDomain(Frozen):
         names = [rule.name for rule in self.rules]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"rules: two are called '{name}'; refusals name the rule")
+                raise ValueError(f"rules: two have the name '{name}'; give each its own")
         return self
 
 

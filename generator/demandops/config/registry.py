@@ -1,7 +1,6 @@
-"""The registry: where each chart and image comes from, and in which version.
+"""The registry: the source and version of each chart and image.
 
-A chart comes from a folder of the state repo (the default), from an OCI registry or from an HTTP
-chart repository.
+A chart is in a folder of the state repo (the default), an OCI registry or an HTTP chart repository.
 """
 
 from __future__ import annotations
@@ -11,15 +10,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen, Word
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Word
 
 ChartVersion = Annotated[
     str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
 ]
 
 
-class ChartSource(Frozen):
-    """A Helm chart in one version: exactly one of ``folder``, ``oci``, ``http`` says where."""
+class ChartSource(FrozenModel):
+    """One version of a Helm chart; exactly one of ``folder``, ``oci``, ``http`` is its source."""
 
     version: ChartVersion
     folder: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")] | None = (
@@ -38,7 +37,8 @@ class ChartSource(Frozen):
             )
         if re.search(r"://[^/\s]*@", self.http or self.oci or ""):
             raise ValueError(
-                "must hold no user or password; give it to the GitOps controller as a Secret"
+                "must not contain a user or password; give them to the GitOps controller as a "
+                "Secret"
             )
         if self.folder and ".." in self.folder.split("/"):
             raise ValueError("folder must stay inside the state repo; remove '..'")
@@ -46,9 +46,9 @@ class ChartSource(Frozen):
 
 
 class Chart(ChartSource):
-    """A Helm chart: the version that is taken by default, and others by channel.
+    """A Helm chart: its default version, and further versions by channel.
 
-    A demand may ask for a channel by its name, or for one of the versions.
+    A demand may request a channel by name, or one of the versions.
     """
 
     channels: dict[Word, ChartSource] = Field(default_factory=dict)
@@ -66,11 +66,11 @@ class Chart(ChartSource):
         return self
 
     def sources(self) -> tuple[ChartSource, ...]:
-        """Return the chart in all its versions, the default first."""
+        """Return all versions of the chart, the default first."""
         return (self, *self.channels.values())
 
     def at(self, version: str) -> ChartSource | None:
-        """Return the chart of a channel or version, the default where it is empty, or nothing."""
+        """Return a channel or version (empty: the default), or ``None`` if it is unknown."""
         if not version:
             return self
         if version in self.channels:
@@ -78,12 +78,12 @@ class Chart(ChartSource):
         return next((source for source in self.sources() if source.version == version), None)
 
     def versions(self) -> tuple[str, ...]:
-        """Return all that :meth:`at` knows."""
+        """Return the channels and versions that :meth:`at` accepts."""
         return (*self.channels, *(source.version for source in self.sources()))
 
 
-class Image(Frozen):
-    """A container image, pinned by tag, by digest or by both (the digest then decides)."""
+class Image(FrozenModel):
+    """A container image, pinned by tag or digest; if it has both, the digest counts."""
 
     repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")]
     tag: (
@@ -98,11 +98,11 @@ class Image(Frozen):
         return self
 
     def parts(self) -> dict[str, str]:
-        """Return repository, tag and digest as the charts take them (absent ones empty)."""
+        """Return repository, tag and digest as chart values; absent ones are empty."""
         return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
 
     def reference(self) -> str:
-        """Return the image as one reference, by digest where one is given."""
+        """Return the image's reference, by digest if it has one."""
         return (
             f"{self.repository}@{self.digest}" if self.digest else f"{self.repository}:{self.tag}"
         )

@@ -1,4 +1,4 @@
-"""``demandops.yaml``: which GitOps controller reads the state repo, and how it reaches it."""
+"""The settings of a state repo in ``demandops.yaml``: its GitOps controller, source and forge."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.file_model import DnsLabel, FileModel, Frozen
-from demandops.errors import shown
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel
+from demandops.errors import quoted
 
 ROOT_FILE = "demandops.yaml"
 
@@ -17,8 +17,8 @@ GitUrl = Annotated[
 ]
 
 
-class Flux(Frozen):
-    """How the clusters' Flux reaches this repo: the GitRepository of each access domain."""
+class Flux(FrozenModel):
+    """Flux's access to this repo: the GitRepository of each access domain."""
 
     url: GitUrl
     interval: Annotated[
@@ -27,10 +27,10 @@ class Flux(Frozen):
     secret: DnsLabel | None = None
 
 
-class ArgoCd(Frozen):
-    """How the clusters' Argo CD reaches this repo, and the namespace it runs in.
+class ArgoCd(FrozenModel):
+    """Argo CD's access to this repo, and its namespace.
 
-    Credentials are Argo CD's own: a Secret of that namespace that names the URL.
+    Argo CD has its own credentials, in a Secret of that namespace that names the URL.
     """
 
     url: GitUrl
@@ -45,8 +45,8 @@ _WEB_URL = re.compile(
 def _web_url(text: str) -> str:
     if not _WEB_URL.fullmatch(text):
         raise ValueError(
-            f"{shown(text)} is no address that a token is sent to; write https://HOST/PATH, "
-            "without a user (plain http only for this machine)"
+            f"{quoted(text)} is not an address that a token may be sent to; write "
+            "https://HOST/PATH, without a user (plain http only for this machine)"
         )
     return text
 
@@ -54,11 +54,12 @@ def _web_url(text: str) -> str:
 WebUrl = Annotated[str, AfterValidator(_web_url)]
 
 
-class Proposals(Frozen):
-    """Where demands that need approval are proposed.
+class Proposals(FrozenModel):
+    """The forge on which demands that need approval are proposed.
 
-    ``none`` pushes the branch and asks nobody. GitLab opens a merge request by push options; GitHub
-    and Gitea (Forgejo) by their API, whose address follows from ``url`` unless ``api`` says it.
+    With ``none`` the branch is pushed and no pull request opened. GitLab opens a merge request by
+    push options. GitHub and Gitea (Forgejo) open one by their API, whose address follows from
+    ``url`` unless ``api`` gives it.
     """
 
     forge: Literal["none", "gitlab", "github", "gitea"] = "none"
@@ -84,15 +85,15 @@ class Proposals(Frozen):
 
     @property
     def project(self) -> tuple[str, ...]:
-        """Return owner and name of the project, the last two parts of its address."""
+        """The project's owner and name, the last two parts of its address."""
         path = (self.url or "").partition("://")[2].partition("/")[2]
         return tuple(path.strip("/").removesuffix(".git").split("/")[-2:]) if path else ()
 
 
 class RepoSettings(FileModel):
-    """``demandops.yaml``: what the whole state repo has in common.
+    """``demandops.yaml``: the settings of the whole state repo.
 
-    The section of the controller that is not chosen may stand there too, and waits.
+    It may also contain the section of the other controller, which is then not used.
     """
 
     kind: Literal["StateRepository"]

@@ -1,4 +1,5 @@
-"""Stage 2, what is asked: a request, from whichever wire, as one frozen value, and what it claims.
+"""Stage 2, the demand: a request as one frozen value, and the claims that it makes.
 
-Knows the configuration (to refuse what cannot be run) and nothing of what is booked already.
+Requests come from ROS actions and YAML files. This stage knows the configuration, to refuse what
+cannot run. It does not know the ledger.
 """

@@ -1,7 +1,6 @@
-"""Admission: can what is asked be run at all, by this configuration?
+"""Admission: the check that the configuration can run what a request demands.
 
-Checks a request against appdefs, inventory, brokers and access domains. What is booked already
-does not matter here; that is the ledger's.
+It uses appdefs, inventory, brokers and access domains, but not the ledger.
 """
 
 from __future__ import annotations
@@ -18,24 +17,24 @@ from demandops.demand.demand_request import (
     ConnectionType,
     DemandRequest,
 )
-from demandops.errors import Fault, fault, near, shown
+from demandops.errors import Fault, fault, quoted, suggestion
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
-    """Yield every reason why ``request`` cannot be honoured, whatever is booked.
+    """Yield every reason why ``request`` cannot be fulfilled, whatever the ledger contains.
 
-    A shutdown is not held to the inventory: what a removed node still holds can be released.
+    A shutdown may name nodes that are not in the inventory, so that their claims can be released.
     """
     yield from shape.faults(request)
-    joining = request.operation.asks
+    claiming = request.operation.adds_claims
     for index, app in enumerate(request.applications):
-        yield from _application(f"applications[{index}]", app, config, joining)
+        yield from _application(f"applications[{index}]", app, config, claiming)
     for index, connection in enumerate(request.connections):
-        yield from _connection(f"connections[{index}]", connection, config, joining)
+        yield from _connection(f"connections[{index}]", connection, config, claiming)
 
 
 def _application(
-    where: str, app: ApplicationDemand, config: Config, joining: bool
+    where: str, app: ApplicationDemand, config: Config, claiming: bool
 ) -> Iterator[Fault]:
     appdef = config.appdefs.get(app.appdef)
     if appdef is None:
@@ -45,21 +44,21 @@ def _application(
             if role not in appdef.inputs and topics:
                 yield fault(
                     f"{where}.inputs.{role}",
-                    f"{appdef.name} takes no such input" + near(role, appdef.inputs),
+                    f"{appdef.name} has no such input" + suggestion(role, appdef.inputs),
                 )
         for name in app.parameters:
             if name not in appdef.parameters:
                 yield fault(
                     f"{where}.parameters.{name}",
-                    f"{appdef.name} has no such parameter" + near(name, appdef.parameters),
+                    f"{appdef.name} has no such parameter" + suggestion(name, appdef.parameters),
                 )
         if app.version and app.version not in config.versions_of(appdef.name):
             yield fault(
                 f"{where}.version",
-                f"{shown(app.version)} is no version or channel of {appdef.name} in "
-                "registry/charts.yaml" + near(app.version, config.versions_of(appdef.name)),
+                f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
+                "registry/charts.yaml" + suggestion(app.version, config.versions_of(appdef.name)),
             )
-    if not joining:
+    if not claiming:
         return
     yield from _node(f"{where}.node", app.node, config)
     for role, topics in app.inputs.items():
@@ -72,22 +71,22 @@ def _application(
         )
 
 
-def _unknown_application(where: str, asked: str, config: Config) -> Fault:
-    if asked.startswith("#"):  # the number of a DeploymentRequest
+def _unknown_application(where: str, name: str, config: Config) -> Fault:
+    if name.startswith("#"):  # the number of a DeploymentRequest
         known = "; known: " + ", ".join(
-            f"{one.deployment_request.type} ({one.name})"
-            for one in config.appdefs.values()
-            if one.deployment_request
+            f"{appdef.deployment_request.type} ({appdef.name})"
+            for appdef in config.appdefs.values()
+            if appdef.deployment_request
         )
     else:
-        known = near(asked, config.appdefs)
-    named = asked.removeprefix("#") if asked.startswith("#") else shown(asked)
-    message = f"{named} names no application definition{known}"
+        known = suggestion(name, config.appdefs)
+    shown = name.removeprefix("#") if name.startswith("#") else quoted(name)
+    message = f"{shown} is not a known application type{known}"
     return fault(f"{where}.appdef", message, code="unknown-application")
 
 
 def _connection(
-    where: str, connection: ConnectionDemand, config: Config, joining: bool
+    where: str, connection: ConnectionDemand, config: Config, claiming: bool
 ) -> Iterator[Fault]:
     types = {known.value: known for known in ConnectionType}
     kind = types.get(connection.type)
@@ -95,10 +94,10 @@ def _connection(
         known = ", ".join(f"{n} ({item.name})" for n, item in types.items() if n >= 0)
         yield fault(
             f"{where}.type",
-            f"{connection.type} is no connection type; known: {known}",
+            f"{connection.type} is not a connection type; known: {known}",
             code="unknown-connection-type",
         )
-    if not joining:
+    if not claiming:
         return
     yield from _node(f"{where}.source", connection.source, config)
     yield from _node(f"{where}.target", connection.target, config)
@@ -106,31 +105,31 @@ def _connection(
         return
     if kind is ConnectionType.AUTO:
         ends_known = connection.source in config.nodes and connection.target in config.nodes
-        if ends_known and transport_choice.choice(connection, config) is kind:
-            yield _within(where, transport_choice.none_fits(connection, config))
+        if ends_known and transport_choice.choose_type(connection, config) is kind:
+            yield _within(where, transport_choice.no_type_fault(connection, config))
         return
-    for found in transport_choice.obstacles(kind, connection, config):
+    for found in transport_choice.type_faults(kind, connection, config):
         yield _within(where, found)
 
 
 def _within(where: str, found: Fault) -> Fault:
-    """Return a fault of a part of the request, told to be at ``where``."""
+    """Return a fault of one part of the request, with its field below ``where``."""
     return replace(found, field=f"{where}.{found.field}")
 
 
 def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
     if not node:
-        return  # told by the request's own checks
+        return  # the request's own checks report it
     if node not in config.nodes:
         yield fault(
             where,
-            f"{shown(node)} is not in inventory/nodes.yaml" + near(node, config.nodes),
+            f"{quoted(node)} is not in inventory/nodes.yaml" + suggestion(node, config.nodes),
             code="unknown-node",
         )
     elif node not in config.domain_of:
         yield fault(
             where,
-            f"{shown(node)} is in no access domain; a platform engineer adds it to "
+            f"{quoted(node)} is not in any access domain; a platform engineer adds it to "
             "policy/access-domains.yaml",
             code="no-access-domain",
         )

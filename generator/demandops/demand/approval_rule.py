@@ -1,7 +1,7 @@
-"""Approval: does a person have to agree before these claims are booked?
+"""The approval rules: which claims need a person's approval before they are booked.
 
-Asked by an access domain, by the rules of one, or by an application definition. Knows nothing of
-how a person is asked.
+An access domain, one of its rules or an application definition can require it. How a person
+approves is not known here.
 """
 
 from __future__ import annotations
@@ -14,32 +14,35 @@ from demandops.config.policy import AccessDomain, matches
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim, Subject, SubjectKind
 from demandops.demand.demand_request import ConnectionType, DemandRequest
 from demandops.demand.lease import Term
-from demandops.demand.permission import asked_at_ends, missing, places
+from demandops.demand.permission import (
+    Access,
+    access_of_application,
+    access_of_connection,
+    first_uncovered,
+)
 
-Asked = Iterable[tuple[str, str]]
 
-
-def asked_by(
+def approval_reasons(
     request: DemandRequest, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
 ) -> tuple[str, ...]:
-    """Return what asks for approval of a request, each once: ``access domain 'edge'``.
+    """Return what requires approval of a request, each once: ``access domain 'edge'``.
 
-    What renews or gives up needs none, nor does what overrides keep beside it.
+    Renewals, releases and the claims of overrides need no approval.
 
     Args:
         request: an admitted request.
-        changes: each claim that it changes, before and after.
+        changes: each claim that it changes, before and after the request.
         config: the access domains and application definitions.
     """
-    if not request.operation.asks:
+    if not request.operation.adds_claims:
         return ()
     listed = set(subjects_of(request))
-    asked = (
+    changed = (
         after
         for before, after in changes
-        if after and after.subject in listed and _says_more(before, after)
+        if after and after.subject in listed and _is_more_than_renewed(before, after)
     )
-    return tuple(dict.fromkeys(who for claim in asked for who in _asked_by(claim, config)))
+    return tuple(dict.fromkeys(reason for claim in changed for reason in _reasons(claim, config)))
 
 
 def subjects_of(request: DemandRequest) -> list[Subject]:
@@ -50,39 +53,36 @@ def subjects_of(request: DemandRequest) -> list[Subject]:
     ]
 
 
-def _says_more(before: Claim | None, after: Claim) -> bool:
-    """Tell whether a claim is new, or differs in more than how long it holds."""
+def _is_more_than_renewed(before: Claim | None, after: Claim) -> bool:
+    """Return whether a claim is new or differs in more than its lease."""
     return before is None or replace(after, lease=before.lease) != before
 
 
-def _asked_by(claim: Claim, config: Config) -> Iterator[str]:
+def _reasons(claim: Claim, config: Config) -> Iterator[str]:
     if isinstance(claim, ApplicationClaim):
         appdef = config.appdefs.get(claim.appdef)
         if appdef is not None and appdef.approval == "required":
             yield f"application definition '{appdef.name}'"
-    for domain, asked in _asks(claim, config):
+    for domain, access in _access(claim, config):
         for requester in claim.requesters:
-            yield from _of_domain(domain, requester, list(asked))
+            yield from _domain_reasons(domain, requester, access)
 
 
-def _asks(claim: Claim, config: Config) -> Iterator[tuple[AccessDomain, Asked]]:
-    """Yield what a claim asks of each access domain that it touches."""
+def _access(claim: Claim, config: Config) -> Iterator[tuple[AccessDomain, Access]]:
+    """Yield the access that a claim needs to each access domain."""
     if isinstance(claim, ConnectionClaim):
         mqtt = claim.type is ConnectionType.MQTT
-        yield from asked_at_ends(claim.source, claim.target, claim.broker, mqtt, config)
-        return
-    for node in places(claim, config):
-        domain = config.domain_of.get(node)
-        if domain is not None:
-            yield domain, (("applications", claim.appdef), ("nodes", node))
+        yield from access_of_connection(claim.source, claim.target, claim.broker, mqtt, config)
+    else:
+        yield from access_of_application(claim, config)
 
 
-def _of_domain(domain: AccessDomain, requester: str, asked: Asked) -> Iterator[str]:
-    """Yield what asks for approval, unless one rule lets the requester have it without."""
+def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Iterator[str]:
+    """Yield what requires approval, unless one rule grants the access without it."""
     rules = [
         rule
         for rule in domain.rules
-        if matches(requester, rule.requesters) and missing(rule, asked) is None
+        if matches(requester, rule.requesters) and first_uncovered(rule, access) is None
     ]
     if any((rule.approval or domain.approval) == "none" for rule in rules):
         return
@@ -93,14 +93,14 @@ def _of_domain(domain: AccessDomain, requester: str, asked: Asked) -> Iterator[s
         yield f"access domain '{domain.name}'"
 
 
-def proposed(request: DemandRequest) -> DemandRequest:
-    """Return a request whose leases count from the approval, not from when it was received."""
+def with_leases_from_approval(request: DemandRequest) -> DemandRequest:
+    """Return the request with leases that start at its approval."""
 
-    def waiting(term: Term | None) -> Term | None:
+    def from_approval(term: Term | None) -> Term | None:
         return replace(term, on_approval=True) if term else None
 
     return replace(
         request,
-        applications=tuple(replace(a, term=waiting(a.term)) for a in request.applications),
-        connections=tuple(replace(c, term=waiting(c.term)) for c in request.connections),
+        applications=tuple(replace(a, term=from_approval(a.term)) for a in request.applications),
+        connections=tuple(replace(c, term=from_approval(c.term)) for c in request.connections),
     )

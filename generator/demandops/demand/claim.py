@@ -1,4 +1,4 @@
-"""Claims: one demand's hold on one subject. Claims are all that the ledger stores."""
+"""Claims: one demand's hold on one subject. The ledger stores claims only."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demandops.demand.route import Route
 
 
 class SubjectKind(Enum):
-    """What a claim can hold; the values are the ledger's folder names."""
+    """The kinds of subjects; the values are the ledger's folder names."""
 
     APPLICATION = "applications"
     CONNECTION = "connections"
@@ -36,14 +36,14 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class ClaimKey:
-    """What a claim is found by; one file of the ledger."""
+    """The identity of a claim; each is one file of the ledger."""
 
     subject: Subject
     demand: str
 
 
 @dataclass(frozen=True, slots=True)
-class ApplicationClaim:  # noqa: PLW1641 - with mappings in them claims have no hash
+class ApplicationClaim:  # noqa: PLW1641 - claims contain mappings, so they have no hash
     """One demand's hold on an application. ``inputs`` are sorted by topic within each role."""
 
     application: str
@@ -59,7 +59,7 @@ class ApplicationClaim:  # noqa: PLW1641 - with mappings in them claims have no 
     lease: Lease | None = None
 
     def __eq__(self, other: object) -> bool:
-        """Compare exactly: to Python 1 is True and 1.0, to a chart they are three values."""
+        """Compare exactly: in Python 1 equals True and 1.0, but a chart treats them differently."""
         if not isinstance(other, ApplicationClaim):
             return NotImplemented
         same = all(getattr(self, one.name) == getattr(other, one.name) for one in fields(self))
@@ -67,12 +67,12 @@ class ApplicationClaim:  # noqa: PLW1641 - with mappings in them claims have no 
 
     @property
     def subject(self) -> Subject:
-        """The application that is held."""
+        """The claimed application."""
         return Subject(SubjectKind.APPLICATION, self.application)
 
     @property
     def key(self) -> ClaimKey:
-        """Where in the ledger the claim stands."""
+        """The key of the claim in the ledger."""
         return ClaimKey(self.subject, self.demand)
 
     def all_inputs(self) -> Iterable[tuple[str, InputTopic]]:
@@ -105,30 +105,28 @@ class ConnectionClaim:
 
     @property
     def subject(self) -> Subject:
-        """The connection that is held."""
+        """The claimed connection."""
         return Subject(SubjectKind.CONNECTION, self.connection)
 
     @property
     def key(self) -> ClaimKey:
-        """Where in the ledger the claim stands."""
+        """The key of the claim in the ledger."""
         return ClaimKey(self.subject, self.demand)
 
 
 Claim = ApplicationClaim | ConnectionClaim
 
-KEPT = OVERRIDE_PREFIX
 
-
-def is_kept(claim: Claim) -> bool:
-    """Tell whether an override holds a claim, rather than a demand."""
-    return claim.demand.startswith(KEPT)
+def is_override_claim(claim: Claim) -> bool:
+    """Return whether an override with the effect ``keep`` made the claim."""
+    return claim.demand.startswith(OVERRIDE_PREFIX)
 
 
 def demand_id(request: str, requesters: Iterable[str]) -> str:
-    """Return the demand id of a request that carries none.
+    """Return the demand id of a request that has none, like the reference's.
 
-    The reference's message has no demand id, so it is made from the request id and the sorted,
-    de-duplicated requesters: the same request sent again is the same demand.
+    It is a digest of the request id and the set of requesters, so a repeated request is the same
+    demand.
     """
     exact = json.dumps([request, sorted(set(requesters))], ensure_ascii=True)
     return hashlib.sha256(exact.encode()).hexdigest()[:20]

@@ -1,14 +1,14 @@
-"""Decommissioning as plain data: a node or a requester that leaves for good.
+"""The request to decommission a node or a requester, as plain data.
 
-The operator's request to the generator, no goal of a requester: neither action carries it, nor
-does a file of demands. It is plain data all the same, so that the outbox keeps it like any demand.
+Only the operator makes it; neither an action nor a demand file contains it. It is plain data so
+that the journal can store it like a demand.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from demandops.demand.demand_request import DemandRequest, Leaving, Operation
+from demandops.demand.demand_request import DecommissionTarget, DemandRequest, Operation
 from demandops.errors import Fault, Refused, fault
 from demandops.identifiers import id_problem
 
@@ -20,22 +20,22 @@ def as_data(name: str, kinds: tuple[str, ...], by: str) -> dict[str, Any]:
 
     Args:
         name: the node or the requester.
-        kinds: as what it leaves, ``node``, ``requester`` or both.
-        by: who has it done, ``name <email>``; empty where that is not known.
+        kinds: ``node``, ``requester`` or both.
+        by: the operator, ``name <email>``; empty if unknown.
     """
     return {"kind": KIND, "name": name, "as": list(kinds), "by": by}
 
 
 def is_decommission(data: object) -> bool:
-    """Tell whether plain data is a request to decommission something."""
+    """Return whether plain data is a request to decommission."""
     return isinstance(data, dict) and data.get("kind") == KIND
 
 
 def parse(data: dict[str, Any]) -> DemandRequest:
-    """Return the request.
+    """Return the request of plain data.
 
     Raises:
-        Refused: where the name is none.
+        Refused: if the name is invalid.
     """
     name = data.get("name")
     problem = id_problem(name) if isinstance(name, str) else "must be text"
@@ -43,5 +43,5 @@ def parse(data: dict[str, Any]) -> DemandRequest:
     if faults:
         raise Refused(faults)
     kinds = frozenset(kind for kind in data.get("as", ()) if kind in ("node", "requester"))
-    leaving = Leaving(str(name), kinds, str(data.get("by") or ""))
-    return DemandRequest(id=str(name), operation=Operation.DECOMMISSION, leaving=leaving)
+    target = DecommissionTarget(str(name), kinds, str(data.get("by") or ""))
+    return DemandRequest(id=str(name), operation=Operation.DECOMMISSION, decommission_target=target)

@@ -1,7 +1,7 @@
-"""Our own demand as plain data, parsed into a :class:`DemandRequest`.
+"""The goal of our own ``Demand`` action as plain data, parsed into a :class:`DemandRequest`.
 
-The action ``demandops_interfaces/action/Demand`` and YAML of the kind ``Demand`` come through
-:func:`parse`. It names its demand, carries any application type and replaces what it held before.
+:func:`parse` takes goals of ``demandops_interfaces/action/Demand`` and YAML of the kind ``Demand``.
+Such a goal names its demand, may list any type of application, and replaces the demand's claims.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PlainValidator
 
 from demandops import strict_yaml
-from demandops.config.file_model import Frozen
+from demandops.config.base_model import FrozenModel
 from demandops.config.policy import seconds_of
 from demandops.demand.demand_request import (
     ApplicationDemand,
@@ -25,10 +25,10 @@ from demandops.demand.demand_request import (
     InputTopic,
     Operation,
 )
-from demandops.demand.goal_form import valid_part
+from demandops.demand.goal_validation import parse_valid_part
 from demandops.demand.route import RouteOptions
-from demandops.errors import Fault, fault, shown
-from demandops.identifiers import absolute
+from demandops.errors import Fault, fault, quoted
+from demandops.identifiers import absolute_topic
 from demandops.settings import API_VERSION
 
 TypeName = Literal["auto", "mqtt", "zenoh", "ros"]
@@ -36,20 +36,20 @@ TypeName = Literal["auto", "mqtt", "zenoh", "ros"]
 _TYPES = {known.name.lower(): known.value for known in ConnectionType}
 
 
-class GoalTopic(Frozen):
-    """A topic that an application takes in, and the node that publishes it."""
+class GoalTopic(FrozenModel):
+    """An input topic of an application, and the node that publishes it."""
 
     topic: str = ""
     source: str = ""
     type: str = ""
 
 
-class GoalApplication(Frozen):
+class GoalApplication(FrozenModel):
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
-    ``parameters`` are values, ``parameters_json`` the same as JSON text. ``version`` is a version
-    or a channel of the registry. ``connect`` says by what inputs of other nodes come that no
-    connection of the demand carries.
+    ``parameters`` maps names to values, ``parameters_json`` to values as JSON text. ``version`` is
+    a version or a channel of the registry. ``connect`` is the connection type for inputs from other
+    nodes that no connection of the demand carries.
     """
 
     id: str = ""
@@ -63,13 +63,13 @@ class GoalApplication(Frozen):
 
 
 class GoalRoute(RouteOptions):
-    """A topic of a connection; it has the same name at both ends where ``target`` is left out."""
+    """A topic of a connection; without ``target`` it has the same name at both ends."""
 
     source: str = ""
     target: str = ""
 
 
-class GoalConnection(Frozen):
+class GoalConnection(FrozenModel):
     """One connection and the topics that it carries."""
 
     id: str = ""
@@ -84,15 +84,15 @@ def _lease_form(value: object) -> object:
     if value is None or (isinstance(value, str | int) and not isinstance(value, bool)):
         return value
     raise ValueError(
-        f"must be a duration like 10m, or whole seconds, not {strict_yaml.brief(value)}"
+        f"must be a duration like 10m, or whole seconds, not {strict_yaml.short_repr(value)}"
     )
 
 
 Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
-"""One validator for all that it may be: pydantic names each member of a union a field."""
+"""A duration or seconds; for a union, pydantic would report one fault for each member."""
 
 
-class DemandGoal(Frozen):
+class DemandGoal(FrozenModel):
     """A demand. ``lease`` is a duration like ``10m``, or whole seconds."""
 
     apiVersion: Literal["demandops/v1"] = API_VERSION
@@ -108,12 +108,12 @@ class DemandGoal(Frozen):
 
 
 _DEEPEST = 50
-"""Levels of a parameter's value: a claim's file is read to a depth of 100."""
+"""The deepest nesting of a parameter's value; a claim's file may have 100 levels."""
 _LISTS_OF_TEXT = ("requesters",)
 
 
 def is_demand_goal(data: dict[str, Any]) -> bool:
-    """Tell whether plain data is meant as a goal of our own action."""
+    """Return whether plain data is a goal of our own action."""
     return "kind" in data or "apiVersion" in data
 
 
@@ -121,9 +121,9 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
     """Parse a goal of our own action.
 
     Returns:
-        The request and the faults of its form; a request with faults must not be booked.
+        The request and the faults of its form. A request with faults must not be booked.
     """
-    goal, faults = valid_part(data, DemandGoal, _LISTS_OF_TEXT)
+    goal, faults = parse_valid_part(data, DemandGoal, _LISTS_OF_TEXT)
     requesters = tuple(goal.requesters)
     request = DemandRequest(
         id=goal.request or goal.demand,
@@ -134,14 +134,14 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         ),
         connections=tuple(_connection(connection, requesters) for connection in goal.connections),
         demand=goal.demand,
-        named_by=requesters,
+        own_requesters=requesters,
         lease_s=_lease(goal.lease, faults),
     )
     return request, faults
 
 
 def form_faults(data: dict[str, Any]) -> list[Fault]:
-    """Return what of ``data`` has not the form of a goal."""
+    """Return the faults of the form of ``data``."""
     return parse(data)[1]
 
 
@@ -163,16 +163,16 @@ def _application(
 ) -> ApplicationDemand:
     parameters: dict[str, Any] = {}
     for name, value in app.parameters.items():
-        parameters[name] = _usable(f"{where}.parameters.{name}", value, faults)
+        parameters[name] = _storable(f"{where}.parameters.{name}", value, faults)
     for name, text in app.parameters_json.items():
         place = f"{where}.parameters_json.{name}"
         if name in parameters:
             faults.append(fault(place, "is given in parameters already; give it once"))
             continue
         try:
-            parameters[name] = _usable(place, json.loads(text), faults)
+            parameters[name] = _storable(place, json.loads(text), faults)
         except (ValueError, RecursionError):
-            message = 'is no JSON; a text needs quotes of its own, as in "\\"fast\\""'
+            message = 'is not JSON; text needs its own quotes, as in "\\"fast\\""'
             faults.append(fault(place, message))
     return ApplicationDemand(
         id=app.id,
@@ -181,7 +181,7 @@ def _application(
         requesters=requesters,
         inputs=MappingProxyType(
             {
-                role: tuple(InputTopic(absolute(t.topic), t.source, t.type) for t in topics)
+                role: tuple(InputTopic(absolute_topic(t.topic), t.source, t.type) for t in topics)
                 for role, topics in app.inputs.items()
                 if topics
             }
@@ -192,24 +192,24 @@ def _application(
     )
 
 
-def _usable(where: str, value: object, faults: list[Fault]) -> object:
-    """Return a parameter's value; what of it no ledger could keep is noted, and left out."""
-    problem = _unkeepable(value, 0)
+def _storable(where: str, value: object, faults: list[Fault]) -> object:
+    """Return a parameter's value; add a fault and return ``None`` if the ledger cannot store it."""
+    problem = _value_problem(value, 0)
     if problem:
         faults.append(fault(where, problem))
     return None if problem else value
 
 
-def _unkeepable(value: object, depth: int) -> str:
+def _value_problem(value: object, depth: int) -> str:
     if depth > _DEEPEST:
         return f"is nested deeper than {_DEEPEST} levels; make it flatter"
     if isinstance(value, float) and not math.isfinite(value):
-        return f"holds {value}, which is no finite number; give one, or leave it out"
+        return f"holds {value}, which is not a finite number; give one, or leave it out"
     if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
-        return f"holds {shown(value)}, which is no Unicode text; write whole characters"
+        return f"holds {quoted(value)}, which is not Unicode text; write whole characters"
     parts = [*value, *value.values()] if isinstance(value, dict) else value
     nested = parts if isinstance(parts, list) else ()
-    return next(filter(None, (_unkeepable(part, depth + 1) for part in nested)), "")
+    return next(filter(None, (_value_problem(part, depth + 1) for part in nested)), "")
 
 
 def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> ConnectionDemand:
@@ -219,7 +219,7 @@ def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> Conn
         source=connection.source,
         target=connection.target,
         topics=tuple(
-            route.route(absolute(route.source), absolute(route.target or route.source))
+            route.route(absolute_topic(route.source), absolute_topic(route.target or route.source))
             for route in connection.topics
         ),
         broker=connection.broker,
@@ -237,10 +237,10 @@ _NAMES = (
 _OF_CONNECTION = re.compile(r"connections\[(\d+)\]")
 
 
-def field(path: str, request: DemandRequest) -> str:
-    """Return the goal's name for a field of its request; of a derived connection, its input."""
+def goal_field(path: str, request: DemandRequest) -> str:
+    """Return the goal's field for a request's field; for a derived connection, its input's."""
     for pattern, replacement in _NAMES:
         if pattern.match(path):
             return pattern.sub(replacement, path)
-    of = _OF_CONNECTION.match(path)
-    return (request.connections[int(of[1])].because if of else "") or path
+    match = _OF_CONNECTION.match(path)
+    return (request.connections[int(match[1])].for_input if match else "") or path

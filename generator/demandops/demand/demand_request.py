@@ -1,8 +1,7 @@
-"""One demand request: applications and connections wanted, or no longer wanted.
+"""Demand requests: one request for applications and connections, or to release them.
 
-The same value comes from the ROS 2 action and from YAML
-(:mod:`demandops.demand.deployment_request_goal`). It is structurally sound by
-construction; :func:`faults` says what its contents break, all together.
+Goals of ROS actions and YAML files are parsed into the same value. :func:`faults` yields all faults
+of its contents.
 """
 
 from __future__ import annotations
@@ -19,17 +18,16 @@ from demandops.errors import Fault, fault
 from demandops.identifiers import id_problem, topic_problem
 
 OVERRIDE_PREFIX = "override:"
-"""What the demand id of an override's own claim starts with, and no other demand's."""
+"""The prefix of the demand ids of claims that overrides make; no other demand may use it."""
 
 
 class Operation(Enum):
     """What a request does to the ledger.
 
-    The reference's goal joins and shuts down, adding to and taking from what its requesters hold.
-    Our own names its demand and puts (replaces), releases or renews it; ``EXPIRE`` is the
-    generator's, for a demand whose lease ran out, ``DECOMMISSION`` its operator's, for a node or a
-    requester that leaves for good, ``ROLLBACK`` a person's, to go back to the books of an earlier
-    commit.
+    The reference's goal joins or shuts down: it adds to its requesters' claims or removes from
+    them. Our own goal names its demand and puts (replaces), releases or renews it. The generator
+    makes ``EXPIRE`` when a lease ends. An operator makes ``DECOMMISSION`` to remove a node or a
+    requester, and ``ROLLBACK`` to restore the ledger of an earlier commit.
     """
 
     JOIN = "join"
@@ -42,21 +40,21 @@ class Operation(Enum):
     ROLLBACK = "rollback"
 
     @property
-    def asks(self) -> bool:
-        """Tell whether something is asked for, rather than given up or kept."""
+    def adds_claims(self) -> bool:
+        """Whether the operation can add claims."""
         return self in (Operation.JOIN, Operation.PUT)
 
     @property
     def is_reference(self) -> bool:
-        """Tell whether it is of the reference's action, which names no demand."""
+        """Whether it is an operation of the reference's action, which names no demand."""
         return self in (Operation.JOIN, Operation.SHUTDOWN)
 
 
 class ConnectionType(Enum):
-    """How a connection carries its topics; the values are the wire's numbers.
+    """The type of a connection; the values are the numbers in ``DeploymentRequest``.
 
-    ``AUTO`` is asked for only, and is no number of the wire: a claim holds what was chosen
-    (:func:`demandops.demand.transport_choice.resolved`).
+    Only requests contain ``AUTO``, which has no number there. Claims have the chosen type
+    (:func:`demandops.demand.transport_choice.with_chosen_types`).
     """
 
     AUTO = -1
@@ -67,7 +65,7 @@ class ConnectionType(Enum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class InputTopic:
-    """A topic that an application takes in, and the node that publishes it."""
+    """An input topic of an application, and the node that publishes it."""
 
     topic: str
     source: str
@@ -76,7 +74,7 @@ class InputTopic:
 
 @dataclass(frozen=True, slots=True)
 class ApplicationDemand:
-    """One application of a request. ``appdef`` is empty where the wire's number is unknown."""
+    """One application of a request; ``appdef`` is ``#<number>`` if the goal's number is unknown."""
 
     id: str
     appdef: str
@@ -86,7 +84,7 @@ class ApplicationDemand:
     parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     version: str = ""
     connect: int | None = None
-    """The connection type for inputs of other nodes that the request leaves out, if any."""
+    """The type of the connections to add for inputs from other nodes, if any."""
     term: Term | None = None
 
 
@@ -94,8 +92,9 @@ class ApplicationDemand:
 class ConnectionDemand:
     """One connection of a request.
 
-    ``type`` is a value of :class:`ConnectionType` or an unknown number of the wire; ``broker`` is
-    empty where it is left open. ``because`` is the field of the input that a derived one is for.
+    ``type`` is a value of :class:`ConnectionType` or an unknown number of the goal. ``broker`` is
+    empty if the program chooses it. ``for_input`` is the field of the input for which the program
+    added the connection.
     """
 
     id: str
@@ -106,12 +105,12 @@ class ConnectionDemand:
     broker: str
     requesters: tuple[str, ...]
     term: Term | None = None
-    because: str = ""
+    for_input: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Leaving:
-    """What is decommissioned: a name, as what (``node``, ``requester``), and who has it done."""
+class DecommissionTarget:
+    """The name to decommission, its kinds (``node``, ``requester``), and the operator."""
 
     name: str
     kinds: frozenset[str]
@@ -120,12 +119,12 @@ class Leaving:
 
 @dataclass(frozen=True, slots=True)
 class DemandRequest:
-    """A whole request: booked as a whole or refused as a whole.
+    """A whole request, which is booked or refused as a whole.
 
-    ``demand`` is the demand's id where the request names it; the reference's does not, and there
-    it is made for each subject (:func:`demandops.demand.claim.demand_id`). ``named_by`` says in
-    whose name a request speaks that lists no subject. ``lease_s`` is the lease that it asks for, in
-    seconds.
+    ``demand`` is the demand's id. The reference's requests carry none; there
+    :func:`demandops.demand.claim.demand_id` makes one for each subject. ``own_requesters`` are the
+    requesters of the request itself, also when it lists no subject. ``lease_s`` is the requested
+    lease in seconds.
     """
 
     id: str
@@ -133,55 +132,57 @@ class DemandRequest:
     applications: tuple[ApplicationDemand, ...] = ()
     connections: tuple[ConnectionDemand, ...] = ()
     demand: str = ""
-    named_by: tuple[str, ...] = ()
+    own_requesters: tuple[str, ...] = ()
     lease_s: int | None = None
-    leaving: Leaving | None = None
+    decommission_target: DecommissionTarget | None = None
 
     def requesters(self) -> tuple[str, ...]:
-        """Return everybody in whose name something is asked, in the order listed, each once."""
+        """Return all requesters, each once, in the order of the request."""
         subjects: tuple[ApplicationDemand | ConnectionDemand, ...]
         subjects = (*self.applications, *self.connections)
         listed = (who for subject in subjects for who in subject.requesters)
-        return tuple(dict.fromkeys((*self.named_by, *listed)))
+        return tuple(dict.fromkeys((*self.own_requesters, *listed)))
 
 
 def faults(request: DemandRequest) -> Iterator[Fault]:
-    """Yield every fault of a request that shows without looking at configuration or ledger."""
-    joining = request.operation.asks
-    if request.id and request.id != request.demand:  # which it is where none is given
+    """Yield every fault of a request that needs neither configuration nor ledger."""
+    claiming = request.operation.adds_claims
+    if request.id and request.id != request.demand:  # without an id, it is the demand's
         yield from _id("id", request.id)
-    yield from _named(request)
-    listing = request.operation not in (Operation.RELEASE, Operation.RENEW)
-    if listing and not (request.applications or request.connections):
+    yield from _own_fields(request)
+    needs_subjects = request.operation not in (Operation.RELEASE, Operation.RENEW)
+    if needs_subjects and not (request.applications or request.connections):
         yield fault(
             "id" if request.operation.is_reference else "applications",
-            "the request lists no application and no connection; list what it is for",
+            "the request lists no application and no connection; list at least one",
             code="empty",
         )
     for index, app in enumerate(request.applications):
         where = f"applications[{index}]"
         yield from _id(f"{where}.id", app.id)
         yield from _requesters(f"{where}.requesters", app.requesters)
-        if joining or app.node:
+        if claiming or app.node:
             yield from _id(f"{where}.node", app.node)
         for role, topics in app.inputs.items():
             for position, topic in enumerate(topics):
-                yield from _input(f"{where}.inputs.{role}[{position}]", topic, joining)
+                yield from _input(f"{where}.inputs.{role}[{position}]", topic, claiming)
     for index, connection in enumerate(request.connections):
-        yield from _connection(f"connections[{index}]", connection, joining)
+        yield from _connection(f"connections[{index}]", connection, claiming)
 
 
-def _named(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of what only our own requests carry."""
+def _own_fields(request: DemandRequest) -> Iterator[Fault]:
+    """Yield the faults of the fields that only our own requests have."""
     if request.operation.is_reference:
         return
     yield from _id("demand", request.demand)
     if request.demand.startswith(OVERRIDE_PREFIX):
         yield fault(
-            "demand", f"starts with '{OVERRIDE_PREFIX}', as overrides do; choose another demand id"
+            "demand",
+            f"starts with '{OVERRIDE_PREFIX}', which only overrides may use; choose "
+            "another demand id",
         )
-    if not (request.applications or request.connections):  # else told for each of these
-        yield from _requesters("requesters", request.named_by)
+    if not (request.applications or request.connections):  # else each of them is checked
+        yield from _requesters("requesters", request.own_requesters)
     if request.lease_s is not None and not 0 < request.lease_s <= LONGEST_S:
         yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
     if request.operation is not Operation.PUT and request.lease_s is not None:
@@ -189,39 +190,39 @@ def _named(request: DemandRequest) -> Iterator[Fault]:
     if request.operation is not Operation.PUT and (request.applications or request.connections):
         yield fault(
             "applications" if request.applications else "connections",
-            f"a {request.operation.value} names its demand alone; put the demand with less to give "
-            "up a part of it",
+            f"a {request.operation.value} names only its demand; to release a part, put the "
+            "demand without it",
         )
 
 
-def _input(where: str, topic: InputTopic, joining: bool) -> Iterator[Fault]:
+def _input(where: str, topic: InputTopic, claiming: bool) -> Iterator[Fault]:
     problem = topic_problem(topic.topic)
     if problem:
         yield fault(f"{where}.topic", problem)
-    if joining or topic.source:
+    if claiming or topic.source:
         yield from _id(f"{where}.source", topic.source)
     if topic.type:
         yield from _id(f"{where}.type", topic.type)
 
 
-def _connection(where: str, connection: ConnectionDemand, joining: bool) -> Iterator[Fault]:
+def _connection(where: str, connection: ConnectionDemand, claiming: bool) -> Iterator[Fault]:
     yield from _id(f"{where}.id", connection.id)
     yield from _requesters(f"{where}.requesters", connection.requesters)
     for end in ("source", "target"):
         node = getattr(connection, end)
-        if joining or node:
+        if claiming or node:
             yield from _id(f"{where}.{end}", node)
     if connection.broker:
         yield from _id(f"{where}.broker", connection.broker)
-    if joining and not connection.topics:
+    if claiming and not connection.topics:
         yield fault(f"{where}.topics", "is empty; a connection carries at least one topic, list it")
     yield from routes.faults(f"{where}.topics", connection.topics)
     for index, route in enumerate(connection.topics):
         same_place = connection.source and connection.source == connection.target
-        if joining and same_place and route.source == route.target:
+        if claiming and same_place and route.source == route.target:
             yield fault(
                 f"{where}.topics[{index}].target",
-                f"'{route.target}' would feed itself, for source and target are both "
+                f"'{route.target}' would feed itself, because source and target are both "
                 f"'{connection.source}'; name another target node or topic",
             )
 
@@ -238,4 +239,4 @@ def _requesters(where: str, requesters: Iterable[str]) -> Iterator[Fault]:
         empty = False
         yield from _id(f"{where}[{index}]", requester)
     if empty:
-        yield fault(where, "is empty; say for whom this is asked")
+        yield fault(where, "is empty; list at least one requester")

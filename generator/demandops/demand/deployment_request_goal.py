@@ -1,8 +1,8 @@
 """The reference's ``DeploymentRequest`` goal as plain data, parsed into a :class:`DemandRequest`.
 
-The ROS 2 node and ``demandops request FILE`` both come through :func:`parse`, so a file is judged
-exactly as a message is. Absent fields take ROS's defaults, enums are integers, unknown fields are
-errors. Faults name the wire's own fields (``apps[0].header.node_id``).
+The ROS 2 node and ``demandops request FILE`` both use :func:`parse`, so files and messages have
+the same rules. Absent fields have ROS's defaults, enums are integers, unknown fields are errors.
+Faults name the fields of the message (``apps[0].header.node_id``).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Annotated
 from pydantic import Field
 
 from demandops.config.appdef import ApplicationDefinition
-from demandops.config.file_model import Frozen
+from demandops.config.base_model import FrozenModel
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -24,17 +24,17 @@ from demandops.demand.demand_request import (
     InputTopic,
     Operation,
 )
-from demandops.demand.goal_form import valid_part
+from demandops.demand.goal_validation import parse_valid_part
 from demandops.demand.route import Route
 from demandops.errors import Fault, fault
-from demandops.identifiers import absolute
+from demandops.identifiers import absolute_topic
 
 Uint8 = Annotated[int, Field(ge=0, le=255)]
 AppdefByType = Callable[[int], ApplicationDefinition | None]
 AppdefByName = Mapping[str, ApplicationDefinition]
 
 
-class WireTopic(Frozen):
+class WireTopic(FrozenModel):
     """``application_manager_interfaces/msg/Topic``."""
 
     topic_name: str = ""
@@ -42,14 +42,14 @@ class WireTopic(Frozen):
     type: str = ""
 
 
-class WireHeader(Frozen):
+class WireHeader(FrozenModel):
     """``application_manager_interfaces/msg/ApplicationHeader``."""
 
     id: str = ""
     node_id: str = ""
 
 
-class WireBody(Frozen):
+class WireBody(FrozenModel):
     """``application_manager_interfaces/msg/ObjectDetectionFusionApp``."""
 
     requester_ids: list[str] = Field(default_factory=list)
@@ -57,7 +57,7 @@ class WireBody(Frozen):
     pointcloud_topics: list[WireTopic] = Field(default_factory=list)
 
 
-class WireApplication(Frozen):
+class WireApplication(FrozenModel):
     """``application_manager_interfaces/msg/Application``."""
 
     header: WireHeader = WireHeader()
@@ -65,7 +65,7 @@ class WireApplication(Frozen):
     object_detection_fusion_app: WireBody = WireBody()
 
 
-class WireConnection(Frozen):
+class WireConnection(FrozenModel):
     """``application_manager_interfaces/msg/Connection``."""
 
     id: str = ""
@@ -78,7 +78,7 @@ class WireConnection(Frozen):
     type: Uint8 = 0
 
 
-class WireGoal(Frozen):
+class WireGoal(FrozenModel):
     """``application_manager_interfaces/action/DeploymentRequest``, the goal."""
 
     apps: list[WireApplication] = Field(default_factory=list)
@@ -110,25 +110,25 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
     Args:
         data: the goal as a mapping, as ``ros2 action send_goal`` takes it.
-        appdef_by_type: the appdef that the wire's number names, or nothing.
+        appdef_by_type: returns the appdef of a number in the message, or ``None``.
 
     Returns:
-        The request and the faults of its form. Where a field has the wrong form it is left out
-        and the rest is parsed all the same, so that the caller can report further faults with
-        these; a request with faults must not be booked. No request where ``data`` is no mapping.
+        The request and the faults of its form. Fields of the wrong form are left out of the
+        request, so that the caller can check the others. A request with faults must not be booked.
+        The request is ``None`` if ``data`` is not a mapping.
     """
     if not isinstance(data, dict):
-        return None, [_no_mapping()]
-    goal, faults = valid_part(data, WireGoal, _LISTS_OF_TEXT)
-    # where it does not say which, it is held to what a shutdown is held to: the rules of both
-    told = {found.field for found in faults}
-    unsaid = "shutdown" in told
+        return None, [_not_a_mapping()]
+    goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
+    faulty = {found.field for found in faults}
+    # without a valid "shutdown", only the rules of both operations apply, which are a shutdown's
+    unclear = "shutdown" in faulty
     request = DemandRequest(
         id=goal.id,
-        operation=Operation.SHUTDOWN if goal.shutdown or unsaid else Operation.JOIN,
+        operation=Operation.SHUTDOWN if goal.shutdown or unclear else Operation.JOIN,
         applications=tuple(_application(app, appdef_by_type(app.type)) for app in goal.apps),
         connections=tuple(
-            _connection(connection, sound=f"connections[{index}].type" not in told)
+            _connection(connection, valid_type=f"connections[{index}].type" not in faulty)
             for index, connection in enumerate(goal.connections)
         ),
     )
@@ -146,18 +146,18 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
 
 def form_faults(data: object) -> list[Fault]:
-    """Return what of ``data`` has not the form of a goal: unknown fields, wrong types."""
+    """Return the faults of the form of ``data``: unknown fields, wrong types."""
     if not isinstance(data, dict):
-        return [_no_mapping()]
-    return valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]
+        return [_not_a_mapping()]
+    return parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]
 
 
-def _no_mapping() -> Fault:
+def _not_a_mapping() -> Fault:
     return fault("", "a request is a mapping with id, apps, connections and shutdown")
 
 
 def _wire_inputs(appdef: ApplicationDefinition | None) -> Mapping[str, str]:
-    """Return topic list of the message → role, as the appdef says."""
+    """Return the appdef's mapping of the message's topic lists to roles."""
     if appdef is None or appdef.deployment_request is None:
         return {}
     return {str(name): role for name, role in appdef.deployment_request.inputs.items()}
@@ -185,33 +185,36 @@ def _application(app: WireApplication, appdef: ApplicationDefinition | None) -> 
 
 def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
     return tuple(
-        InputTopic(absolute(topic.topic_name), topic.source_node_id, topic.type) for topic in topics
+        InputTopic(absolute_topic(topic.topic_name), topic.source_node_id, topic.type)
+        for topic in topics
     )
 
 
-def _connection(connection: WireConnection, *, sound: bool) -> ConnectionDemand:
-    """Return a connection; without a sound type it is held to no type's own rules."""
+def _connection(connection: WireConnection, *, valid_type: bool) -> ConnectionDemand:
+    """Return a connection; ``AUTO`` replaces an invalid type, so that no type's rules apply."""
     sources, targets = connection.source_topics, connection.target_topics
-    # where one list is shorter (told by the caller), the other's names stand in for its
+    # the caller reports lists of unequal length; names of the longer fill the shorter
     pairs = zip(
         [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
     )
     return ConnectionDemand(
         id=connection.id,
-        type=connection.type if sound else ConnectionType.AUTO.value,
+        type=connection.type if valid_type else ConnectionType.AUTO.value,
         source=connection.source_node_id,
         target=connection.target_node_id,
-        topics=tuple(Route(absolute(source), absolute(target)) for source, target in pairs),
+        topics=tuple(
+            Route(absolute_topic(source), absolute_topic(target)) for source, target in pairs
+        ),
         broker=connection.broker_node_id,
         requesters=tuple(dict.fromkeys(connection.requester_ids)),
     )
 
 
-def wire_field(path: str, request: DemandRequest, appdefs: AppdefByName) -> str:
-    """Return the wire's name for a field of ``request``.
+def goal_field(path: str, request: DemandRequest, appdefs: AppdefByName) -> str:
+    """Return the message's field for a field of ``request``.
 
-    ``applications[0].node`` is ``apps[0].header.node_id`` in the message, and a role is the topic
-    list that the appdef says it comes from.
+    ``applications[0].node`` is ``apps[0].header.node_id`` in the message. A role is the topic list
+    that the appdef maps to it.
     """
     for pattern, replacement in _WIRE_NAMES:
         if pattern.match(path):

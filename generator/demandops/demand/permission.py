@@ -1,6 +1,6 @@
-"""Permission: may these requesters ask for this, here, and for how long?
+"""Permission: the check that requesters may demand this, on these nodes, for this long.
 
-Holds a request to the access domains of the nodes that it names. Every refusal names the rule.
+The access domains of the nodes decide. Every refusal names the rule.
 """
 
 from __future__ import annotations
@@ -22,33 +22,43 @@ from demandops.demand.lease import Term
 from demandops.demand.transport_choice import choose_broker
 from demandops.errors import Fault, fault
 
+Access = list[tuple[str, str]]
+"""Fields of a rule (``nodes``, ``applications``) and the values that a demand needs in them."""
+
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
-    """Yield what the access domains do not let its requesters ask for.
+    """Yield a fault for everything that the access domains do not allow the requesters.
 
-    Giving something up needs no permission. Nodes that are in no domain are told elsewhere.
+    A release needs no permission. :mod:`demandops.demand.admission` reports nodes without a domain.
     """
-    if not request.operation.asks:
+    if not request.operation.adds_claims:
         return
     for index, app in enumerate(request.applications):
         where = f"applications[{index}]"
-        for node in places(app, config):
-            domain = config.domain_of.get(node)
-            if domain is not None:
-                asked = (("applications", app.appdef), ("nodes", node))
-                yield from _unruled(where, app.requesters, domain, asked)
+        for domain, access in access_of_application(app, config):
+            yield from _not_allowed(where, app.requesters, domain, access)
         home = config.domain_of.get(app.node)
         if home is not None:
             yield from _too_long(request, home)
     for index, connection in enumerate(request.connections):
         yield from _connection(f"connections[{index}]", connection, config)
-        domain = config.domain_of.get(connection.target)
+        home = config.domain_of.get(connection.target)
+        if home is not None:
+            yield from _too_long(request, home)
+
+
+def access_of_application(
+    app: ApplicationDemand | ApplicationClaim, config: Config
+) -> Iterator[tuple[AccessDomain, Access]]:
+    """Yield the access that an application needs to the access domain of each of its nodes."""
+    for node in _service_nodes(app, config):
+        domain = config.domain_of.get(node)
         if domain is not None:
-            yield from _too_long(request, domain)
+            yield domain, [("applications", app.appdef), ("nodes", node)]
 
 
-def places(app: ApplicationDemand | ApplicationClaim, config: Config) -> Iterable[str]:
-    """Return the nodes on which services of an application run: its own, and sources."""
+def _service_nodes(app: ApplicationDemand | ApplicationClaim, config: Config) -> Iterable[str]:
+    """Return the nodes on which services of an application run: its node, and sources."""
     appdef = config.appdefs.get(app.appdef)
     services = appdef.services.values() if appdef else ()
     roles = [service.each for service in services if service.placement == "source"]
@@ -56,38 +66,38 @@ def places(app: ApplicationDemand | ApplicationClaim, config: Config) -> Iterabl
     return dict.fromkeys((app.node, *sources))
 
 
-def _connection(where: str, asked: ConnectionDemand, config: Config) -> Iterator[Fault]:
-    mqtt = asked.type == ConnectionType.MQTT.value
-    for domain, asks in asked_at_ends(asked.source, asked.target, asked.broker, mqtt, config):
-        yield from _unruled(where, asked.requesters, domain, asks)
+def _connection(where: str, connection: ConnectionDemand, config: Config) -> Iterator[Fault]:
+    mqtt = connection.type == ConnectionType.MQTT.value
+    ends = (connection.source, connection.target)
+    for domain, access in access_of_connection(*ends, connection.broker, mqtt, config):
+        yield from _not_allowed(where, connection.requesters, domain, access)
 
 
-def asked_at_ends(
-    source: str, target: str, wanted_broker: str, mqtt: bool, config: Config
-) -> Iterator[tuple[AccessDomain, list[tuple[str, str]]]]:
-    """Yield what a connection asks of the access domain of each of its ends."""
-    broker = choose_broker(wanted_broker, source, target, config) if mqtt else None
+def access_of_connection(
+    source: str, target: str, requested_broker: str, mqtt: bool, config: Config
+) -> Iterator[tuple[AccessDomain, Access]]:
+    """Yield the access that a connection needs to the access domain of each end."""
+    broker = choose_broker(requested_broker, source, target, config) if mqtt else None
     for node in dict.fromkeys((source, target)):
         domain = config.domain_of.get(node)
         if domain is None:
             continue
-        asks = [("nodes", node)]
+        access = [("nodes", node)]
         if broker is not None:
-            asks.append(("brokers", broker.node))
-        yield domain, asks
+            access.append(("brokers", broker.node))
+        yield domain, access
 
 
-def _unruled(
+def _not_allowed(
     where: str,
     requesters: Iterable[str],
     domain: AccessDomain,
-    asked: Iterable[tuple[str, str]],
+    access: Access,
 ) -> Iterator[Fault]:
-    """Yield a fault for each requester whom no rule of the domain lets ask for this."""
-    asked = list(asked)
+    """Yield a fault for each requester without a rule of the domain that grants the access."""
     for index, requester in enumerate(requesters if domain.rules else ()):
         own = [rule for rule in domain.rules if matches(requester, rule.requesters)]
-        misses = [missing(rule, asked) for rule in own]
+        misses = [first_uncovered(rule, access) for rule in own]
         if own and None in misses:
             continue
         place = f"{where}.requesters[{index}]"
@@ -106,10 +116,10 @@ def _unruled(
         yield fault(place, message, code="not-allowed")
 
 
-def missing(rule: Rule, asked: Iterable[tuple[str, str]]) -> tuple[str, str] | None:
-    """Return the first thing asked that a rule does not cover; nothing where it covers all."""
+def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
+    """Return the first access that a rule does not grant, or ``None`` if it grants all."""
     return next(
-        ((kind, value) for kind, value in asked if not matches(value, getattr(rule, kind))), None
+        ((kind, value) for kind, value in access if not matches(value, getattr(rule, kind))), None
     )
 
 
@@ -120,13 +130,13 @@ def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
     yield fault(
         "lease",
         f"is {request.lease_s} s, above leases.longest of access domain '{domain.name}', "
-        f"{longest}; ask for that, and renew",
+        f"{longest}; request that, and renew",
         code="not-allowed",
     )
 
 
-def with_terms(request: DemandRequest, config: Config) -> DemandRequest:
-    """Return the request with the lease that each subject gets, by its domain."""
+def with_lease_terms(request: DemandRequest, config: Config) -> DemandRequest:
+    """Return the request with the lease of each subject, by the policy of its domain."""
 
     def term(node: str) -> Term | None:
         domain = config.domain_of.get(node)

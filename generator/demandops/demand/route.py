@@ -1,9 +1,8 @@
-"""One topic of a connection: from which name to which, which way, and how it is carried.
+"""Routes: one topic of a connection, with its names, direction and options.
 
-A :class:`Route` is what requests ask for, claims hold and clients are configured from. Which
-type of connection can honour which option is :mod:`demandops.demand.transport_choice`'; here is
-only what a route may say at all. :func:`parse` is for every parser that takes
-options from outside: the ledger's files, and messages that have them.
+Requests and claims contain :class:`Route`, and clients are configured from it. This module knows
+the valid options; :mod:`demandops.demand.transport_choice` knows which connection type supports
+them. :func:`parse` is for options from messages and from the ledger's files.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from demandops.config.file_model import Frozen, faults_of
-from demandops.errors import Fault, fault, shown
+from demandops.config.base_model import FrozenModel, faults_of
+from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import message_type_problem, topic_problem
 
 
@@ -23,12 +22,12 @@ from demandops.identifiers import message_type_problem, topic_problem
 class Route:
     """One topic that a connection carries.
 
-    ``source`` is its name on the source node, ``target`` on the target node; with ``reverse`` it
-    is carried from the target to the source. ``type`` is the ROS message type
-    (``std_msgs/msg/String``), empty where it is not said. Of the options each default leaves the
-    client's own behaviour: ``qos`` (MQTT, 0 to 2), ``retained`` and ``primitive`` (MQTT),
-    ``reliability``, ``durability`` and ``queue`` (of the ROS endpoints), ``rate`` (most messages
-    a second, in Hz; 0 for all).
+    ``source`` is its name on the source node, ``target`` on the target node. With ``reverse``
+    messages go from the target to the source. ``type`` is the ROS message type
+    (``std_msgs/msg/String``), empty if not given. The options are ``qos`` (MQTT, 0 to 2),
+    ``retained`` and ``primitive`` (MQTT), ``reliability``, ``durability`` and ``queue`` (of the ROS
+    endpoints), ``rate`` (the highest rate in Hz; 0 for all messages). Their defaults keep the
+    client's own behavior.
     """
 
     source: str
@@ -44,23 +43,23 @@ class Route:
     rate: float = 0.0
 
     def options(self) -> dict[str, Any]:
-        """Return what is not as by default, besides the two names."""
+        """Return the options that differ from their defaults."""
         return {
             name: value for name, default in _DEFAULTS if (value := getattr(self, name)) != default
         }
 
     @property
-    def read(self) -> str:
-        """The topic that is read, at the end where messages come from."""
+    def read_topic(self) -> str:
+        """The topic on the node that messages come from."""
         return self.target if self.reverse else self.source
 
     @property
-    def written(self) -> str:
-        """The topic that is written, at the end where messages arrive."""
+    def written_topic(self) -> str:
+        """The topic on the node that messages go to."""
         return self.source if self.reverse else self.target
 
-    def ends(self, source: str, target: str) -> tuple[str, str]:
-        """Return the nodes that messages come from and arrive at, of a connection's two ends."""
+    def sender_and_receiver(self, source: str, target: str) -> tuple[str, str]:
+        """Return the sending and the receiving node of a connection between two nodes."""
         return (target, source) if self.reverse else (source, target)
 
 
@@ -78,8 +77,8 @@ def _message_type(value: str) -> str:
 MessageType = Annotated[str, AfterValidator(_message_type)]
 
 
-class RouteOptions(Frozen):
-    """The options of a route as they come from outside; each default is that of :class:`Route`."""
+class RouteOptions(FrozenModel):
+    """The options of a route in messages and files; the defaults are those of :class:`Route`."""
 
     type: MessageType = ""
     reverse: bool = False
@@ -99,32 +98,33 @@ class RouteOptions(Frozen):
 def parse(
     where: str, source: str, target: str, options: Mapping[str, object]
 ) -> tuple[Route, list[Fault]]:
-    """Return a route of options that came from outside, and what is wrong with them.
+    """Return a route with options from a message or a file, and their faults.
 
     Args:
         where: the field that holds them, for faults (``connections[0].topics[2]``).
-        source, target: the topic's names at both ends, absolute.
-        options: by the names of :class:`RouteOptions`; what is left out is as by default.
+        source, target: the topic's absolute names at both ends.
+        options: values of :class:`RouteOptions`; absent ones get their defaults.
 
     Returns:
-        The route, without the options that are faulty; it must not be booked where there are any.
+        The route without the invalid options, and the faults. A route with faults must not be
+        booked.
     """
     try:
         return RouteOptions.model_validate(dict(options)).route(source, target), []
     except ValidationError as error:
         faults = faults_of(error, RouteOptions)
-        bad = {found.field for found in faults}
-        sound = {name: value for name, value in options.items() if name not in bad}
+        invalid = {found.field for found in faults}
+        valid = {name: value for name, value in options.items() if name not in invalid}
         return (
-            RouteOptions.model_validate(sound).route(source, target),
+            RouteOptions.model_validate(valid).route(source, target),
             [fault(f"{where}.{found.field}", found.message) for found in faults],
         )
 
 
 def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
-    """Yield what the routes of one connection break, whatever carries them."""
+    """Yield the faults of one connection's routes that do not depend on its type."""
     targets: dict[str, Route] = {}
-    read_back: dict[str, str] = {}
+    carried_back: dict[str, str] = {}
     for index, route in enumerate(routes):
         for side, name in (("source", route.source), ("target", route.target)):
             problem = topic_problem(name)
@@ -134,43 +134,44 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
         if first.target != route.target:
             yield fault(
                 f"{where}[{index}].target",
-                f"{shown(route.source)} goes to {shown(first.target)} and to "
-                f"{shown(route.target)}; one source topic has one target, use a second connection",
+                f"{quoted(route.source)} goes to {quoted(first.target)} and to "
+                f"{quoted(route.target)}; one source topic has one target, use a second connection",
             )
-        for name, stands, asked in differences(first, route):
+        for name, value, other in contradictions(first, route):
             yield fault(
                 f"{where}[{index}].{name}",
-                f"{shown(route.source)} is listed with {name} {stands} and {asked}; list it once",
+                f"{quoted(route.source)} is listed with {name} {value} and {other}; list it once",
             )
-        if route.reverse and read_back.setdefault(route.target, route.source) != route.source:
+        if route.reverse and carried_back.setdefault(route.target, route.source) != route.source:
             yield fault(
                 f"{where}[{index}].target",
-                f"{shown(route.target)} is carried back to {shown(read_back[route.target])} and to "
-                f"{shown(route.source)}; one topic goes to one place, use a second connection",
+                f"{quoted(route.target)} is carried back to {quoted(carried_back[route.target])} "
+                f"and to {quoted(route.source)}; one topic goes to one place, use a second "
+                "connection",
             )
 
 
-def differences(one: Route, other: Route) -> Iterator[tuple[str, object, object]]:
-    """Yield (option, its value in one, in the other) where two routes contradict each other.
+def contradictions(one: Route, other: Route) -> Iterator[tuple[str, object, object]]:
+    """Yield (option, first value, second value) for each contradiction between two routes.
 
-    A message type that is not said contradicts none.
+    An empty message type does not contradict another.
     """
     for name, _ in _DEFAULTS:
         first, second = getattr(one, name), getattr(other, name)
         if first == second or (name == "type" and not (first and second)):
             continue
-        yield name, _written(first), _written(second)
+        yield name, _shown(first), _shown(second)
 
 
-def _written(value: object) -> str:
+def _shown(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else f"{value!r}"
 
 
-def united(routes: Iterable[Route]) -> dict[str, Route]:
-    """Return routes by source topic, sorted; a type that one of them says holds for all."""
-    found: dict[str, Route] = {}
+def merge_routes(routes: Iterable[Route]) -> dict[str, Route]:
+    """Return routes by source topic, sorted; a message type that one gives is kept."""
+    merged: dict[str, Route] = {}
     for route in routes:
-        known = found.get(route.source)
-        if known is None or (route.type and not known.type):
-            found[route.source] = route
-    return dict(sorted(found.items()))
+        first = merged.get(route.source)
+        if first is None or (route.type and not first.type):
+            merged[route.source] = route
+    return dict(sorted(merged.items()))

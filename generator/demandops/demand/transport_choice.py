@@ -1,8 +1,7 @@
-"""Which type of connection can carry what is asked, by this configuration.
+"""The choice of a connection type: which types can carry a connection in this configuration.
 
-:func:`obstacles` says what keeps one type from it; :func:`resolved` chooses where the type is
-left open. Both are pure functions of request and configuration; what is booked comes in as
-an argument.
+:func:`type_faults` yields why a type cannot carry a connection. :func:`with_chosen_types` chooses
+the type of each connection that leaves it open.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from demandops.config.config import (
 from demandops.config.inventory import Broker, Node
 from demandops.demand.demand_request import ConnectionDemand, ConnectionType, DemandRequest
 from demandops.demand.route import Route
-from demandops.errors import Fault, fault, shown
+from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import topic_problem
 
 PREFERENCE = (ConnectionType.ZENOH, ConnectionType.MQTT, ConnectionType.ROS)
 """The order of the automatic choice."""
 
-HONOURED: dict[ConnectionType, frozenset[str]] = {
+SUPPORTED_OPTIONS: dict[ConnectionType, frozenset[str]] = {
     ConnectionType.MQTT: frozenset(
         {"qos", "retained", "primitive", "reliability", "durability", "queue"}
     ),
     ConnectionType.ZENOH: frozenset({"rate"}),
     ConnectionType.ROS: frozenset({"reliability", "durability", "queue", "rate"}),
 }
-"""The options of a route that a type's client can honour; message type and direction all can."""
+"""The options of a route that a type supports; all support message type and direction."""
 
 _IMAGES = {
     ConnectionType.MQTT: MQTT_CLIENT_IMAGE,
@@ -42,72 +41,78 @@ _IMAGES = {
     ConnectionType.ROS: DDS_ROUTER_IMAGE,
 }
 _ALWAYS = ("type", "reverse")
-_UNCARRIED = "unsupported-connection-type"
+_UNSUPPORTED = "unsupported-connection-type"
 
-Standing = Callable[[str], ConnectionType | None]
-"""Returns the type of a connection that something holds already, or nothing."""
+CurrentType = Callable[[str], ConnectionType | None]
+"""Returns the type of a connection that is already claimed, or ``None``."""
 
 
-def resolved(request: DemandRequest, config: Config, standing: Standing) -> DemandRequest:
-    """Return ``request`` with every ``AUTO`` made the type that carries the connection.
+def with_chosen_types(
+    request: DemandRequest, config: Config, current_type: CurrentType
+) -> DemandRequest:
+    """Return ``request`` with a chosen type for each connection of type ``AUTO``.
 
-    A connection that stands keeps its type. Otherwise the first of Zenoh, MQTT and ROS that
-    nothing keeps from carrying it (:func:`obstacles`); ``AUTO`` stays where there is none.
+    A claimed connection keeps its current type. Another gets the first of Zenoh, MQTT and ROS that
+    can carry it (:func:`type_faults`); it stays ``AUTO`` if none can.
     """
     connections = tuple(
-        replace(asked, type=(standing(asked.id) or choice(asked, config)).value)
-        if asked.type == ConnectionType.AUTO.value
-        else asked
-        for asked in request.connections
+        replace(
+            connection, type=(current_type(connection.id) or choose_type(connection, config)).value
+        )
+        if connection.type == ConnectionType.AUTO.value
+        else connection
+        for connection in request.connections
     )
     return replace(request, connections=connections)
 
 
-def choice(asked: ConnectionDemand, config: Config) -> ConnectionType:
-    """Return the type that a connection without one gets; ``AUTO`` where none can carry it."""
+def choose_type(connection: ConnectionDemand, config: Config) -> ConnectionType:
+    """Return the type for a connection that leaves it open; ``AUTO`` if none can carry it."""
     for kind in PREFERENCE:
-        if next(obstacles(kind, asked, config), None) is None:
+        if next(type_faults(kind, connection, config), None) is None:
             return kind
     return ConnectionType.AUTO
 
 
-def none_fits(asked: ConnectionDemand, config: Config) -> Fault:
-    """Say of each type what keeps it from carrying a connection."""
+def no_type_fault(connection: ConnectionDemand, config: Config) -> Fault:
+    """Return a fault that says for each type why it cannot carry a connection."""
     reasons = []
     for kind in PREFERENCE:
-        found = next(obstacles(kind, asked, config))
-        place = "" if found.field == "type" else f"{found.field} "
-        reasons.append(f"{kind.name}: {place}{found.message}")
-    message = f"is open, and nothing can carry it. {'; '.join(reasons)}"
-    return fault("type", message, code=_UNCARRIED)
+        reason = next(type_faults(kind, connection, config))
+        field = "" if reason.field == "type" else f"{reason.field} "
+        reasons.append(f"{kind.name}: {field}{reason.message}")
+    message = f"is not given, and no type can carry it. {'; '.join(reasons)}"
+    return fault("type", message, code=_UNSUPPORTED)
 
 
-def obstacles(kind: ConnectionType, asked: ConnectionDemand, config: Config) -> Iterator[Fault]:
-    """Yield what keeps ``kind`` from carrying a connection, by fields of :class:`ConnectionDemand`.
+def type_faults(
+    kind: ConnectionType, connection: ConnectionDemand, config: Config
+) -> Iterator[Fault]:
+    """Yield why ``kind`` cannot carry a connection, by fields of :class:`ConnectionDemand`.
 
-    Nodes that are not in the inventory are told elsewhere and passed over here.
+    Nodes that are not in the inventory are skipped; :mod:`demandops.demand.admission` reports them.
     """
     if kind is not ConnectionType.MQTT and _IMAGES[kind] not in config.images:
         yield fault(
             "type",
             f"{kind.value} ({kind.name}) needs an image '{_IMAGES[kind]}'; add it to {IMAGES_FILE}",
-            code=_UNCARRIED,
+            code=_UNSUPPORTED,
         )
-    yield from _ends(kind, asked, config)
-    yield from misfits(kind, asked.topics, (asked.source, asked.target), config)
+    yield from _end_faults(kind, connection, config)
+    yield from route_faults(kind, connection.topics, (connection.source, connection.target), config)
 
 
-def misfits(
+def route_faults(
     kind: ConnectionType, topics: Iterable[Route], ends: tuple[str, str], config: Config
 ) -> Iterator[Fault]:
-    """Yield what of the routes between two ends ``kind`` cannot do, by ``topics[i].<option>``."""
+    """Yield a fault for everything in a connection's routes that ``kind`` does not support."""
     for index, route in enumerate(topics):
         if topic_problem(route.source) or topic_problem(route.target):
-            continue  # told by the request's own checks
+            continue  # the request's own checks report it
         where = f"topics[{index}]"
-        yield from _options(where, kind, route)
+        yield from _option_faults(where, kind, route)
         if kind is ConnectionType.ROS:
-            yield from _of_dds(where, route, route.ends(*ends)[0], config)
+            yield from _ros_route_faults(where, route, route.sender_and_receiver(*ends)[0], config)
         if kind is not ConnectionType.MQTT and route.source != route.target:
             yield fault(
                 f"{where}.target",
@@ -116,16 +121,22 @@ def misfits(
             )
 
 
-def _ends(kind: ConnectionType, asked: ConnectionDemand, config: Config) -> Iterator[Fault]:
-    source, target = config.nodes.get(asked.source), config.nodes.get(asked.target)
+def _end_faults(
+    kind: ConnectionType, connection: ConnectionDemand, config: Config
+) -> Iterator[Fault]:
+    source, target = config.nodes.get(connection.source), config.nodes.get(connection.target)
     if kind is ConnectionType.MQTT:
-        # where the broker is open it follows from the ends, which may be told already
-        known = asked.broker or (source and target)
-        if known and choose_broker(asked.broker, asked.source, asked.target, config) is None:
-            yield _no_broker(asked, config)
+        # without a broker in the request it follows from the ends; admission reports unknown ends
+        known = connection.broker or (source and target)
+        if (
+            known
+            and choose_broker(connection.broker, connection.source, connection.target, config)
+            is None
+        ):
+            yield _no_broker(connection, config)
         return
-    if asked.broker:
-        yield fault("broker", f"is of MQTT only, and this is {kind.name}; leave it out")
+    if connection.broker:
+        yield fault("broker", f"is for MQTT only, and the type is {kind.name}; leave it out")
     if source is None or target is None:
         return
     for end, node in (("source", source), ("target", target)):
@@ -134,28 +145,28 @@ def _ends(kind: ConnectionType, asked: ConnectionDemand, config: Config) -> Iter
                 end,
                 f"'{node.id}' runs rmw_zenoh_cpp, and {kind.name} clients speak DDS; use type 1 "
                 f"(MQTT), or another rmw in {NODES_FILE}",
-                code=_UNCARRIED,
+                code=_UNSUPPORTED,
             )
     if kind is ConnectionType.ROS:
         if source.wan is None and target.wan is None:
             yield fault(
                 "type",
-                f"0 (ROS) needs an address that one end can be reached at; add wan: {{host: …}} to "
+                f"0 (ROS) needs an end with a reachable address; add wan: {{host: …}} to "
                 f"'{source.id}' or '{target.id}' in {NODES_FILE}",
-                code=_UNCARRIED,
+                code=_UNSUPPORTED,
             )
         return
-    yield from _zenoh_ends(source, target)
+    yield from _zenoh_end_faults(source, target)
 
 
-def _zenoh_ends(source: Node, target: Node) -> Iterator[Fault]:
+def _zenoh_end_faults(source: Node, target: Node) -> Iterator[Fault]:
     for end, node in (("source", source), ("target", target)):
         if node.zenoh is None:
             yield fault(
                 end,
                 f"'{node.id}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to it in "
-                f"{NODES_FILE}, or zenoh: {{}} where others can be reached from it",
-                code=_UNCARRIED,
+                f"{NODES_FILE}, or zenoh: {{}} if it can reach others",
+                code=_UNSUPPORTED,
             )
     if source.zenoh is None or target.zenoh is None:
         return
@@ -165,49 +176,49 @@ def _zenoh_ends(source: Node, target: Node) -> Iterator[Fault]:
     ):
         yield fault(
             "type",
-            f"2 (ZENOH) finds no way between '{source.id}' and '{target.id}'; give one of them an "
-            f"endpoint under zenoh in {NODES_FILE}, or both one router under connect",
-            code=_UNCARRIED,
+            f"2 (ZENOH) finds no route between '{source.id}' and '{target.id}'; give one of them "
+            f"an endpoint under zenoh in {NODES_FILE}, or both one router under connect",
+            code=_UNSUPPORTED,
         )
 
 
-def _options(where: str, kind: ConnectionType, route: Route) -> Iterator[Fault]:
+def _option_faults(where: str, kind: ConnectionType, route: Route) -> Iterator[Fault]:
     for name in route.options():
-        if name in _ALWAYS or name in HONOURED[kind]:
+        if name in _ALWAYS or name in SUPPORTED_OPTIONS[kind]:
             continue
-        able = [other for other in PREFERENCE if name in HONOURED[other]]
+        able = [other for other in PREFERENCE if name in SUPPORTED_OPTIONS[other]]
         names = " or ".join(f"{other.value} ({other.name})" for other in able)
         yield fault(
             f"{where}.{name}",
-            f"{name} of '{route.source}' is nothing that {kind.name} can do; leave it out, or use "
+            f"{name} of '{route.source}' is not supported by {kind.name}; leave it out, or use "
             f"type {names}",
         )
 
 
-def _of_dds(where: str, route: Route, node: str, config: Config) -> Iterator[Fault]:
+def _ros_route_faults(where: str, route: Route, node: str, config: Config) -> Iterator[Fault]:
     if node in config.nodes and not message_type(route, node, config):
         yield fault(
             f"{where}.type",
-            f"the message type of '{route.source}' is not known, and ROS needs it; say it in the "
-            f"request where it has a field for it, or add it to types of '{node}' in {NODES_FILE}",
+            f"the message type of '{route.source}' is not known, and ROS needs it; give it in "
+            f"the request if it has a field for it, or add it to types of '{node}' in {NODES_FILE}",
         )
     if route.durability and not route.reliability:
         yield fault(
             f"{where}.reliability",
-            f"is open while durability of '{route.source}' is set; ROS needs both, add it",
+            f"is not given, but durability of '{route.source}' is set; ROS needs both, add it",
         )
 
 
 def message_type(route: Route, node: str, config: Config) -> str:
-    """Return the message type of a route that is read on ``node``, as said or by the inventory."""
+    """Return the message type of a route with sender ``node``, from the route or the inventory."""
     known = config.nodes.get(node)
-    return route.type or (known.types.get(route.read, "") if known else "")
+    return route.type or (known.types.get(route.read_topic, "") if known else "")
 
 
 def choose_broker(requested: str, source: str, target: str, config: Config) -> Broker | None:
-    """Return the broker of a connection: the requested one, the target's, the source's, the only.
+    """Return a connection's broker: the requested, the target's, the source's or the only one.
 
-    Nothing where none of these exists. ``requested`` is a node id or empty.
+    Return ``None`` if there is none of these. ``requested`` is a node id or empty.
     """
     if requested:
         return config.brokers.get(requested)
@@ -219,11 +230,12 @@ def choose_broker(requested: str, source: str, target: str, config: Config) -> B
     return None
 
 
-def _no_broker(asked: ConnectionDemand, config: Config) -> Fault:
+def _no_broker(connection: ConnectionDemand, config: Config) -> Fault:
     known = ", ".join(sorted(config.brokers))
     remedy = f"name one of: {known}" if known else "inventory/brokers.yaml has none; add one there"
-    if asked.broker:
-        message = f"no broker runs on {shown(asked.broker)}; {remedy}"
+    if connection.broker:
+        message = f"no broker runs on {quoted(connection.broker)}; {remedy}"
     else:
-        message = f"is open, and no broker runs on '{asked.target}' or '{asked.source}'; {remedy}"
+        ends = f"'{connection.target}' or '{connection.source}'"
+        message = f"is not given, and no broker runs on {ends}; {remedy}"
     return fault("broker", message, code="no-broker")

@@ -10,7 +10,7 @@ from http.client import HTTPException, HTTPResponse
 from typing import IO, Any
 
 from demandops import __version__
-from demandops.errors import DemandOpsError, shown
+from demandops.errors import DemandOpsError, quoted
 
 _TIMEOUT_S = 15.0
 _MOST_BYTES = 4_000_000
@@ -107,4 +107,4 @@ def _reason(error: urllib.error.HTTPError) -> str:
     details = answer.get("errors")
     texts = [answer.get("message"), *(details if isinstance(details, list) else ())]
     texts = [text.get("message") if isinstance(text, dict) else text for text in texts]
-    return shown("; ".join(text for text in texts if isinstance(text, str) and text), 300)
+    return quoted("; ".join(text for text in texts if isinstance(text, str) and text), 300)

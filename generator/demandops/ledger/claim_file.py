@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from demandops import strict_yaml
-from demandops.config.file_model import Frozen, parse
+from demandops.config.base_model import FrozenModel, parse
 from demandops.demand.claim import (
     ApplicationClaim,
     Claim,
@@ -72,7 +72,7 @@ def _time(text: str) -> datetime:
 Timestamp = Annotated[str, AfterValidator(_timestamp)]
 
 
-class _Topic(Frozen):
+class _Topic(FrozenModel):
     topic: str
     source: str
     type: str = ""
@@ -87,7 +87,7 @@ def _plain_route(value: object) -> object:
     return {"target": value} if isinstance(value, str) else value
 
 
-class _Lease(Frozen):
+class _Lease(FrozenModel):
     seconds: int = Field(ge=1, le=LONGEST_S)
     slack: int = Field(default=0, ge=0, le=LONGEST_S)
     until: Timestamp | None = None  # None: the lease starts with the approval
@@ -97,7 +97,7 @@ class _Lease(Frozen):
         return Lease(self.seconds, self.slack, until)
 
 
-class _Claim(Frozen):
+class _Claim(FrozenModel):
     apiVersion: Literal["demandops.ledger/v1"]
     demand: str = Field(min_length=1)
     request: str

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from typing import Literal
 
 from demandops import strict_yaml
-from demandops.config.file_model import Frozen, parse_file
-from demandops.config.override import Override, moment_of, written
+from demandops.config.base_model import FrozenModel, parse_file
+from demandops.config.override import Override, format_time, parse_time
 from demandops.errors import InvalidInput
 from demandops.ledger.claim_file import LEDGER_ROOT
 from demandops.settings import LEDGER_API_VERSION
@@ -20,7 +20,7 @@ from demandops.settings import LEDGER_API_VERSION
 MARKERS_ROOT = f"{LEDGER_ROOT}/overrides"
 
 
-class _Marker(Frozen):
+class _Marker(FrozenModel):
     apiVersion: Literal["demandops.ledger/v1"]
     kind: Literal["EndedOverride"]
     override: str
@@ -40,7 +40,7 @@ def text_of(override: Override) -> str:
             "apiVersion": LEDGER_API_VERSION,
             "kind": "EndedOverride",
             "override": override.name,
-            "expires": written(override.end),
+            "expires": format_time(override.end),
         }
     )
 
@@ -56,7 +56,7 @@ def read(files: Mapping[str, str]) -> dict[str, str]:
         try:
             marker = parse_file(_Marker, text, path)
             if marker.override == name and path == path_of(name):
-                ended[name] = written(moment_of(marker.expires))
+                ended[name] = format_time(parse_time(marker.expires))
         except (InvalidInput, ValueError):
             continue
     return ended
@@ -68,6 +68,6 @@ def stale_markers(paths: Mapping[str, str], overrides: Mapping[str, Override]) -
     current = {
         path_of(name)
         for name, override in overrides.items()
-        if override.end is not None and ended.get(name) == written(override.end)
+        if override.end is not None and ended.get(name) == format_time(override.end)
     }
     return sorted({*paths} - current)

@@ -125,7 +125,7 @@ class Ledger:
         if not self.minutes:
             return None
         first = self._claims(_ENDS, min(self.minutes))
-        return min(claim.lease.ends for claim in first if claim.lease)
+        return min(claim.lease.expires_at for claim in first if claim.lease)
 
     def unstarted_claims(self) -> tuple[Claim, ...]:
         """Return the approved claims whose lease the generator has not started yet."""
@@ -137,10 +137,10 @@ class Ledger:
         """Return the claims whose lease ended before ``now``, sorted by its end."""
         over = (minute for minute in self.minutes if minute <= _minute(now))
         ended = [
-            (claim.lease.ends, claim)
+            (claim.lease.expires_at, claim)
             for minute in over
             for claim in self._claims(_ENDS, minute)
-            if claim.lease and claim.lease.ends < now
+            if claim.lease and claim.lease.expires_at < now
         ]
         return tuple(claim for _, claim in sorted(ended, key=lambda pair: pair[0]))
 
@@ -222,7 +222,7 @@ def index_entries(claim: Claim | None) -> set[Entry]:
     found: set[Entry] = {("demand", claim.demand)}
     found |= {("requester", requester) for requester in claim.requesters}
     if claim.lease is not None:
-        found.add((_ENDS, _minute(claim.lease.ends)))
+        found.add((_ENDS, _minute(claim.lease.expires_at)))
     if isinstance(claim, ApplicationClaim):
         found.add(("node", claim.node))
         for _, topic in claim.all_inputs():
@@ -233,8 +233,8 @@ def index_entries(claim: Claim | None) -> set[Entry]:
         if claim.broker:
             found.add(("broker", claim.broker))
         for route in claim.topics.values():
-            _, taking = route.ends(claim.source, claim.target)
-            found.add(("brings", taking, route.written))
+            _, taking = route.sender_and_receiver(claim.source, claim.target)
+            found.add(("brings", taking, route.written_topic))
     return found
 
 

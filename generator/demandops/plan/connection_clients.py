@@ -18,7 +18,7 @@ from demandops.demand import route as routes
 from demandops.demand.claim import ConnectionClaim
 from demandops.demand.demand_request import ConnectionType
 from demandops.demand.route import Route
-from demandops.demand.transport_choice import choose_broker, message_type, misfits
+from demandops.demand.transport_choice import choose_broker, message_type, route_faults
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.ledger import Ledger
 from demandops.plan import naming
@@ -57,7 +57,7 @@ def client_keys(ledger: Ledger, connection: str) -> Iterator[EndKey | BridgeKey]
 
 def connection_topics(claims: Iterable[ConnectionClaim]) -> dict[str, Route]:
     """Return the routes of all claims on a connection by source topic, sorted."""
-    return routes.united(route for claim in claims for route in claim.topics.values())
+    return routes.merge_routes(route for claim in claims for route in claim.topics.values())
 
 
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
@@ -65,11 +65,11 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
 
     It keeps topic names, so it does not carry a route that renames the topic.
     """
-    sender, receiver = route.ends(source, target)
+    sender, receiver = route.sender_and_receiver(source, target)
     node = config.nodes.get(sender)
     if node is None or route.source != route.target:
         return False
-    return route.read in node.bridged.get(receiver, ())
+    return route.read_topic in node.bridged.get(receiver, ())
 
 
 def carried_routes(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[str, Route]:
@@ -85,7 +85,7 @@ def carried_routes(claims: tuple[ConnectionClaim, ...], config: Config) -> dict[
         for name, route in connection_topics(claims).items()
         if not is_bridged(route, first.source, first.target, config)
     }
-    problems = list(misfits(first.type, topics.values(), (first.source, first.target), config))
+    problems = list(route_faults(first.type, topics.values(), (first.source, first.target), config))
     if problems:
         raise Refused(
             replace(one, field="connections", message=f"'{first.connection}': {one.message}")
@@ -152,7 +152,7 @@ def _ros_end(ledger: Ledger, config: Config, key: EndKey, topics: dict[str, Rout
     claim = ledger.connection_claims(key.connection)[0]
     ends = (claim.source, claim.target)
     typed = {
-        name: replace(route, type=message_type(route, route.ends(*ends)[0], config))
+        name: replace(route, type=message_type(route, route.sender_and_receiver(*ends)[0], config))
         for name, route in topics.items()
     }
     listener = _listener(claim, config)
@@ -226,10 +226,10 @@ def zenoh_bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | Non
         source, target = claims[0].source, claims[0].target
         for route in carried_routes(claims, config).values():
             connections[id] = target if key.node == source else source
-            if key.node != route.ends(source, target)[0]:
-                subscribers.add(route.written)
+            if key.node != route.sender_and_receiver(source, target)[0]:
+                subscribers.add(route.written_topic)
                 continue
-            rate, other = publishers.setdefault(route.read, (route.rate, id))
+            rate, other = publishers.setdefault(route.read_topic, (route.rate, id))
             if rate != route.rate:
                 raise Refused([_two_rates(route, id, rate, other, key.node)])
     if not connections:
@@ -251,10 +251,9 @@ def zenoh_bridge(ledger: Ledger, config: Config, key: BridgeKey) -> Bridge | Non
 def _two_rates(route: Route, id: str, rate: float, other: str, node: str) -> Fault:
     return fault(
         "connections",
-        f"rate {route.rate} of '{route.read}' in '{id}' contradicts an existing claim: '{other}' "
-        "carries "
-        f"it from '{node}' with rate {rate}, and the node's bridge has one for each topic; use the "
-        "same",
+        f"rate {route.rate} of '{route.read_topic}' in '{id}' contradicts an existing claim: "
+        f"'{other}' carries it from '{node}' with rate {rate}, and the node's bridge has one for "
+        "each topic; use the same",
         code="conflict",
     )
 

@@ -32,7 +32,7 @@ def with_implied_connections(
     """
     connections = list(request.connections)
     brought = {
-        (route.ends(connection.source, connection.target)[1], route.written)
+        (route.sender_and_receiver(connection.source, connection.target)[1], route.written_topic)
         for connection in request.connections
         for route in connection.topics
     }
@@ -48,7 +48,7 @@ def with_implied_connections(
             known = next((c for c in connections if (c.id, c.source, c.target) == same), None)
             if known is None:
                 connections.append(
-                    replace(needed, because=f"applications[{index}].{foreign.field}")
+                    replace(needed, for_input=f"applications[{index}].{foreign.field}")
                 )
                 continue
             topics = dict.fromkeys((*known.topics, *needed.topics))

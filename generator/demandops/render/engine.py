@@ -55,7 +55,7 @@ def _finalize(value: object) -> object:
         return value
     if isinstance(value, Undefined):
         str(value)  # StrictUndefined raises here and names what is missing
-    return strict_yaml.scalar(_plain(value))
+    return strict_yaml.to_json(_plain(value))
 
 
 def _plain(value: object) -> object:

@@ -12,7 +12,7 @@ from typing import Any
 
 from demandops.config.config import Config
 from demandops.config.inventory import Node
-from demandops.config.override import merged
+from demandops.config.override import merge_patch
 from demandops.errors import Fault, InvalidInput
 from demandops.plan.release import ServiceRelease
 from demandops.render.engine import Engine
@@ -33,7 +33,7 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
     except InvalidInput as error:
         raise InvalidInput(_name_overrides(error, release)) from None
     for file, patch in release.shaping.patches:
-        values = merged(values, patch)
+        values = merge_patch(values, patch)
         check_values(values, release.chart, config, file)
     return values
 

@@ -17,8 +17,8 @@ import jsonschema_rs
 import kubernetes_validate
 
 from demandops import strict_yaml
+from demandops.config.base_model import field_path
 from demandops.config.config import Config
-from demandops.config.file_model import field_path
 from demandops.config.override import OVERRIDES_ROOT
 from demandops.config.registry import ChartSource
 from demandops.errors import Fault, InvalidInput, fault

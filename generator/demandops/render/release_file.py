@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 
 from demandops.config.config import Config
-from demandops.config.override import Override, written
+from demandops.config.override import Override, format_time
 from demandops.plan.release import Release
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
@@ -56,7 +56,7 @@ def _join(comments: list[str], body: str) -> str:
 
 def override_comment(override: Override, effects: tuple[str, ...]) -> str:
     """Return the comment that names an override and its effects."""
-    until = f"until {written(override.end)}; " if override.end else ""
+    until = f"until {format_time(override.end)}; " if override.end else ""
     return (
         f"# override {override.path}: {', '.join(effects)}; priority {override.priority}; {until}"
         f"owner {override.owner}; reason: {override.reason}"
@@ -85,7 +85,7 @@ def kept_charts(
         current: the generated files in the state repo.
         config: the configuration.
     """
-    if not any(override.hold for override in config.in_force):
+    if not any(override.hold for override in config.active_overrides):
         return {}
     return {
         path: text

@@ -27,7 +27,7 @@ def render_trial_demands(config: Config, engine: Engine) -> None:
         for releases in invented.values()
         for fault in _render_faults(releases, config, engine)
     ]
-    for override in () if faults else config.in_force:
+    for override in () if faults else config.active_overrides:
         overridden = [
             list(trial_demands.overridden_releases(override, releases, appdef, config))
             for appdef, releases in invented.items()

@@ -34,7 +34,7 @@ def targets_of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...
                 continue
         release = new or old
         if release is not None:
-            targets.append(_target(release, config.repository, wanted=new is not None))
+            targets.append(_target(release, config.repo_settings, wanted=new is not None))
     return tuple(dict.fromkeys(targets))
 
 
@@ -44,14 +44,14 @@ def targets_of_state(state: State) -> list[tuple[Release, Target]]:
     for key in all_keys(state.ledger, state.config):
         release = plan(state.ledger, state.config, key)
         if release is not None:
-            target = _target(release, state.config.repository, wanted=True)
+            target = _target(release, state.config.repo_settings, wanted=True)
             releases.append((release, target))
     return sorted(releases, key=lambda pair: (pair[1].domain.cluster, pair[1].name))
 
 
 def _requested_subjects(request: DemandRequest, ledger: Ledger) -> list[Subject]:
     subjects = [claim.subject for claim in ledger.claims_of_demand(request.demand)]
-    if request.operation.asks:
+    if request.operation.adds_claims:
         subjects += [Subject(SubjectKind.APPLICATION, app.id) for app in request.applications]
         subjects += [Subject(SubjectKind.CONNECTION, link.id) for link in request.connections]
     return subjects

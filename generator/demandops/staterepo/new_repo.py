@@ -36,9 +36,9 @@ def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
     contents = _read(data_folder("skeleton"), "")
     contents |= _read(data_folder("appdefs"), "appdefs/")
     roots = {"flux": contents.pop(ROOT_FILE), "argocd": contents.pop("demandops.argocd.yaml")}
-    root = strict_yaml.edited(roots[gitops], "renderVersion", RENDER_VERSION)
+    root = strict_yaml.set_key(roots[gitops], "renderVersion", RENDER_VERSION)
     if url:
-        root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {strict_yaml.scalar(url)}", root)
+        root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {strict_yaml.to_json(url)}", root)
     contents[ROOT_FILE] = root
     config = load({p: text for p, text in contents.items() if p.split("/")[0] in CONFIG_ROOTS})
     return contents | rendered_files(State.of(config, Ledger()))

@@ -137,11 +137,11 @@ def _plan_upgrade(
     before = files[ROOT_FILE]
     files[ROOT_FILE] = _root(before, old, request)
     marked = last_valid_config.end_markers_at(tree)
-    config = load(files).with_ended(ended_override_file.read(marked))
+    config = load(files).with_ended_overrides(ended_override_file.read(marked))
     state = State.of(config, snapshot.state.ledger)
     applied = _with_changes_by_people(repository, snapshot, state, marked, now)
     state = replace(state, ledger=applied.ledger, config=applied.config)
-    if old.repository.gitops != config.repository.gitops:
+    if old.repo_settings.gitops != config.repo_settings.gitops:
         _refuse_held(state)
     changed = dict(batch.render_all(state, applied.files).files)
     if files[ROOT_FILE] != before:
@@ -186,18 +186,18 @@ def _refuse_held(state: State) -> None:
 
 def _root(text: str, config: Config, request: UpgradeRequest) -> str:
     """Return ``demandops.yaml`` with the requested changes; keep all else in it."""
-    repository = config.repository
+    repository = config.repo_settings
     gitops = request.gitops or repository.gitops
     try:
         if repository.render_version != RENDER_VERSION:
-            text = strict_yaml.edited(text, "renderVersion", RENDER_VERSION)
+            text = strict_yaml.set_key(text, "renderVersion", RENDER_VERSION)
         if repository.gitops != gitops:
-            text = strict_yaml.edited(text, "gitops", gitops)
+            text = strict_yaml.set_key(text, "gitops", gitops)
         section = getattr(repository, gitops)
         if section is None:
             # both controllers fetch the same repo, so the configured one names its URL
             known = getattr(repository, repository.gitops)
-            text = strict_yaml.edited(text, gitops, {"url": request.url or known.url})
+            text = strict_yaml.set_key(text, gitops, {"url": request.url or known.url})
         elif request.url not in (None, section.url):
             message = f"is {section.url} already; change it there, or leave out --url"
             raise InvalidInput([fault(f"{gitops}.url", message)])
@@ -216,7 +216,7 @@ def _person(objects: Repository, now: datetime) -> Signature:
 
 
 def _message(made: Upgrade, applied: LedgerUpdate) -> str:
-    old, new = made.old.repository, made.new.repository
+    old, new = made.old.repo_settings, made.new.repo_settings
     switched = old.gitops != new.gitops
     title = "Render everything again"
     if switched:

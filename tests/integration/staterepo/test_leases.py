@@ -106,7 +106,7 @@ def wait_for(moment: datetime) -> None:
 
 
 def ends(generator: Generator, demand: str) -> datetime:
-    return max(claim.lease.ends for claim in held(generator, demand) if claim.lease)
+    return max(claim.lease.expires_at for claim in held(generator, demand) if claim.lease)
 
 
 def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:

@@ -386,6 +386,5 @@ def test_nobody_takes_an_overrides_demand_id(generator: Generator) -> None:
     }
     with pytest.raises(InvalidInput) as refusal:
         rig.book(generator, goal)
-    assert "demand: starts with 'override:', as overrides do; choose another demand id" in str(
-        refusal.value
-    )
+    message = "demand: starts with 'override:', which only overrides may use; choose another"
+    assert message in str(refusal.value)

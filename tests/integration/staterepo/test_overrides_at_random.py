@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import staterepo_rig as rig
 import yaml
-from demandops.demand.claim import KEPT
+from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.errors import DemandOpsError
 from staterepo_rig import Person
 
@@ -90,7 +90,7 @@ def test_whatever_people_merge_history_verifies(address: str, bare: Path, tmp_pa
         rig.book(generator, rig.goal(8))
         snapshot = generator.snapshot
     assert snapshot.problems == ()
-    assert not any(claim.demand.startswith(KEPT) for claim in snapshot.state.ledger)
+    assert not any(claim.demand.startswith(OVERRIDE_PREFIX) for claim in snapshot.state.ledger)
     assert rig.git(bare, "ls-tree", "-r", "--name-only", "main", "ledger/overrides/") == ""
     texts = rig.git(
         bare, "grep", "-l", "# override overrides/", "main", "--", "clusters", check=False

@@ -49,14 +49,14 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     ),
     "a key twice": (
         NODES, "    type: vehicle\n", "    type: vehicle\n    type: edge\n",
-        ["line {next}, column 5: not valid YAML: the key 'type' stands twice"],
+        ["line {next}, column 5: not valid YAML: the key 'type' appears twice"],
     ),
     "an anchor": (
         NODES, "- id: vehicle00", "- id: &v vehicle00",
-        ["line {at}: anchors and aliases (& and *) are not taken; write it out"],
+        ["line {at}: anchors and aliases (& and *) are not allowed; write the value out"],
     ),
     "two documents": (
-        IMAGES, "kind: Images", "---\nkind: Images", ["holds 2 documents; only one is taken"],
+        IMAGES, "kind: Images", "---\nkind: Images", ["holds 2 documents; only one is allowed"],
     ),
     "a version that is not known": (
         NODES, "demandops/v1", "demandops/v2",
@@ -66,13 +66,14 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     "another kind": (NODES, "kind: Nodes", "kind: Node", ["kind: is 'Node', but must be 'Nodes'"]),
     "a field that does not exist": (
         NODES, "nodes:\n  -", "node: []\nnodes:\n  -",
-        ["node: is not a field here; remove it or mend its spelling; did you mean 'nodes'?"],
+        ["node: is not a field here; remove it or correct its spelling; did you mean 'nodes'?"],
     ),
     "a misspelt field of an item": (
         NODES, "    cluster: c-its\n", "    clutser: c-its\n",
         [
             "nodes[0].cluster: is missing; add it",
-            "nodes[0].clutser: is not a field here; remove it or mend its spelling; did you mean "
+            "nodes[0].clutser: is not a field here; remove it or correct its spelling; did you "
+            "mean "
             "'cluster'?",
         ],
     ),
@@ -93,8 +94,8 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
         "- id: twin\n    type: vehicle\n    cluster: c-its\n    zenoh: {}\n"
         "    selector: {host: a}\n  " + V1 + "    zenoh: {}\n    selector: {host: a}\n",
         [
-            "nodes[2].zenoh: 'twin' runs a bridge on the same host and ROS domain, and two do not "
-            "work; keep one"
+            "nodes[2].zenoh: 'twin' already runs a bridge on the same host and ROS domain; "
+            "remove one of them"
         ],
     ),
     "ports in the wrong order": (
@@ -107,7 +108,7 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     ),
     "a message type without its package": (
         NODES, V1, V1 + "    types: {/a: String}\n",
-        ["nodes[1].types./a: 'String' is no message type; write it like std_msgs/msg/String"],
+        ["nodes[1].types./a: 'String' is not a message type; write it like std_msgs/msg/String"],
     ),
     "topics that are bridged to a node that does not exist": (
         NODES, V1, V1 + "    bridged: {egde: [/a]}\n",
@@ -115,7 +116,7 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     ),
     "a password in Git": (
         BROKERS, "    port: 1883\n", "    port: 1883\n    credentials: {secret: a, password: b}\n",
-        ["brokers[0].credentials.password: is not a field here; remove it or mend its spelling"],
+        ["brokers[0].credentials.password: is not a field here; remove it or correct its spelling"],
     ),
     "credentials without the Secret that holds them": (
         BROKERS, "    port: 1883\n", "    port: 1883\n    credentials: {userKey: name}\n",
@@ -150,7 +151,7 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     # inventory/clusters.yaml
     "a cluster twice": (
         CLUSTERS, "  - name: c-its", "  - name: c-its\n  - name: c-its",
-        ["clusters[1].name: 'c-its' stands twice; remove one"],
+        ["clusters[1].name: 'c-its' appears twice; remove one"],
     ),
     "a cluster that is no folder": (
         CLUSTERS, "name: c-its", "name: ../c-its",
@@ -170,7 +171,7 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     ),
     "a node twice": (
         NODES, "id: vehicle01", "id: vehicle00",
-        ["nodes[1].id: 'vehicle00' stands twice; remove one"],
+        ["nodes[1].id: 'vehicle00' appears twice; remove one"],
     ),
     "a node that is a number": (
         NODES, "id: vehicle01", "id: 5", ["nodes[1].id: must be text, not 5; put it in quotes"],
@@ -211,7 +212,7 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
         ["brokers[0].node: 'clod' is not in nodes.yaml; did you mean 'cloud'?"],
     ),
     "two brokers on a node": (
-        BROKERS, "node: cloud", "node: edge", ["brokers[1].node: 'edge' stands twice; remove one"],
+        BROKERS, "node: cloud", "node: edge", ["brokers[1].node: 'edge' appears twice; remove one"],
     ),
     "a port beyond the last": (
         BROKERS, "port: 1883", "port: 70000",
@@ -242,21 +243,21 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
         DOMAINS, "domains:\n",
         "domains:\n  - name: other\n    namespace: perception\n    nodes: [nobody]\n",
         [
-            "domains[1].namespace: 'perception' is the namespace of 'other' already; give each its "
-            "own"
+            "domains[1].namespace: 'perception' is already the namespace of 'other'; give each "
+            "its own"
         ],
     ),
     "a domain twice": (
         DOMAINS, "domains:\n",
         "domains:\n  - name: perception\n    namespace: other\n    nodes: [nobody]\n",
-        ["domains[1].name: 'perception' stands twice; remove one"],
+        ["domains[1].name: 'perception' appears twice; remove one"],
     ),
     # registry/charts.yaml
     "a chart's folder that does not exist": (
         CHARTS, CHART, f"{CHART}s",
         [
-            f"charts.object-detection.folder: '{CHART}s/Chart.yaml' does not exist; mend the "
-            "folder"
+            f"charts.object-detection.folder: '{CHART}s/Chart.yaml' does not exist; correct the "
+            f"folder"
         ],
     ),
     "a chart outside": (
@@ -267,7 +268,7 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
         CHARTS, "version: 0.1.0", "version: 0.1.1",
         [
             f"charts.object-detection.version: is 0.1.1, but {CHART}/Chart.yaml says 0.1.0; make "
-            "them one"
+            f"them equal"
         ],
     ),
     "a chart's version that is none": (
@@ -295,7 +296,7 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     "a chart's address with a password": (
         CHARTS, FOLDER, "    http: https://me:secret@charts.example.org\n",
         [
-            "charts.object-detection: must hold no user or password; give it to the GitOps "
+            "charts.object-detection: must not contain a user or password; give them to the GitOps "
             "controller as a Secret"
         ],
     ),
@@ -322,7 +323,7 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     ),
     "an MQTT client that is missing": (
         IMAGES, "  mqtt-client:", "  mqtt-clint:",
-        ["images: 'mqtt-client' is missing; MQTT connections run it"],
+        ["images: 'mqtt-client' is missing; add it, because MQTT connections run it"],
     ),
     # appdefs/*/appdef.yaml
     "an input that does not exist": (
@@ -333,15 +334,14 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     "both each and inputs": (
         APPDEF, "each: point_cloud\n", "each: point_cloud\n    inputs: {ego_data: ego_data}\n",
         [
-            "services.object-detection: 'each' already says what the service takes in; remove "
-            "'inputs'"
+            "services.object-detection: 'each' already names the service's input; remove 'inputs'"
         ],
     ),
     "a source for an application": (
         APPDEF, "prefix: of\n", "prefix: of\n    placement: source\n",
         [
-            "services.object-fusion: placement 'source' needs 'each': an application has no one "
-            "source"
+            "services.object-fusion: placement 'source' needs 'each': an application has no "
+            "single source"
         ],
     ),
     "an output that does not exist": (
@@ -369,13 +369,13 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     ),
     "a prefix that connections have": (
         APPDEF, "prefix: of", "prefix: mqtt",
-        ["services.object-fusion.prefix: 'mqtt' names connections; choose another"],
+        ["services.object-fusion.prefix: 'mqtt' is the prefix of connections; choose another"],
     ),
     "a prefix of two services": (
         APPDEF, "prefix: of", "prefix: od",
         [
-            "services.object-fusion.prefix: 'od' is used by 'object-detection' already; only a "
-            "service for each topic may stand in several appdefs, and then must be the same in all"
+            "services.object-fusion.prefix: 'od' is used by 'object-detection' already; choose "
+            "another (only identical services with 'each' may share a prefix)"
         ],
     ),
     "a prefix with a dash": (
@@ -414,8 +414,7 @@ EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     "bounds the wrong way round": (
         APPDEF, "prefix: of\n", "prefix: of\n    scaling: {min: 3, max: 2}\n",
         [
-            "services.object-fusion.scaling: min 3 is above max 2; lower the one or raise the "
-            "other"
+            "services.object-fusion.scaling: min 3 is above max 2; lower min or raise max"
         ],
     ),
     "no topic for a replica": (
@@ -454,7 +453,7 @@ def test_a_mistake_is_told_with_file_field_and_remedy(name: str) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "is missing; `demandops init` shows what it holds"),
+        (None, "is missing; `demandops init` creates an example"),
         ("", "must be a mapping that starts with apiVersion: demandops/v1"),
         ("- a\n", "must be a mapping that starts with apiVersion: demandops/v1"),
         ("a: [\n", "line 2, column 1: not valid YAML: did not find expected node content"),
@@ -477,12 +476,12 @@ class TestArgoCd:
 
     def test_a_url_is_enough(self) -> None:
         config = load(configuration(self.root(url="https://git.example/state.git")))
-        assert config.repository.argocd
-        assert config.repository.argocd.namespace == "argocd"
+        assert config.repo_settings.argocd
+        assert config.repo_settings.argocd.namespace == "argocd"
 
     def test_the_other_controllers_section_may_stay(self) -> None:
         text = skeleton()[ROOT] + "argocd:\n  url: https://git.example/state.git\n"
-        assert load(configuration({ROOT: text})).repository.gitops == "flux"
+        assert load(configuration({ROOT: text})).repo_settings.gitops == "flux"
 
     def test_a_section_without_its_url(self) -> None:
         assert faults(self.root(namespace="argo")) == [f"{ROOT}: argocd.url: is missing; add it"]
@@ -490,14 +489,14 @@ class TestArgoCd:
     def test_a_field_of_fluxs(self) -> None:
         found = faults(self.root(url="https://git.example/state.git", interval="1m"))
         assert found == [
-            f"{ROOT}: argocd.interval: is not a field here; remove it or mend its spelling"
+            f"{ROOT}: argocd.interval: is not a field here; remove it or correct its spelling"
         ]
 
     def test_a_domain_in_argo_cds_own_namespace(self) -> None:
         root = self.root(url="https://git.example/state.git", namespace="perception")
         assert faults(root) == [
-            f"{DOMAINS}: domains[0].namespace: 'perception' is Argo CD's own, where whoever may "
-            "write an Application may do all that Argo CD may; choose another"
+            f"{DOMAINS}: domains[0].namespace: 'perception' is Argo CD's own namespace, where an "
+            f"Application may do all that Argo CD may; choose another"
         ]
 
 
@@ -557,7 +556,7 @@ class TestNodes:
         self, field: str, name: str, meant: str
     ) -> None:
         (found,) = faults(edited(NODES, V1, f"{V1}    {field}\n"))
-        message = f"{NODES}: {name}: is not a field here; remove it or mend its spelling"
+        message = f"{NODES}: {name}: is not a field here; remove it or correct its spelling"
         assert found in (message, f"{message}; did you mean '{meant}'?")
 
     def test_every_node_of_an_unknown_cluster_is_told(self) -> None:
@@ -582,8 +581,8 @@ class TestAppdefs:
 
     def test_a_name_that_is_not_the_folders_is_one_fault(self) -> None:
         assert faults(edited(APPDEF, "name: object-detection-fusion", "name: fusion")) == [
-            f"{APPDEF}: name: is 'fusion', but the folder is 'object-detection-fusion'; make them "
-            "one"
+            f"{APPDEF}: name: is 'fusion', but the folder is 'object-detection-fusion'; make "
+            f"them equal"
         ]
 
     def test_an_output_with_letters_that_ros_forbids_is_refused(self) -> None:
@@ -606,8 +605,7 @@ class TestAppdefs:
         )
         assert found[0] == (
             f"{APPDEF}: services.object-fusion.prefix: 'of' is used by 'object-fusion' already; "
-            "only a service for each topic may stand in several appdefs, and then must be the same "
-            "in all"
+            f"choose another (only identical services with 'each' may share a prefix)"
         )
 
     def test_a_shared_service_with_two_templates_is_told(self) -> None:

@@ -229,7 +229,7 @@ class TestValues:
 
     def test_a_key_twice(self) -> None:
         (found,) = appended("hostNetwork: true\n")
-        assert "not valid YAML: the key 'hostNetwork' stands twice" in found
+        assert "not valid YAML: the key 'hostNetwork' appears twice" in found
 
     @pytest.mark.parametrize("text", ["", "- a\n", "true\n", "{# nothing #}", "~\n"])
     def test_no_mapping(self, text: str) -> None:

@@ -94,9 +94,11 @@ class TestAutomaticChoice:
 
     def test_where_nothing_can_carry_it_each_is_told(self) -> None:
         assert faults(state("", brokers=False), demand()) == [
-            "connections[0].type: is open, and nothing can carry it. ZENOH: 2 (ZENOH) needs an "
-            "image 'zenoh-bridge'; add it to registry/images.yaml; MQTT: broker is open, and no "
-            "broker runs on 'edge' or 'vehicle00'; inventory/brokers.yaml has none; add one there; "
+            "connections[0].type: is not given, and no type can carry it. ZENOH: 2 (ZENOH) needs "
+            "an "
+            "image 'zenoh-bridge'; add it to registry/images.yaml; MQTT: broker is not given, "
+            "and no broker runs on 'edge' or 'vehicle00'; inventory/brokers.yaml has none; add "
+            "one there; "
             "ROS: 0 (ROS) needs an image 'dds-router'; add it to registry/images.yaml"
         ]
 
@@ -142,8 +144,8 @@ class TestOptions:
         (name,) = options
         found = state(vehicle00=SPEAKS | TYPED, edge=REACHABLE | WAN)
         assert faults(found, demand(kind, {"/a": options})) == [
-            f"connections[0].topics[0].{name}: {name} of '/a' is nothing that {kind.upper()} can "
-            f"do; leave it out, or use type {able}"
+            f"connections[0].topics[0].{name}: {name} of '/a' is not supported by "
+            f"{kind.upper()}; leave it out, or use type {able}"
         ]
 
     @pytest.mark.parametrize("kind", ["zenoh", "ros"])
@@ -158,7 +160,7 @@ class TestOptions:
     def test_a_broker_is_of_mqtt_only(self, kind: str) -> None:
         found = state(vehicle00=SPEAKS | TYPED, edge=REACHABLE | WAN)
         assert faults(found, demand(kind, broker="edge")) == [
-            f"connections[0].broker: is of MQTT only, and this is {kind.upper()}; leave it out"
+            f"connections[0].broker: is for MQTT only, and the type is {kind.upper()}; leave it out"
         ]
 
     @pytest.mark.parametrize("kind", ["zenoh", "ros"])
@@ -177,14 +179,15 @@ class TestZenoh:
     def test_a_node_without_a_bridge(self) -> None:
         assert faults(state(edge=REACHABLE), demand("zenoh")) == [
             "connections[0].source: 'vehicle00' runs no Zenoh bridge; add zenoh: {endpoint: …} to "
-            "it in inventory/nodes.yaml, or zenoh: {} where others can be reached from it"
+            "it in inventory/nodes.yaml, or zenoh: {} if it can reach others"
         ]
 
     def test_no_way_between_the_two(self) -> None:
         one = {"zenoh": {"connect": ["tcp/a:1"]}}
         other = {"zenoh": {"connect": ["tcp/b:1"]}}
         assert faults(state(vehicle00=one, edge=other), demand("zenoh")) == [
-            "connections[0].type: 2 (ZENOH) finds no way between 'vehicle00' and 'edge'; give one "
+            "connections[0].type: 2 (ZENOH) finds no route between 'vehicle00' and 'edge'; give "
+            "one "
             "of them an endpoint under zenoh in inventory/nodes.yaml, or both one router under "
             "connect"
         ]
@@ -206,14 +209,14 @@ class TestRos:
 
     def test_no_address(self) -> None:
         assert faults(state(vehicle00=TYPED), demand("ros")) == [
-            "connections[0].type: 0 (ROS) needs an address that one end can be reached at; add "
+            "connections[0].type: 0 (ROS) needs an end with a reachable address; add "
             "wan: {host: …} to 'vehicle00' or 'edge' in inventory/nodes.yaml"
         ]
 
     def test_no_message_type(self) -> None:
         assert faults(state(edge=WAN), demand("ros")) == [
             "connections[0].topics[0].type: the message type of '/a' is not known, and ROS needs "
-            "it; say it in the request where it has a field for it, or add it to types of "
+            "it; give it in the request if it has a field for it, or add it to types of "
             "'vehicle00' in inventory/nodes.yaml"
         ]
 
@@ -225,7 +228,8 @@ class TestRos:
     def test_durability_needs_reliability(self) -> None:
         asked = demand("ros", {"/a": {"durability": "volatile"}})
         assert faults(state(vehicle00=TYPED, edge=WAN), asked) == [
-            "connections[0].topics[0].reliability: is open while durability of '/a' is set; ROS "
+            "connections[0].topics[0].reliability: is not given, but durability of '/a' is set; "
+            "ROS "
             "needs both, add it"
         ]
 

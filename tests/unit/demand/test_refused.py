@@ -28,24 +28,25 @@ C0 = "connections[0]"
 REFUSED: dict[str, tuple[Goal, list[str]]] = {
     "an application type that no definition has": (
         goal([application(type=9)]),
-        ["apps[0].type: 9 names no application definition; known: 1 (object-detection-fusion)"],
+        ["apps[0].type: 9 is not a known application type; known: 1 (object-detection-fusion)"],
     ),
     "an application without a type": (
         goal([{key: value for key, value in application().items() if key != "type"}]),
-        ["apps[0].type: 0 names no application definition; known: 1 (object-detection-fusion)"],
+        ["apps[0].type: 0 is not a known application type; known: 1 (object-detection-fusion)"],
     ),
     "a connection type that does not exist": (
         goal([], [connection(type=3)]),
-        [f"{C0}.type: 3 is no connection type; {TYPES}"],
+        [f"{C0}.type: 3 is not a connection type; {TYPES}"],
     ),
     "a ROS connection, for which the inventory has nothing": (
         goal([], [connection(type=0, broker="", topics=["/a"])]),
         [
             f"{C0}.type: 0 (ROS) needs an image 'dds-router'; add it to registry/images.yaml",
-            f"{C0}.type: 0 (ROS) needs an address that one end can be reached at; add wan: "
+            f"{C0}.type: 0 (ROS) needs an end with a reachable address; add wan: "
             "{host: …} to 'vehicle00' or 'edge' in inventory/nodes.yaml",
-            f"{C0}.source_topics[0]: the message type of '/a' is not known, and ROS needs it; say "
-            "it in the request where it has a field for it, or add it to types of 'vehicle00' in "
+            f"{C0}.source_topics[0]: the message type of '/a' is not known, and ROS needs it; "
+            f"give it in the request if it has a field for it, or add it to types of 'vehicle00' "
+            f"in "
             "inventory/nodes.yaml",
         ],
     ),
@@ -55,7 +56,7 @@ REFUSED: dict[str, tuple[Goal, list[str]]] = {
             f"{C0}.type: 2 (ZENOH) needs an image 'zenoh-bridge'; add it to registry/images.yaml",
             *(
                 f"{C0}.{end}_node_id: '{node}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to "
-                "it in inventory/nodes.yaml, or zenoh: {} where others can be reached from it"
+                "it in inventory/nodes.yaml, or zenoh: {} if it can reach others"
                 for end, node in (("source", "vehicle00"), ("target", "edge"))
             ),
         ],
@@ -64,10 +65,10 @@ REFUSED: dict[str, tuple[Goal, list[str]]] = {
         goal([], [connection(type=2)]),
         [
             f"{C0}.type: 2 (ZENOH) needs an image 'zenoh-bridge'; add it to registry/images.yaml",
-            f"{C0}.broker_node_id: is of MQTT only, and this is ZENOH; leave it out",
+            f"{C0}.broker_node_id: is for MQTT only, and the type is ZENOH; leave it out",
             *(
                 f"{C0}.{end}_node_id: '{node}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to "
-                "it in inventory/nodes.yaml, or zenoh: {} where others can be reached from it"
+                "it in inventory/nodes.yaml, or zenoh: {} if it can reach others"
                 for end, node in (("source", "vehicle00"), ("target", "edge"))
             ),
         ],
@@ -101,15 +102,15 @@ REFUSED: dict[str, tuple[Goal, list[str]]] = {
     "an open broker, with several and none at either end": (
         goal([], [connection(broker="", ends=("vehicle00", "vehicle01"))]),
         [
-            f"{C0}.broker_node_id: is open, and no broker runs on 'vehicle01' or 'vehicle00'; "
+            f"{C0}.broker_node_id: is not given, and no broker runs on 'vehicle01' or 'vehicle00'; "
             "name one of: cloud, edge"
         ],
     ),
     "nobody for whom it is asked": (
         goal([application(who=[])], [connection(who=[])]),
         [
-            f"{BODY}.requester_ids: is empty; say for whom this is asked",
-            f"{C0}.requester_ids: is empty; say for whom this is asked",
+            f"{BODY}.requester_ids: is empty; list at least one requester",
+            f"{C0}.requester_ids: is empty; list at least one requester",
         ],
     ),
     "a requester without a name": (
@@ -144,7 +145,7 @@ REFUSED: dict[str, tuple[Goal, list[str]]] = {
     "a topic that would feed itself": (
         goal([], [connection(ends=("edge", "edge"), topics=["/a"])]),
         [
-            f"{C0}.target_topics[0]: '/a' would feed itself, for source and target are both "
+            f"{C0}.target_topics[0]: '/a' would feed itself, because source and target are both "
             "'edge'; name another target node or topic"
         ],
     ),
@@ -176,10 +177,10 @@ REFUSED: dict[str, tuple[Goal, list[str]]] = {
     "ids with white space around them": (
         goal([application(" a", who=["b\u3000"])], [connection(" ")], id="c\n"),
         [
-            r"id: 'c\n' starts or ends with white space; take it away",
-            "apps[0].header.id: ' a' starts or ends with white space; take it away",
-            rf"{BODY}.requester_ids[0]: 'b\u3000' starts or ends with white space; take it away",
-            f"{C0}.id: ' ' starts or ends with white space; take it away",
+            r"id: 'c\n' starts or ends with white space; remove it",
+            "apps[0].header.id: ' a' starts or ends with white space; remove it",
+            rf"{BODY}.requester_ids[0]: 'b\u3000' starts or ends with white space; remove it",
+            f"{C0}.id: ' ' starts or ends with white space; remove it",
         ],
     ),
     "line separators that only some programs see": (
@@ -210,8 +211,8 @@ REFUSED: dict[str, tuple[Goal, list[str]]] = {
     "ids longer than any name": (
         goal([application("x" * 1025)], [connection("y" * 1025)]),
         [
-            "apps[0].header.id: has 1025 characters; at most 1024 are taken",
-            f"{C0}.id: has 1025 characters; at most 1024 are taken",
+            "apps[0].header.id: has 1025 characters; at most 1024 are allowed",
+            f"{C0}.id: has 1025 characters; at most 1024 are allowed",
         ],
     ),
     "ids that are missing": (
@@ -296,7 +297,7 @@ def test_without_any_broker_the_file_to_mend_is_told() -> None:
 
 def test_a_request_for_nothing_is_refused() -> None:
     (found,) = Books().faults(goal())
-    assert "the request lists no application and no connection; list what " in found
+    assert "the request lists no application and no connection; list at least one" in found
 
 
 def test_a_node_in_no_access_domain_is_refused() -> None:
@@ -305,8 +306,8 @@ def test_a_node_in_no_access_domain_is_refused() -> None:
     books = Books({path: text + 'nodes: ["vehicle*", "station*"]}\n'})
     remedy = "a platform engineer adds it to policy/access-domains.yaml"
     assert books.faults(perception()) == [
-        f"apps[0].header.node_id: 'edge' is in no access domain; {remedy}",
-        f"connections[0].target_node_id: 'edge' is in no access domain; {remedy}",
+        f"apps[0].header.node_id: 'edge' is not in any access domain; {remedy}",
+        f"connections[0].target_node_id: 'edge' is not in any access domain; {remedy}",
     ]
 
 
@@ -460,17 +461,17 @@ def test_every_fault_of_a_request_is_told_at_once() -> None:
             r"id: 'a\nb' holds the control character U+000A; choose an id without it",
             "apps[0].header.id: '..' holds '..'; choose an id without it",
             f"apps[0].header.node_id: 'Mars' is not in inventory/nodes.yaml; known: {NODES}",
-            f"{BODY}.requester_ids: is empty; say for whom this is asked",
+            f"{BODY}.requester_ids: is empty; list at least one requester",
             f"{BODY}.ego_data_topics[0].topic_name: '/a b' {ROS_NAMES}",
             f"{BODY}.ego_data_topics[0].source_node_id: 'Mars' is not in inventory/nodes.yaml; "
             f"known: {NODES}",
-            "apps[0].type: 7 names no application definition; known: 1 (object-detection-fusion)",
+            "apps[0].type: 7 is not a known application type; known: 1 (object-detection-fusion)",
             f"{C0}.id: is empty; give an id",
             f"{C0}.requester_ids[0]: is empty; give an id",
             f"{C0}.source_node_id: 'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",
             f"{C0}.target_topics: has 0 names for 1 in source_topics; source topic i goes to "
             "target topic i, so list as many of each",
-            f"{C0}.type: 5 is no connection type; {TYPES}",
+            f"{C0}.type: 5 is not a connection type; {TYPES}",
         ]
     )
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from demandops.demand import transport_choice
-from demandops.demand.route import Route, RouteOptions, differences, faults, parse, united
+from demandops.demand.route import Route, RouteOptions, contradictions, faults, merge_routes, parse
 
 OPTIONS: dict[str, object] = {
     "type": "std_msgs/msg/String",
@@ -47,7 +47,7 @@ def test_options_and_routes_have_the_same_fields_and_defaults() -> None:
 
 
 def test_every_option_does_something_in_some_client() -> None:
-    honoured = set().union(*transport_choice.HONOURED.values())
+    honoured = set().union(*transport_choice.SUPPORTED_OPTIONS.values())
     assert honoured == RouteOptions.model_fields.keys() - {"type", "reverse"}
 
 
@@ -71,11 +71,11 @@ def test_every_option_does_something_in_some_client() -> None:
         ),
         (
             {"type": "String"},
-            "t.type: 'String' is no message type; write it like std_msgs/msg/String",
+            "t.type: 'String' is not a message type; write it like std_msgs/msg/String",
         ),
         (
             {"qso": 1},
-            "t.qso: is not a field here; remove it or mend its spelling; did you mean 'qos'?",
+            "t.qso: is not a field here; remove it or correct its spelling; did you mean 'qos'?",
         ),
     ],
 )
@@ -111,15 +111,23 @@ def test_two_topics_may_arrive_as_one() -> None:
 
 def test_a_type_that_is_not_said_contradicts_none_and_is_filled_in() -> None:
     plain, typed = Route("/a", "/a"), Route("/a", "/a", type="std_msgs/msg/String")
-    assert not list(differences(plain, typed))
-    assert united([plain, typed]) == united([typed, plain]) == {"/a": typed}
+    assert not list(contradictions(plain, typed))
+    assert merge_routes([plain, typed]) == merge_routes([typed, plain]) == {"/a": typed}
     other = Route("/a", "/a", type="std_msgs/msg/Bool")
-    assert list(differences(typed, other)) == [
+    assert list(contradictions(typed, other)) == [
         ("type", "'std_msgs/msg/String'", "'std_msgs/msg/Bool'")
     ]
 
 
 def test_where_messages_come_from_and_arrive() -> None:
     there, back = Route("/a", "/b"), Route("/a", "/b", reverse=True)
-    assert (there.read, there.written, there.ends("s", "t")) == ("/a", "/b", ("s", "t"))
-    assert (back.read, back.written, back.ends("s", "t")) == ("/b", "/a", ("t", "s"))
+    assert (there.read_topic, there.written_topic, there.sender_and_receiver("s", "t")) == (
+        "/a",
+        "/b",
+        ("s", "t"),
+    )
+    assert (back.read_topic, back.written_topic, back.sender_and_receiver("s", "t")) == (
+        "/b",
+        "/a",
+        ("t", "s"),
+    )

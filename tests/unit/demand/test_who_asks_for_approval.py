@@ -118,12 +118,12 @@ def test_dropping_renewing_and_releasing_need_none() -> None:
 def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     from asking import NOW
     from demandops.decision import decide
-    from demandops.demand.approval_rule import proposed
+    from demandops.demand.approval_rule import with_leases_from_approval
     from demandops.ledger import claim_file
 
     books = Books(policy(approval="required"))
     decision = decide(books.state, put(lease=60), NOW, books.files.get)
-    waiting = decide(books.state, proposed(decision.request), NOW, books.files.get)
+    waiting = decide(books.state, with_leases_from_approval(decision.request), NOW, books.files.get)
     [claim] = [
         one for one in waiting.state.ledger.claims_of_demand("d") if "edge" in one.subject.id
     ][:1]
@@ -136,7 +136,7 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     assert claim_file.read(text, path) == claim
     found = {one.key for one in waiting.state.ledger.unstarted_claims()}
     assert found == {one.key for one in waiting.state.ledger.claims_of_demand("d")}
-    later = claim.lease.begun(NOW)
+    later = claim.lease.restarted(NOW)
     assert (later.seconds, (later.until - NOW).total_seconds()) == (60, 60)
     assert waiting.state.ledger.ended_claims(NOW.replace(year=2100)) == ()
 

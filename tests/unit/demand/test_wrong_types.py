@@ -18,12 +18,16 @@ WRONG: dict[str, tuple[object, list[str]]] = {
     ),
     "an unknown field, misspelt": (
         perception(shutdwon=True),
-        ["shutdwon: is not a field here; remove it or mend its spelling; did you mean 'shutdown'?"],
+        [
+            "shutdwon: is not a field here; remove it or correct its spelling; did you mean "
+            "'shutdown'?"
+        ],
     ),
     "an unknown field, like none": (
         perception(qos=1),
         [
-            "qos: is not a field here; remove it or mend its spelling; known: apps, connections, "
+            "qos: is not a field here; remove it or correct its spelling; known: apps, "
+            "connections, "
             "id, shutdown"
         ],
     ),
@@ -65,7 +69,7 @@ def test_faults_of_form_and_of_content_are_told_together() -> None:
     )
     assert sorted(Books().faults(asked)) == sorted(
         [
-            "apps[0].typ: is not a field here; remove it or mend its spelling",
+            "apps[0].typ: is not a field here; remove it or correct its spelling",
             "connections[0].type: input should be less than or equal to 255, not 300",
             "id: '..' holds '..'; choose an id without it",
             "apps[0].header.node_id: 'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",

@@ -188,7 +188,8 @@ def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
         ("{forge: github, url: 'https://github.com/its'}", "needs url, the project's address"),
         (
             "{forge: gitea, url: 'http://git.example.org/a/b'}",
-            "proposals.url: 'http://git.example.org/a/b' is no address that a token is sent to",
+            "proposals.url: 'http://git.example.org/a/b' is not an address that a token may be "
+            "sent to",
         ),
         ("{forge: gitea, url: 'https://me:secret@x.org/a/b'}", "proposals.url: "),
         ("{forge: none, api: 'https://x.org/a'}", "api: is not used with forge: none"),

@@ -15,7 +15,7 @@ from demandops.demand.claim import (
     demand_id,
 )
 from demandops.demand.demand_request import ConnectionType, InputTopic, id_problem
-from demandops.demand.route import Route, united
+from demandops.demand.route import Route, merge_routes
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from hypothesis import given
@@ -110,7 +110,7 @@ def connection_claims(draw: st.DrawFn) -> ConnectionClaim:
         source=draw(ids),
         target=draw(ids),
         broker=draw(st.just("") | ids),
-        topics=MappingProxyType(united(draw(st.lists(routes, min_size=1, max_size=4)))),
+        topics=MappingProxyType(merge_routes(draw(st.lists(routes, min_size=1, max_size=4)))),
     )
 
 

@@ -16,7 +16,7 @@ from demandops.decision import Decision, State
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim
 from demandops.demand.demand_request import ConnectionType, InputTopic
 from demandops.demand.lease import LONGEST_S, Lease
-from demandops.demand.route import Route, united
+from demandops.demand.route import Route, merge_routes
 from demandops.identifiers import id_problem
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
@@ -204,7 +204,7 @@ def assert_recorded(world: running.World, promises: Promises) -> None:
         assert (claim.lease is None) == (promised is None)
         if claim.lease is not None and promised is not None:
             end = running.START + timedelta(seconds=promised)
-            assert claim.lease.until <= end <= claim.lease.ends
+            assert claim.lease.until <= end <= claim.lease.expires_at
 
 
 @examples(90)
@@ -227,7 +227,7 @@ def test_what_was_promised_is_kept(random: Random, length: int) -> None:
         assert_outcome(taken, expected, promises)
         assert claims_of(world) == promises.claims()
         assert_recorded(world, promises)
-        if isinstance(taken, Decision) and taken.request.operation.asks:
+        if isinstance(taken, Decision) and taken.request.operation.adds_claims:
             again = world.take(goal)
             assert isinstance(again, Decision)
             assert (again.outcome, dict(again.files)) == ("unchanged", {})
@@ -300,7 +300,9 @@ connections = st.builds(
     source=ids,
     target=ids,
     broker=st.just("") | ids,
-    topics=st.lists(routes, min_size=1, max_size=3).map(lambda r: MappingProxyType(united(r))),
+    topics=st.lists(routes, min_size=1, max_size=3).map(
+        lambda r: MappingProxyType(merge_routes(r))
+    ),
     **common,
 )
 
@@ -333,13 +335,13 @@ def test_the_index_is_that_of_a_ledger_built_in_any_order(
         again.index,
         again.minutes,
     )
-    ends = [claim.lease.ends for claim in rest if claim.lease]
+    ends = [claim.lease.expires_at for claim in rest if claim.lease]
     assert ledger.next_lease_end() == min(ends, default=None)
     for now in ends:
         gone = ledger.ended_claims(now)
         assert {claim.key for claim in gone} == {
-            claim.key for claim in rest if claim.lease and claim.lease.ends < now
+            claim.key for claim in rest if claim.lease and claim.lease.expires_at < now
         }
-        assert [c.lease.ends for c in gone if c.lease] == sorted(
-            c.lease.ends for c in gone if c.lease
+        assert [c.lease.expires_at for c in gone if c.lease] == sorted(
+            c.lease.expires_at for c in gone if c.lease
         )

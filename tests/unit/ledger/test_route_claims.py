@@ -16,7 +16,7 @@ from demandops.demand.demand_request import (
     DemandRequest,
     Operation,
 )
-from demandops.demand.route import Route, united
+from demandops.demand.route import Route, merge_routes
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger import claim_file
 from demandops.ledger.apply import apply
@@ -37,7 +37,7 @@ def claim(*routes: Route, kind: ConnectionType = ConnectionType.MQTT) -> Connect
         source="s",
         target="t",
         broker="",
-        topics=MappingProxyType(united(routes)),
+        topics=MappingProxyType(merge_routes(routes)),
     )
 
 
@@ -75,7 +75,10 @@ class TestFiles:
         ("written", "expected"),
         [
             ("{qos: 1}", "topics./a.target: is missing; add it"),
-            ("{target: /b, qso: 1}", "topics./a.qso: is not a field here; remove it or mend its"),
+            (
+                "{target: /b, qso: 1}",
+                "topics./a.qso: is not a field here; remove it or correct its",
+            ),
             ("{target: /b, qos: 7}", "topics./a.qos: input should be less than or equal to 2"),
             ("{target: /b, reverse: 1}", "topics./a.reverse: must be true or false, not 1"),
             ("[/b]", "topics./a: must be a mapping, not ['/b']"),

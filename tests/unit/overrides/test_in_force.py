@@ -14,8 +14,8 @@ import pytest
 import yaml
 from asking import CLOUD, EGO, NOW, STATION_CLOUD, Books, application, connection, goal
 from demandops.decision import decide, rendered_files
-from demandops.demand.claim import KEPT, Subject, SubjectKind
-from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.demand.claim import Subject, SubjectKind
+from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest, Operation
 from demandops.errors import InvalidInput, Refused
 from demandops.plan.views.bookkeeping import bookkeeping
 from hypothesis import given, settings
@@ -92,7 +92,7 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
         for claim in ledger:
             suspended = "eve" in claim.requesters or claim.subject.id == "v2/edge"
             assert ((claim.subject.id, claim.demand) in told) is suspended
-            if claim.demand.startswith(KEPT):
+            if claim.demand.startswith(OVERRIDE_PREFIX):
                 assert claim.requesters == ("petra",)
                 assert ledger.claims_on(claim.subject) == (claim,), "it gives way to any other"
         for entry in entries.services.values():

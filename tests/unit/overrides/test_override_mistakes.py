@@ -44,7 +44,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "nothing selected": ({"select": None}, ["select: is missing; add it"]),
     "a reason of two lines": (
         {"reason": "one\ntwo"},
-        ["reason: 'one\\ntwo' is more than one line of plain text; make it one"],
+        ["reason: 'one\\ntwo' is more than one line of plain text; write one line"],
     ),
     "an empty reason": (
         {"reason": " "},
@@ -54,22 +54,25 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
         {"owner": "a\u202eb"},
         ["owner: 'a\\u202eb' holds the control character U+202E; choose an id without it"],
     ),
-    "an empty list": ({"select": []}, ["select: is empty or holds nothing; say what is selected"]),
+    "an empty list": (
+        {"select": []},
+        ["select: is empty or has an empty item; name what to select"],
+    ),
     "an empty selector": (
         {"select": [{}]},
-        ["select[0]: selects nothing; give at least one field, nodes: ['*'] say"],
+        ["select[0]: selects nothing; give at least one field, for example nodes: ['*']"],
     ),
     "no pattern": (
         {"select": [{"nodes": []}]},
-        ["select[0].nodes: is empty or holds nothing; say what is selected"],
+        ["select[0].nodes: is empty or has an empty item; name what to select"],
     ),
     "a pattern forgotten": (
         {"select": [{"nodes": None, "services": ["*"]}]},
-        ["select[0]: nodes: nothing stands there; fill it in, or remove it"],
+        ["select[0]: nodes: has no value; fill it in, or remove it"],
     ),
     "an end forgotten": (
         {"expires": EMPTY},
-        ["expires: nothing stands there; fill it in, or remove it"],
+        ["expires: has no value; fill it in, or remove it"],
     ),
     "a pattern that is no list": (
         {"select": [{"nodes": "edge"}]},
@@ -77,15 +80,18 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "a misspelt field": (
         {"select": [{"node": ["edge"]}]},
-        ["select[0].node: is not a field here; remove it or mend its spelling"],
+        ["select[0].node: is not a field here; remove it or correct its spelling"],
     ),
     "a misspelt effect": (
         {"replica": 2},
-        ["replica: is not a field here; remove it or mend its spelling; did you mean 'replicas'?"],
+        [
+            "replica: is not a field here; remove it or correct its spelling; did you mean "
+            "'replicas'?"
+        ],
     ),
     "a connection of an application": (
         {"select": [{"connections": ["*"], "services": ["*"]}]},
-        ["select[0]: connections and services never fit the same thing; write two selectors"],
+        ["select[0]: connections and services never match the same thing; write two selectors"],
     ),
     "no effect": (
         {"replicas": None},
@@ -96,21 +102,18 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "deny and more": (
         {"deny": True, "version": "0.1.0"},
-        ["deny keeps it from running, so version and replicas can do nothing; keep one of them"],
+        ["deny prevents it from running, so version and replicas cannot apply; remove one of them"],
     ),
     "hold and more": (
         {"hold": True, "values": {"a": 1}},
-        [
-            "hold freezes the release as it is, so values and replicas cannot change it; keep one "
-            "of them"
-        ],
+        ["hold freezes the release, so values and replicas cannot change it; remove one of them"],
     ),
     "hold that does not": ({"hold": False}, ["hold: is False, but must be True"]),
     "a connection moved": (
         {"select": [{"connections": ["*"]}], "replicas": None, "node": "cloud"},
         [
-            "select[0].connections: node is for services, and a connection has none; remove the "
-            "one or the other"
+            "select[0].connections: node is for services, and connections have none; remove one "
+            "of the two"
         ],
     ),
     "a service kept": (
@@ -119,19 +122,19 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "no time": (
         {"expires": "tomorrow"},
-        ["expires: 'tomorrow' is no time with a time zone; write one like 2026-01-31T12:00:00Z"],
+        ["expires: 'tomorrow' is not a time with a time zone; write one like 2026-01-31T12:00:00Z"],
     ),
     "a time without zone": (
         {"expires": "2026-01-31T12:00:00"},
         [
-            "expires: '2026-01-31T12:00:00' is no time with a time zone; write one like "
+            "expires: '2026-01-31T12:00:00' is not a time with a time zone; write one like "
             "2026-01-31T12:00:00Z"
         ],
     ),
     "a day that is none": (
         {"expires": "2026-02-31T12:00:00Z"},
         [
-            "expires: '2026-02-31T12:00:00Z' is no time with a time zone; write one like "
+            "expires: '2026-02-31T12:00:00Z' is not a time with a time zone; write one like "
             "2026-01-31T12:00:00Z"
         ],
     ),
@@ -141,11 +144,11 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "a number that JSON lacks": (
         {"values": {"a": [{"b": float("inf")}]}},
-        ["values: holds inf, which JSON has no number for; choose another value"],
+        ["values: contains inf, which is not a number in JSON; choose another value"],
     ),
     "a pin that says nothing": (
         {"images": {"object-detection": {}}},
-        ["images.object-detection: says nothing; give a tag, a digest or a repository"],
+        ["images.object-detection: changes nothing; give a tag, a digest or a repository"],
     ),
     "an unknown image": (
         {"images": {"object-detektion": {"tag": "1"}}},
@@ -161,8 +164,8 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "an unknown version": (
         {"version": "9.9.9"},
         [
-            "version: '9.9.9' is no version or channel in registry/charts.yaml of a chart that is "
-            "selected; known: 0.1.0"
+            "version: '9.9.9' is not a version or channel in registry/charts.yaml of a selected "
+            "chart; known: 0.1.0"
         ],
     ),
     "several at once": (
@@ -187,8 +190,8 @@ def test_a_file_that_is_no_override_is_told(path: str) -> None:
     with pytest.raises(InvalidInput) as invalid:
         load(configuration({path: text()}))
     assert [str(found) for found in invalid.value.faults] == [
-        f"{path}: is no override: one is overrides/<name>.yaml, the name of small letters, digits "
-        "and '-'; rename the file, or remove it"
+        f"{path}: is not an override file; rename it to overrides/<name>.yaml, with lower-case "
+        f"letters, digits and '-', or remove it"
     ]
 
 
@@ -198,7 +201,7 @@ def test_notes_are_passed_over_and_a_sound_override_is_taken() -> None:
             {"overrides/README.md": "hello", "overrides/.gitkeep": "", "overrides/a.yaml": text()}
         )
     )
-    assert [one.path for one in config.in_force] == ["overrides/a.yaml"]
+    assert [one.path for one in config.active_overrides] == ["overrides/a.yaml"]
 
 
 def test_a_node_in_no_access_domain_takes_nothing() -> None:
@@ -213,7 +216,7 @@ def test_a_node_in_no_access_domain_takes_nothing() -> None:
             )
         )
     assert [str(found) for found in invalid.value.faults] == [
-        "overrides/a.yaml: node: 'cloud' is in no access domain; add it to one in "
+        "overrides/a.yaml: node: 'cloud' is not in any access domain; add it to one in "
         "policy/access-domains.yaml"
     ]
 
@@ -222,7 +225,7 @@ def test_a_tie_names_both_files_and_the_remedy() -> None:
     other = text(select=[{"nodes": ["e*"]}], replicas=3)
     assert faults(one=text(), two=other) == [
         "overrides/two.yaml: priority: is 0, as in overrides/one.yaml, and both may set replicas "
-        "of the same release; give one of them another priority, or select apart"
+        "of the same release; give one of them another priority, or select different releases"
     ]
 
 
@@ -240,4 +243,4 @@ def test_a_tie_names_both_files_and_the_remedy() -> None:
 def test_no_tie_where_it_does_not_matter_who_comes_last(other: dict[str, Any]) -> None:
     changed = {"replicas": 3} | other
     files = {"overrides/one.yaml": text(), "overrides/two.yaml": text(**changed)}
-    assert len(load(configuration(files)).in_force) == 2
+    assert len(load(configuration(files)).active_overrides) == 2

@@ -12,8 +12,13 @@ from typing import Any
 from asking import configuration
 from demandops.config.config import Config
 from demandops.config.load import load
-from demandops.config.override import Override, OverrideFile, Selector, merged
-from demandops.config.override_conflict import can_meet, commute, contested, overlap
+from demandops.config.override import Override, OverrideFile, Selector, merge_patch
+from demandops.config.override_conflict import (
+    can_meet,
+    contested_effects,
+    patches_commute,
+    patterns_overlap,
+)
 from demandops.config.policy import matches
 from demandops.plan.checks import trial_demands
 from demandops.plan.overrides.effects import apply_effects, effects_on
@@ -32,8 +37,8 @@ pattern = st.text("ab*?", min_size=1, max_size=4)
 @example("?", "ab")
 def test_patterns_overlap_just_where_some_text_fits_both(one: str, other: str) -> None:
     both = any(matches(text, (one,)) and matches(text, (other,)) for text in TEXTS)
-    assert overlap(one, other) is both
-    assert overlap(other, one) is both
+    assert patterns_overlap(one, other) is both
+    assert patterns_overlap(other, one) is both
 
 
 @lru_cache
@@ -126,8 +131,11 @@ patch = st.fixed_dictionaries({}, optional={"k": json, "l": json})
 def test_patches_that_commute_give_the_same_in_either_order(
     target: dict[str, Any], one: dict[str, Any], other: dict[str, Any]
 ) -> None:
-    both = merged(merged(target, one), other), merged(merged(target, other), one)
-    if commute(one, other):
+    both = (
+        merge_patch(merge_patch(target, one), other),
+        merge_patch(merge_patch(target, other), one),
+    )
+    if patches_commute(one, other):
         assert repr(_sorted(both[0])) == repr(_sorted(both[1]))
 
 
@@ -139,7 +147,7 @@ def _sorted(value: Any) -> Any:
 
 @given(json, json)
 def test_a_merge_patch_is_that_of_rfc_7386(target: Any, patch: Any) -> None:
-    result = merged(target, patch)
+    result = merge_patch(target, patch)
     if not isinstance(patch, dict):
         assert result == patch
         return
@@ -150,7 +158,7 @@ def test_a_merge_patch_is_that_of_rfc_7386(target: Any, patch: Any) -> None:
         elif patch[key] is None:
             assert key not in result
         else:
-            assert result[key] == merged(kept.get(key), patch[key])
+            assert result[key] == merge_patch(kept.get(key), patch[key])
 
 
 pins = st.sampled_from([{"tag": "x"}, {"tag": "y"}, {"repository": "z"}])
@@ -179,8 +187,8 @@ def test_what_is_not_contested_is_the_same_in_either_order(
     one: dict[str, Any], other: dict[str, Any]
 ) -> None:
     both = [_override(name, fields) for name, fields in (("one", one), ("other", other))]
-    if contested(*both):
-        assert contested(both[1], both[0])
+    if contested_effects(*both):
+        assert contested_effects(both[1], both[0])
         return
     first, second = (_shaped(order) for order in (both, both[::-1]))
     assert first == second
@@ -189,7 +197,7 @@ def test_what_is_not_contested_is_the_same_in_either_order(
 def _override(name: str, fields: dict[str, Any]) -> Override:
     head = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "r", "owner": "o"}
     file = OverrideFile.model_validate(head | {"select": [{"nodes": ["*"]}]} | fields)
-    return Override.of(name, file)
+    return Override.from_file(name, file)
 
 
 def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
@@ -199,6 +207,6 @@ def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
     assert isinstance(shaped, ServiceRelease)
     values: Any = {}
     for _, patch in shaped.shaping.patches:
-        values = merged(values, patch)
+        values = merge_patch(values, patch)
     images = {name: shaped.shaping.image(name, config()) for name in release.service.images}
     return shaped.replicas, shaped.node, shaped.shaping.held, repr(_sorted(values)), images

@@ -350,7 +350,7 @@ class TestWhatPeopleDidInGit:
 
     def test_an_option_that_the_type_cannot_honour(self) -> None:
         assert self.after("zenoh", Route("/a", "/a", qos=1)) == [
-            "connections: 'c': qos of '/a' is nothing that ZENOH can do; leave it out, or use type "
+            "connections: 'c': qos of '/a' is not supported by ZENOH; leave it out, or use type "
             "1 (MQTT)"
         ]
 

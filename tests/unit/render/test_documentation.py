@@ -51,7 +51,7 @@ def test_every_field_of_a_route_is_explained_with_the_types_that_honour_it() -> 
     rows = re.findall(r"^\| `(\w+)`[^|]*\|[^|]*\| ([^|]*) \|$", PAGE, re.MULTILINE)
     told = {name: row for name, row in rows if name in RouteOptions.model_fields}
     assert told.keys() == RouteOptions.model_fields.keys()
-    for kind, options in transport_choice.HONOURED.items():
+    for kind, options in transport_choice.SUPPORTED_OPTIONS.items():
         label = {"MQTT": "MQTT", "ZENOH": "Zenoh", "ROS": "ROS"}[kind.name]
         listed = {name for name, row in told.items() if label in row and name != "type"}
         assert listed == options

@@ -101,7 +101,7 @@ def test_an_interval_is_a_duration_or_seconds(text: str, seconds: float) -> None
 
 @pytest.mark.parametrize("text", ["", "-1", "often", "1e9", "30 s", "nan"])
 def test_anything_else_is_no_interval(text: str) -> None:
-    with pytest.raises(ValueError, match="is no duration; write one like 90s"):
+    with pytest.raises(ValueError, match="is not a duration; write one like 90s"):
         parse_interval(text)
 
 

@@ -129,7 +129,7 @@ def test_a_release_says_what_stops_and_what_was_not_held(desk: Any) -> None:
 
 def test_following_people_says_what_changed_and_what_was_not_taken_in() -> None:
     releases = [ReleaseChange("of-edge", "change", "object-fusion on edge", ("- replicas 1",))]
-    problems = [fault("nodes[0].id", "stands twice; remove one").within("inventory/nodes.yaml")]
+    problems = [fault("nodes[0].id", "appears twice; remove one").within("inventory/nodes.yaml")]
     assert commit_message.of_follow(releases, "c" * 40, "b" * 40, problems) == (
         "Update of-edge after commit cccccccccccc\n"
         "\n"
@@ -140,7 +140,7 @@ def test_following_people_says_what_changed_and_what_was_not_taken_in() -> None:
         "      - replicas 1\n"
         "\n"
         "Not applied, because not valid:\n"
-        "  inventory/nodes.yaml: nodes[0].id: stands twice; remove one\n"
+        "  inventory/nodes.yaml: nodes[0].id: appears twice; remove one\n"
         "\n"
         "Operation: follow\n"
         f"Follows: {'c' * 40}\n"

@@ -81,7 +81,7 @@ def upgrade(
 
 
 def _data(made: Upgrade, dry_run: bool) -> dict[str, Any]:
-    old, new = made.old.repository, made.new.repository
+    old, new = made.old.repo_settings, made.new.repo_settings
     outcome = "unchanged" if not made.files else "would-change" if dry_run else "upgraded"
     return {
         "outcome": outcome,
@@ -101,7 +101,7 @@ def _step_data(step: Step) -> dict[str, Any]:
 
 def _print(made: Upgrade, dry_run: bool) -> None:
     out = console()
-    new = made.new.repository
+    new = made.new.repo_settings
     if not made.files:
         out.print(
             f"nothing to do: everything is rendered for {new.gitops} by version "
@@ -121,7 +121,7 @@ def _print(made: Upgrade, dry_run: bool) -> None:
 
 
 def _summary(made: Upgrade, dry_run: bool) -> Iterable[str]:
-    old, new = made.old.repository, made.new.repository
+    old, new = made.old.repo_settings, made.new.repo_settings
     written = sum(text is not None for text in made.files.values())
     done = f"would write {written} and remove" if dry_run else f"wrote {written} and removed"
     yield f"{done} {len(made.files) - written} files"

@@ -16,7 +16,7 @@ from demandops.cli.output import (
     progress,
     state_repo_option,
 )
-from demandops.config.override import ImagePin, written
+from demandops.config.override import ImagePin, format_time
 from demandops.plan.views.override_report import Entry, override_report
 from demandops.staterepo import reader
 
@@ -52,7 +52,7 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
             "\n".join([*entry.releases, *entry.claims]),
             str(override.priority),
             override.owner,
-            written(override.end) if override.end else "",
+            format_time(override.end) if override.end else "",
             override.reason,
         )
     out.print(table)
@@ -82,7 +82,7 @@ def _row(entry: Entry) -> dict[str, Any]:
         "claims": list(entry.claims),
         "priority": override.priority,
         "owner": override.owner,
-        "until": written(override.end) if override.end else None,
+        "until": format_time(override.end) if override.end else None,
         "reason": override.reason,
     }
 

@@ -56,7 +56,7 @@ def proposals(state_repo: str, output: str) -> None:
 
 def _configured(repo: reader.Reader) -> Proposals:
     try:
-        return repo.config().repository.proposals
+        return repo.config().repo_settings.proposals
     except InvalidInput:
         return Proposals()  # an invalid file elsewhere must not hide the proposals
 

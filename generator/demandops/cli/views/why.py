@@ -18,7 +18,7 @@ from demandops.cli.output import (
 )
 from demandops.cli.views import why_answer
 from demandops.demand.claim import Subject, SubjectKind
-from demandops.errors import StateRepoError, near, shown
+from demandops.errors import StateRepoError, quoted, suggestion
 from demandops.ledger import claim_file
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
@@ -106,7 +106,7 @@ def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Ma
         return (running or matches)[0]
     if matches:
         kinds = ", ".join(each.kind for each in matches)
-        raise StateRepoError(f"{shown(name)} can mean several: {kinds}; choose one with --kind")
+        raise StateRepoError(f"{quoted(name)} can mean several: {kinds}; choose one with --kind")
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     ledger, config = snapshot.state.ledger, snapshot.state.config
@@ -115,7 +115,7 @@ def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Ma
         *repo.stopped_release_names(str(snapshot.commit)),
     }
     known |= {id for each in SubjectKind for id in ledger.subjects(each)}
-    raise StateRepoError(f"nothing called {shown(name)} runs or ever ran{near(name, known)}")
+    raise StateRepoError(f"nothing called {quoted(name)} runs or ever ran{suggestion(name, known)}")
 
 
 def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Match]:
@@ -147,7 +147,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Match:
     if release is not None and path_of(release) == path:
         return _Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
-        raise StateRepoError(f"{shown(path)} is not in the state repo and never was")
+        raise StateRepoError(f"{quoted(path)} is not in the state repo and never was")
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return _Match("file", path, path)
     return _Match("claim" if claim_file.kind_of(path) else "release", name, path)

@@ -65,7 +65,7 @@ def connection_claim(
         source=connection.source,
         target=connection.target,
         broker=connection.broker,
-        topics=MappingProxyType(routes.united(connection.topics)),
+        topics=MappingProxyType(routes.merge_routes(connection.topics)),
         lease=renewed(current.lease if current else None, connection.term, now),
     )
     return _with_booking_time(claim, current)

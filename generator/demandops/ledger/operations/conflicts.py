@@ -89,7 +89,7 @@ def _route_conflicts(
             "one target, use a second connection",
             code="conflict",
         )
-    for name, old, new in routes.differences(current, demanded):
+    for name, old, new in routes.contradictions(current, demanded):
         yield fault(
             f"{where}.{name}",
             f"{name} {new} of '{demanded.source}' contradicts an existing claim: {held} with "

@@ -12,8 +12,8 @@ from datetime import datetime
 from types import MappingProxyType
 
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim, Subject, SubjectKind
-from demandops.demand.demand_request import DemandRequest, Leaving
-from demandops.errors import Fault, Refused, fault, near
+from demandops.demand.demand_request import DecommissionTarget, DemandRequest
+from demandops.errors import Fault, Refused, fault, suggestion
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
 
 
@@ -23,7 +23,7 @@ def decommission(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple
     Raises:
         Refused: if it holds nothing.
     """
-    leaving = request.leaving
+    leaving = request.decommission_target
     assert leaving is not None  # noqa: S101 - a decommission request names it
     start, claims = ledger, dict[str, Claim]()
     if "node" in leaving.kinds:
@@ -58,7 +58,7 @@ def needs_node(claim: Claim, node: str) -> bool:
     return node in (claim.source, claim.target, claim.broker)
 
 
-def _reduced(claim: Claim, leaving: Leaving, now: datetime) -> Claim | None:
+def _reduced(claim: Claim, leaving: DecommissionTarget, now: datetime) -> Claim | None:
     if "requester" in leaving.kinds and leaving.name in claim.requesters:
         return None
     return _without_node(claim, leaving.name, now) if needs_node(claim, leaving.name) else claim
@@ -79,7 +79,7 @@ def _without_node(claim: Claim, node: str, now: datetime) -> Claim | None:
     return replace(claim, inputs=MappingProxyType(inputs), booked=now) if inputs else None
 
 
-def _nothing_held(ledger: Ledger, leaving: Leaving) -> Fault:
+def _nothing_held(ledger: Ledger, leaving: DecommissionTarget) -> Fault:
     """Return the fault that nothing is held. A similar name helps to find a typo."""
     names = [ledger.indexed_names("requester")] if "requester" in leaving.kinds else []
     names += (
@@ -88,6 +88,6 @@ def _nothing_held(ledger: Ledger, leaving: Leaving) -> Fault:
         else []
     )
     kinds = " or ".join(sorted(leaving.kinds))
-    close = near(leaving.name, {name for found in names for name in found})
+    close = suggestion(leaving.name, {name for found in names for name in found})
     message = f"'{leaving.name}' holds nothing as a {kinds}{close}"
     return fault("name", message, code="not-held")

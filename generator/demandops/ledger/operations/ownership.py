@@ -24,7 +24,7 @@ def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
         demands = sorted(
             {
                 claim.demand
-                for requester in request.named_by
+                for requester in request.own_requesters
                 for claim in ledger.claims_of_requester(requester)
             }
         )

@@ -13,7 +13,7 @@ from datetime import datetime
 
 from demandops.config.config import Config
 from demandops.demand import admission, permission
-from demandops.demand.claim import ApplicationClaim, Claim, is_kept
+from demandops.demand.claim import ApplicationClaim, Claim, is_override_claim
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -54,7 +54,7 @@ def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledg
     assert isinstance(request, Restoration)  # noqa: S101 - apply() checks the operation
     changes = _changes(ledger, request)
     if not request.drop_newer:
-        newer = [c for c in changes if c.before is not None and not is_kept(c.before)]
+        newer = [c for c in changes if c.before is not None and not is_override_claim(c.before)]
         if newer:
             raise Refused(_newer_faults(newer))
     start = ledger
@@ -75,7 +75,7 @@ def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
 def _same(one: Claim | None, other: Claim | None) -> bool:
     if one is None or other is None:
         return one is other
-    if is_kept(one):  # when the override kept it does not matter
+    if is_override_claim(one):  # when the override kept it does not matter
         one = replace(one, booked=other.booked)
     return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
 
@@ -85,7 +85,7 @@ def _with_full_lease(change: ClaimChange, now: datetime) -> Claim | None:
     if claim is None or claim.lease is None:
         return claim
     term = Term(claim.lease.seconds, claim.lease.slack)
-    lease: Lease = term.starting(now)
+    lease: Lease = term.lease_from(now)
     return replace(claim, lease=lease)
 
 
@@ -108,7 +108,7 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
 def faults(request: Restoration, ledger: Ledger, config: Config) -> Iterator[Fault]:
     """Yield why restored claims are not valid in the current configuration."""
     for change in _changes(ledger, request):
-        if change.after is None or is_kept(change.after):  # overrides decide about these
+        if change.after is None or is_override_claim(change.after):  # overrides decide about these
             continue
         booking = _request_for(change.after)
         for found in (*admission.faults(booking, config), *permission.faults(booking, config)):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from demandops.config.config import Config
-from demandops.config.override import Override, Selector, written
+from demandops.config.override import Override, Selector, format_time
 from demandops.config.policy import matches
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, DemandRequest
@@ -25,8 +25,8 @@ def faults(
     request: DemandRequest, after: Ledger, changes: Changes, config: Config
 ) -> Iterator[Fault]:
     """Yield every new application and connection of a request that an override denies."""
-    denying = [one for one in reversed(config.in_force) if one.deny]
-    if not denying or not request.operation.asks:
+    denying = [one for one in reversed(config.active_overrides) if one.deny]
+    if not denying or not request.operation.adds_claims:
         return
     renewed = {
         change.key.subject: change.before is not None
@@ -111,7 +111,7 @@ def _matched_field(
 
 
 def _message(override: Override) -> str:
-    until = f" until {written(override.end)}" if override.end else ""
+    until = f" until {format_time(override.end)}" if override.end else ""
     return (
         f"is denied by {override.path}{until}: {override.reason}; ask its owner, {override.owner}, "
         "or leave it out"
@@ -127,7 +127,7 @@ def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator
     ]
     seen = set()
     requesters = set(request.requesters())
-    for claim in claims if config.in_force else ():
+    for claim in claims if config.active_overrides else ():
         override = suspended_by(claim, config)
         if override is None or claim.key in seen or not requesters & set(claim.requesters):
             continue

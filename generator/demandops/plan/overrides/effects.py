@@ -10,7 +10,8 @@ from dataclasses import replace
 
 from demandops.config.config import DDS_ROUTER_IMAGE, MQTT_CLIENT_IMAGE, ZENOH_BRIDGE_IMAGE, Config
 from demandops.config.override import Override
-from demandops.demand.claim import KEPT, Claim
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.selectors import Traits, selects
 from demandops.plan.overrides.suspended_claims import denied_by
@@ -37,15 +38,19 @@ def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release
     Raises:
         Refused: if an override moves it to a node that is gone.
     """
-    if not config.in_force:
+    if not config.active_overrides:
         return release
     claims = _claims(release, ledger)
     traits = _traits(release, claims)
     if service_denied_by(release, ledger, config) is not None:
         return None
-    kept = {claim.demand.removeprefix(KEPT) for claim in claims if claim.demand.startswith(KEPT)}
+    kept = {
+        claim.demand.removeprefix(OVERRIDE_PREFIX)
+        for claim in claims
+        if claim.demand.startswith(OVERRIDE_PREFIX)
+    }
     by = []
-    for override in config.in_force:
+    for override in config.active_overrides:
         effects = effects_on(release, override, config) if selects(override, traits, config) else ()
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
@@ -56,7 +61,9 @@ def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release
 
 def service_denied_by(release: Release, ledger: Ledger, config: Config) -> Override | None:
     """Return the override that denies a service, or ``None``."""
-    if not isinstance(release, ServiceRelease) or not any(one.deny for one in config.in_force):
+    if not isinstance(release, ServiceRelease) or not any(
+        one.deny for one in config.active_overrides
+    ):
         return None
     return denied_by(_traits(release, _claims(release, ledger)), config)
 

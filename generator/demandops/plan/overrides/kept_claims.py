@@ -13,8 +13,8 @@ from datetime import datetime
 
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.demand.claim import KEPT, Claim, ClaimKey, Subject, SubjectKind, is_kept
-from demandops.demand.demand_request import DemandRequest
+from demandops.demand.claim import Claim, ClaimKey, Subject, SubjectKind, is_override_claim
+from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
 from demandops.plan.overrides.selectors import selects, traits_of
 from demandops.plan.overrides.suspended_claims import suspended_by
@@ -31,7 +31,9 @@ def requested_subjects(request: DemandRequest) -> tuple[Subject, ...]:
 def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
     """Return the ledger without the kept claims on these subjects."""
     for subject in subjects:
-        ledger = ledger.without(claim for claim in ledger.claims_on(subject) if is_kept(claim))
+        ledger = ledger.without(
+            claim for claim in ledger.claims_on(subject) if is_override_claim(claim)
+        )
     return ledger
 
 
@@ -64,10 +66,12 @@ def update_kept_claims(
     keys: list[ClaimKey] = []
     for subject in subjects:
         existing = [
-            c for c in (*after.claims_on(subject), *before.claims_on(subject)) if is_kept(c)
+            c
+            for c in (*after.claims_on(subject), *before.claims_on(subject))
+            if is_override_claim(c)
         ]
         needed = None
-        if all(is_kept(claim) for claim in after.claims_on(subject)):
+        if all(is_override_claim(claim) for claim in after.claims_on(subject)):
             needed = _needed(existing, before.claims_on(subject), config, now)
         keys += [claim.key for claim in existing]
         after = after.without(existing)
@@ -79,7 +83,7 @@ def update_kept_claims(
 
 def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
     """Return every subject with a kept claim, sorted."""
-    found = {claim.subject for claim in ledger if is_kept(claim)}
+    found = {claim.subject for claim in ledger if is_override_claim(claim)}
     return tuple(sorted(found, key=str))
 
 
@@ -88,7 +92,9 @@ def _needed(
 ) -> Claim | None:
     """Return the kept claim that a subject without demands needs, or ``None``."""
     for claim in existing:
-        if any(KEPT + one.name == claim.demand for one in keeping_overrides(claim, config)):
+        if any(
+            OVERRIDE_PREFIX + one.name == claim.demand for one in keeping_overrides(claim, config)
+        ):
             return claim
     if not before:
         return None
@@ -96,7 +102,7 @@ def _needed(
     if suspended_by(last, config) is not None:
         return None
     for override in keeping_overrides(last, config):
-        name = KEPT + override.name
+        name = OVERRIDE_PREFIX + override.name
         return replace(
             last, demand=name, request=name, requesters=(override.owner,), booked=now, lease=None
         )
@@ -109,9 +115,9 @@ def keeping_overrides(claim: Claim, config: Config) -> list[Override]:
     A kept claim names the owner as its requester, so ``requesters`` of the selector is ignored: it
     was matched against the original claim.
     """
-    traits, any_requester = traits_of(claim), is_kept(claim)
+    traits, any_requester = traits_of(claim), is_override_claim(claim)
     return [
         one
-        for one in reversed(config.in_force)
+        for one in reversed(config.active_overrides)
         if one.keep and selects(one, traits, config, any_requester=any_requester)
     ]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from demandops.config.config import Config
-from demandops.config.override import Override, written
+from demandops.config.override import Override, format_time
 from demandops.demand.claim import ClaimKey, Subject
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger
@@ -47,7 +47,7 @@ def update_ledger(
         now: new overrides that end by then do not apply.
     """
     ledger, config = after
-    known = {one.name: one for one in before[1].in_force}
+    known = {one.name: one for one in before[1].active_overrides}
     expired = [
         one
         for one in expired_overrides(config, now)
@@ -56,11 +56,11 @@ def update_ledger(
     stale = ended_override_file.stale_markers(markers, config.overrides)
     ended = {
         name: end
-        for name, end in config.ended.items()
+        for name, end in config.ended_overrides.items()
         if ended_override_file.path_of(name) not in stale
     }
-    ended |= {one.name: written(one.end) for one in expired if one.end}
-    config = config.with_ended(ended)
+    ended |= {one.name: format_time(one.end) for one in expired if one.end}
+    config = config.with_ended_overrides(ended)
     files: dict[str, str | None] = dict.fromkeys(stale)
     for override in expired:
         files |= _marker(override)
@@ -77,7 +77,9 @@ def end_override(state: tuple[Ledger, Config], override: Override, now: datetime
     ledger, config = state
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
-    after = config.with_ended({**config.ended, override.name: written(override.end)})
+    after = config.with_ended_overrides(
+        {**config.ended_overrides, override.name: format_time(override.end)}
+    )
     update = update_ledger(state, (ledger, after), (), {}, now)
     return LedgerUpdate(
         update.ledger, update.config, update.keys, {**update.files, **_marker(override)}
@@ -102,13 +104,15 @@ def changed_claim_files(
 
 def expired_overrides(config: Config, now: datetime) -> list[Override]:
     """Return the overrides in effect whose end has passed, sorted by their end."""
-    expired = [(one.end, one.name, one) for one in config.in_force if one.end and one.end <= now]
+    expired = [
+        (one.end, one.name, one) for one in config.active_overrides if one.end and one.end <= now
+    ]
     return [one for _, _, one in sorted(expired, key=lambda item: item[:2])]
 
 
 def changed_override_files(before: Config, after: Config) -> list[str]:
     """Return the files of the overrides that took effect, changed or stopped applying."""
-    old = {one.name: one for one in before.in_force}
-    new = {one.name: one for one in after.in_force}
+    old = {one.name: one for one in before.active_overrides}
+    new = {one.name: one for one in after.active_overrides}
     names = [name for name in {*old, *new} if old.get(name) != new.get(name)]
     return sorted((new.get(name) or old[name]).path for name in names)

@@ -45,23 +45,25 @@ class UnsuspendedClaims(Ledger):
 
 def without_suspended(ledger: Ledger, config: Config) -> Ledger:
     """Return a view of the ledger without suspended claims."""
-    if isinstance(ledger, UnsuspendedClaims) or not any(one.deny for one in config.in_force):
+    if isinstance(ledger, UnsuspendedClaims) or not any(
+        one.deny for one in config.active_overrides
+    ):
         return ledger
     return UnsuspendedClaims(ledger.claims, ledger.index, ledger.minutes, config)
 
 
 def suspended_by(claim: Claim, config: Config) -> Override | None:
     """Return the highest override that suspends a claim, or ``None``."""
-    if not config.in_force:
+    if not config.active_overrides:
         return None
     traits = traits_of(claim)
     try:
-        return config.judged[traits]
+        return config.denial_cache[traits]
     except KeyError:
         pass
-    if len(config.judged) >= _MOST_CACHED:
-        config.judged.clear()
-    found = config.judged[traits] = denied_by(traits, config)
+    if len(config.denial_cache) >= _MOST_CACHED:
+        config.denial_cache.clear()
+    found = config.denial_cache[traits] = denied_by(traits, config)
     return found
 
 
@@ -70,7 +72,7 @@ def denied_by(traits: Traits, config: Config) -> Override | None:
 
     A selector that names services denies the releases of these services, never a claim or demand.
     """
-    for override in reversed(config.in_force):
+    for override in reversed(config.active_overrides):
         if override.deny and any(
             bool(selector.services) is bool(traits.service) and fits(selector, traits, config)
             for selector in override.select
@@ -81,7 +83,7 @@ def denied_by(traits: Traits, config: Config) -> Override | None:
 
 def suspended_claims(ledger: Ledger, config: Config) -> Iterator[tuple[Claim, Override]]:
     """Yield every suspended claim and the override that suspends it, sorted by subject."""
-    if not any(one.deny for one in config.in_force):
+    if not any(one.deny for one in config.active_overrides):
         return
     for claim in sorted(ledger, key=lambda one: (str(one.subject), one.demand)):
         override = suspended_by(claim, config)

@@ -18,7 +18,8 @@ from demandops.config.config import (
 )
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.demand.claim import KEPT, ApplicationClaim, Claim, Subject, demand_id, is_kept
+from demandops.demand.claim import ApplicationClaim, Claim, Subject, demand_id, is_override_claim
+from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Bridge, MqttEnd, Release, ServiceRelease
@@ -81,8 +82,10 @@ def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
 
 def how_to_release(claim: Claim) -> str:
     """Return how the requesters release a claim."""
-    if is_kept(claim):
-        return f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(KEPT)}.yaml"
+    if is_override_claim(claim):
+        return (
+            f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(OVERRIDE_PREFIX)}.yaml"
+        )
     if claim.demand == demand_id(claim.request, claim.requesters):
         return f"send request '{claim.request}' again with shutdown: true"
     return f"send operation: release for demand '{claim.demand}'"
@@ -90,7 +93,7 @@ def how_to_release(claim: Claim) -> str:
 
 def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
     """Return people's files that decide what a release is and where it runs."""
-    found = [ShapingFile(ROOT_FILE, "gitops", f"written for {config.repository.gitops}")]
+    found = [ShapingFile(ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}")]
     of_kind = _service if isinstance(release, ServiceRelease) else _client
     found += of_kind(release, config)
     found.append(ShapingFile(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))
@@ -111,7 +114,11 @@ def denied_release_named(
 
 def keeping_override(claim: Claim, config: Config) -> Override | None:
     """Return the override that keeps this claim, or ``None`` if a demand holds it."""
-    return config.overrides.get(claim.demand.removeprefix(KEPT)) if is_kept(claim) else None
+    return (
+        config.overrides.get(claim.demand.removeprefix(OVERRIDE_PREFIX))
+        if is_override_claim(claim)
+        else None
+    )
 
 
 def _service(release: Release, config: Config) -> Iterator[ShapingFile]:

@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Literal
 
 from demandops.config.config import Config
-from demandops.config.override import Override, written
+from demandops.config.override import Override, format_time
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.suspended_claims import suspended_by
@@ -40,7 +40,7 @@ def override_report(ledger: Ledger, config: Config, now: datetime) -> list[Entry
         )
         state: State = "in force" if any(entry) else "matches nothing"
         expired = override.end is not None and override.end <= now
-        if expired or override not in config.in_force:
+        if expired or override not in config.active_overrides:
             state, entry = "expired", ((), ())
         found.append(Entry(override, state, *entry))
     return found
@@ -53,8 +53,8 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
         if entry.state == "expired" and override.end:
             yield (
                 override.path,
-                f"expired at {written(override.end)} and no longer applies; remove the file, or "
-                "write a later time",
+                f"expired at {format_time(override.end)} and no longer applies; remove the file, "
+                "or write a later time",
             )
         elif entry.state == "matches nothing":
             yield override.path, "matches nothing now; if it should, correct select"

@@ -43,4 +43,4 @@ def merge_patch(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
 
 def short_value(value: object) -> str:
     """Return a value in few words, for a person."""
-    return "none" if value is ABSENT else strict_yaml.brief(value)
+    return "none" if value is ABSENT else strict_yaml.short_repr(value)

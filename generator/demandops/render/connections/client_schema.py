@@ -12,7 +12,7 @@ from typing import Any
 
 import jsonschema_rs
 
-from demandops.config.file_model import field_path
+from demandops.config.base_model import field_path
 from demandops.errors import InvalidInput, fault
 from demandops.settings import data_folder
 

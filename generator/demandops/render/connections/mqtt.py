@@ -43,7 +43,9 @@ def parameters(end: MqttEnd) -> dict[str, Any]:
     name may differ between the ends.
     """
     bridge: dict[str, Any] = {}
-    read = {route.read: (name, route) for name, route in end.topics.items() if end.reads(route)}
+    read = {
+        route.read_topic: (name, route) for name, route in end.topics.items() if end.reads(route)
+    }
     written = {name: route for name, route in end.topics.items() if not end.reads(route)}
     if read:
         bridge["ros2mqtt"] = {"ros_topics": sorted(read)}
@@ -55,7 +57,10 @@ def parameters(end: MqttEnd) -> dict[str, Any]:
     if written:
         bridge["mqtt2ros"] = {"mqtt_topics": [end.channel + name for name in written]}
         for name, route in written.items():
-            bridge["mqtt2ros"][end.channel + name] = {"ros_topic": route.written, **_options(route)}
+            bridge["mqtt2ros"][end.channel + name] = {
+                "ros_topic": route.written_topic,
+                **_options(route),
+            }
     return {
         "/**/*": {
             "ros__parameters": {

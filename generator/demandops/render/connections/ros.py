@@ -35,7 +35,9 @@ def configuration(end: RosEnd) -> dict[str, Any]:
     the source. The general routes cover them, so that a new one needs no restart.
     """
     inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
-    topics = [{"name": f"rt{route.read}", "type": dds_type(route.type)} for route in _all(end)]
+    topics = [
+        {"name": f"rt{route.read_topic}", "type": dds_type(route.type)} for route in _all(end)
+    ]
     tuned = [
         {**topic, "qos": qos}
         for topic, route in zip(topics, _all(end), strict=True)

@@ -67,9 +67,9 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
         cluster=cluster,
         domains=domains,
         folders={domain.name: domain_folder(cluster, domain) for domain in domains},
-        projects={domain.name: project_of(domain, config.repository) for domain in domains},
+        projects={domain.name: project_of(domain, config.repo_settings) for domain in domains},
         urls=_sources(config),
-        repository=config.repository,
+        repository=config.repo_settings,
         branch=MAIN_BRANCH,
         server=IN_CLUSTER,
     )
@@ -77,7 +77,7 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
 
 def _sources(config: Config) -> list[str]:
     """Return every URL that a domain's Applications may use as a source."""
-    section = config.repository.argocd
+    section = config.repo_settings.argocd
     assert section is not None  # noqa: S101 - required when gitops is "argocd"
     charts = {
         source.oci or source.http for chart in config.charts.values() for source in chart.sources()

@@ -46,9 +46,9 @@ def switch_steps(old: Config, new: Config) -> SwitchSteps:
     Args:
         old, new: the configuration before and after.
     """
-    if old.repository.gitops == new.repository.gitops:
+    if old.repo_settings.gitops == new.repo_settings.gitops:
         return SwitchSteps()
-    if new.repository.gitops == "argocd":
+    if new.repo_settings.gitops == "argocd":
         return SwitchSteps(tuple(_suspend_flux(new)), tuple(_finish_switch_to_argocd(new)))
     return SwitchSteps(tuple(_delete_applications(old)), tuple(_finish_switch_to_flux(new)))
 
@@ -80,7 +80,7 @@ def _finish_switch_to_argocd(config: Config) -> Iterator[Step]:
             commands.append(f"{kubectl} delete {_FLUX_KINDS} -l {_of(domain)}")
             commands.append(f"{kubectl} delete kustomization {domain.name}")
         commands += [
-            f"kubectl -n {namespace} delete gitrepository {config.repository.source}"
+            f"kubectl -n {namespace} delete gitrepository {config.repo_settings.source}"
             for namespace in _namespaces(domains)
         ]
         description = "delete Flux's objects; because Flux is suspended, no workload is removed"
@@ -93,13 +93,13 @@ def _of(domain: AccessDomain) -> str:
 
 
 def _delete_applications(config: Config) -> Iterator[Step]:
-    section = config.repository.argocd
+    section = config.repo_settings.argocd
     assert section is not None  # noqa: S101 - required when gitops is "argocd"
     for cluster, domains in domains_by_cluster(config).items():
         commands = []
         for domain in domains:
             name, kubectl = (
-                project_of(domain, config.repository),
+                project_of(domain, config.repo_settings),
                 f"kubectl -n {section.namespace}",
             )
             commands.append(
@@ -115,7 +115,7 @@ def _delete_applications(config: Config) -> Iterator[Step]:
             commands.append(f"{kubectl} delete application -l {_OURS}")
         commands += [
             f"kubectl -n {section.namespace} delete appproject "
-            f"{project_of(domain, config.repository)}"
+            f"{project_of(domain, config.repo_settings)}"
             for domain in domains
         ]
         description = "delete Argo CD's Applications but not their workloads: finalizers first"

@@ -60,7 +60,7 @@ def base_files(config: Config, engine: Engine) -> dict[str, str]:
                     chart_name=name,
                     name=object_name,
                     namespace=domain.namespace,
-                    source=config.repository.source,
+                    source=config.repo_settings.source,
                 )
     return files
 
@@ -79,6 +79,6 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
                 if source.folder
             }
         ),
-        repository=config.repository,
+        repository=config.repo_settings,
         branch=MAIN_BRANCH,
     )

@@ -24,8 +24,8 @@ def render(release: Release, config: Config, engine: Engine) -> str:
     if not isinstance(release, ServiceRelease):
         return connections.render(release, config, engine)
     values = values_of(release, config, engine)
-    if config.repository.gitops == "argocd":
-        return argocd.render(release, values, config.repository, engine)
+    if config.repo_settings.gitops == "argocd":
+        return argocd.render(release, values, config.repo_settings, engine)
     return flux.render(release, values, engine)
 
 
@@ -36,6 +36,6 @@ def base_files(config: Config, engine: Engine) -> dict[str, str]:
     domain on it has a placeholder: Git drops empty folders, and on a missing folder Flux and Argo
     CD fail instead of pruning.
     """
-    if config.repository.gitops == "argocd":
+    if config.repo_settings.gitops == "argocd":
         return argocd.base_files(config, engine)
     return flux.base_files(config, engine)

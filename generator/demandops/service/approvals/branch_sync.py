@@ -116,7 +116,7 @@ class BranchSync:
             )
             if not is_fresh and not self._commit_and_push(proposal, steps, snapshot, head):
                 return False
-        forge = snapshot.state.config.repository.proposals
+        forge = snapshot.state.config.repo_settings.proposals
         message = self._branches.message(proposal.record.commits[-1])
         title, body = message.split("\n", 1)[0], pull_request_body(message, proposal.reasons)
         if forge.forge in ("github", "gitea"):
@@ -152,7 +152,10 @@ class BranchSync:
         for ticket, decision in left:
             try:
                 step = decide(
-                    state, approval_rule.proposed(decision.request), ticket.received, read
+                    state,
+                    approval_rule.with_leases_from_approval(decision.request),
+                    ticket.received,
+                    read,
                 )
             except InvalidInput as error:
                 faulty.append((ticket, error))
@@ -188,7 +191,7 @@ class BranchSync:
         return True
 
     def _options(self, proposal: Proposal, snapshot: Snapshot, commit: str) -> list[str]:
-        forge = snapshot.state.config.repository.proposals
+        forge = snapshot.state.config.repo_settings.proposals
         if forge.forge != "gitlab":
             return []
         message = self._branches.message(commit)

@@ -54,7 +54,7 @@ class OverrideExpiry:
     def _due_times(self, config: Config) -> list[datetime]:
         return [
             self._due_time(override.name, override.end)
-            for override in config.in_force
+            for override in config.active_overrides
             if override.end
         ]
 

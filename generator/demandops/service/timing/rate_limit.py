@@ -26,7 +26,7 @@ class RateLimit:
         self, request: DemandRequest, config: Config, operation: str, received: datetime
     ) -> Iterator[Fault]:
         """Count a demand and yield a fault for each quota it exceeds; releases are not limited."""
-        if not request.operation.asks:
+        if not request.operation.adds_claims:
             return
         nodes = [app.node for app in request.applications]
         nodes += [connection.target for connection in request.connections]

@@ -12,7 +12,8 @@ from dataclasses import replace
 from pygit2 import Commit, Repository
 
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.demand.claim import KEPT, Claim
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.errors import InvalidInput
 from demandops.ledger import claim_file, ended_override_file
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
@@ -58,7 +59,7 @@ def _named(entry: LogEntry) -> set[str]:
     """Return the file names of the claims that a commit's message accounts for."""
     demands = {*entry.trailers.get("Demand-Id", ())}
     for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
-        demands.add(KEPT + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
+        demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
     return {f"{claim_file.segment(demand)}.yaml" for demand in demands}
 
 

@@ -96,7 +96,7 @@ class _Proof:
     def differing(self, before: Tree | None) -> tuple[str, ...]:
         """Return the files that differ from what was rendered."""
         wanted = self.undemanded | dict(self.planned.values())
-        if before is not None and any(one.hold for one in self.state.config.in_force):
+        if before is not None and any(one.hold for one in self.state.config.active_overrides):
             charts = {
                 path: trees.read_text(before, path) or ""
                 for path, _ in _generated_files(before)
@@ -209,7 +209,7 @@ def _parent(commit: Commit) -> Tree | None:
 def _held_from(commit: Commit, config: Config) -> dict[str, str]:
     """Return the files of the commit's parent if overrides hold some of them."""
     before = _parent(commit)
-    if before is None or not any(override.hold for override in config.in_force):
+    if before is None or not any(override.hold for override in config.active_overrides):
         return {}
     return trees.texts(before, GENERATED_ROOTS)
 

@@ -13,10 +13,10 @@ from datetime import datetime, timezone
 
 import pygit2
 
-from demandops.config.override import OVERRIDES_ROOT, Override, written
+from demandops.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.decision import Decision
-from demandops.demand.claim import KEPT, ClaimKey, SubjectKind
-from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.demand.claim import ClaimKey, SubjectKind
+from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest, Operation
 from demandops.errors import Fault
 from demandops.ledger import claim_file
 from demandops.ledger.operations.decommission import needs_node
@@ -54,7 +54,7 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 
     The author of a rollback or a decommission is the person who ran the command.
     """
-    request, leaving = decision.request, decision.request.leaving
+    request, leaving = decision.request, decision.request.decommission_target
     if isinstance(request, Restoration):
         email = re.sub(r"[<>\s]", "", request.email) or GENERATOR_EMAIL
         return pygit2.Signature(_name(request.by), email, int(received.timestamp()), 0)
@@ -129,7 +129,7 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
     """Return the requesters of a demand, else those of the claims that it changed."""
     changes = decision.changes.claims
     claims = [change.after or change.before for change in changes]
-    if decision.request.leaving is not None:  # the one that leaves is a requester only before
+    if decision.request.decommission_target is not None:  # it is a requester only before
         claims = [change.before for change in changes]
     found = sorted({who for claim in claims if claim for who in claim.requesters})
     return decision.request.requesters() or tuple(found)
@@ -137,7 +137,10 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
 
 def _leaving(decision: Decision) -> list[tuple[str, str]]:
     """Return the trailer of a decommissioned node; a requester has its own trailer."""
-    leaving, befores = decision.request.leaving, [c.before for c in decision.changes.claims]
+    leaving, befores = (
+        decision.request.decommission_target,
+        [c.before for c in decision.changes.claims],
+    )
     if leaving is None or "node" not in leaving.kinds:
         return []
     needed = any(needs_node(before, leaving.name) for before in befores if before)
@@ -146,14 +149,14 @@ def _leaving(decision: Decision) -> list[tuple[str, str]]:
 
 def _title(decision: Decision) -> str:
     subjects = ", ".join(subject.id for subject in decision.changes.subjects())
-    operation, leaving = decision.request.operation, decision.request.leaving
+    operation, leaving = decision.request.operation, decision.request.decommission_target
     if leaving is not None:
         return f"Decommission {leaving.name}"
     if operation is Operation.EXPIRE:
         return f"Expire {subjects}"
     if isinstance(decision.request, Restoration):
         return f"Roll back to {decision.request.to[:12]}"
-    renewed = operation.asks and _only_leases(decision)
+    renewed = operation.adds_claims and _only_leases(decision)
     return f"{_VERBS[Operation.RENEW if renewed else operation][0]} {subjects}"
 
 
@@ -168,20 +171,24 @@ def _why(decision: Decision, received: datetime) -> str:
             f"{what}: {request.reason}"
         )
     if request.operation is Operation.EXPIRE:
-        ends = [c.before.lease.ends for c in decision.changes.claims if c.before and c.before.lease]
+        ends = [
+            c.before.lease.expires_at
+            for c in decision.changes.claims
+            if c.before and c.before.lease
+        ]
         last = max(ends).astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
         return (
             f"Why: the lease of demand '{request.demand}' on {what} in the name of {who} ended "
             f"at {last} and was not renewed."
         )
-    if request.leaving is not None:
-        by = f" by {request.leaving.by}" if request.leaving.by else ""
+    if request.decommission_target is not None:
+        by = f" by {request.decommission_target.by}" if request.decommission_target.by else ""
         return (
-            f"Why: '{request.leaving.name}' was decommissioned{by} on {time}; it held a part "
-            f"of {what} in the name of {who}."
+            f"Why: '{request.decommission_target.name}' was decommissioned{by} on "
+            f"{time}; it held a part of {what} in the name of {who}."
         )
     verb = _VERBS[request.operation][1]
-    if request.operation.asks and _only_leases(decision):
+    if request.operation.adds_claims and _only_leases(decision):
         verb = _VERBS[Operation.RENEW][1]
     named = "" if request.operation.is_reference else f" of demand '{request.demand}'"
     return (
@@ -255,7 +262,7 @@ def of_override_end(
         f"End override {override.name}",
         "",
         f"Why: {override.path} by {override.owner} ({override.reason}) expired at "
-        f"{written(override.end) if override.end else ''}.",
+        f"{format_time(override.end) if override.end else ''}.",
         "",
         *(_desired_state(releases) if releases else ["Desired state: unchanged."]),
     ]
@@ -281,8 +288,8 @@ def _overrides(decision: Decision) -> list[tuple[str, str]]:
 
 def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
     """Return the files of the ``keep`` overrides that add these claims."""
-    demands = (key.demand for key in keys if key.demand.startswith(KEPT))
-    return [f"{OVERRIDES_ROOT}/{demand.removeprefix(KEPT)}.yaml" for demand in demands]
+    demands = (key.demand for key in keys if key.demand.startswith(OVERRIDE_PREFIX))
+    return [f"{OVERRIDES_ROOT}/{demand.removeprefix(OVERRIDE_PREFIX)}.yaml" for demand in demands]
 
 
 def _trailers(pairs: Iterable[tuple[str, str]]) -> list[str]:

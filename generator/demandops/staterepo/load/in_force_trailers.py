@@ -55,7 +55,7 @@ def snapshot_at(repo: Repository, commit: Commit, record: LogEntry) -> Snapshot:
     source = _source(record)
     advance = snapshots.advance(repo, last_valid, commit.id)
     config = load_config(source.texts(repo))
-    config = config.with_ended(
+    config = config.with_ended_overrides(
         ended_override_file.read(last_valid_config.end_markers_at(commit.tree))
     )
     state = State.of(config, advance.snapshot.state.ledger)

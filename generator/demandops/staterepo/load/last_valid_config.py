@@ -70,7 +70,7 @@ def config_at(tree: Tree) -> Config:
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
-    return load_config(files).with_ended(ended_override_file.read(end_markers_at(tree)))
+    return load_config(files).with_ended_overrides(ended_override_file.read(end_markers_at(tree)))
 
 
 def end_markers_at(tree: Tree) -> dict[str, str]:

@@ -121,7 +121,7 @@ def load_last_valid(
     except InvalidInput as error:
         problems += error.faults
         config = last_valid_config.newest_valid_config(commit, error)
-        config = config.with_ended(
+        config = config.with_ended_overrides(
             ended_override_file.read(last_valid_config.end_markers_at(commit.tree))
         )
     ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
@@ -213,12 +213,12 @@ def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
         problems += valid.faults
         source = valid.source if problems else None
         if valid.config is not None:
-            config = valid.config.with_ended(state.config.ended)
+            config = valid.config.with_ended_overrides(state.config.ended_overrides)
             config_changed = config_changed or config != state.config
             state = State(config, State.of(config, state.ledger).engine, state.ledger)
     ended = ended_override_file.read(last_valid_config.end_markers_at(after))
-    if ended != state.config.ended:
-        state = replace(state, config=state.config.with_ended(ended))
+    if ended != state.config.ended_overrides:
+        state = replace(state, config=state.config.with_ended_overrides(ended))
         config_changed = True
     ledger, keys, subjects, invalid = state.ledger, snapshot.keys, list[Subject](), list[str]()
     changed = dict(
@@ -263,7 +263,7 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config = load_config(files)
-    if config.with_ended(state.config.ended) != state.config:
+    if config.with_ended_overrides(state.config.ended_overrides) != state.config:
         try_configuration(State.of(config, Ledger()))
     return config
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
-from demandops.config.override import written
+from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
@@ -137,7 +137,7 @@ def _state(
 ) -> State:
     """Return the state of the files; add faults that do not prevent rendering to ``faults``."""
     config = load({p: t for p, t in files.items() if p.split("/")[0] in CONFIG_ROOTS})
-    version = config.repository.render_version
+    version = config.repo_settings.render_version
     if version < RENDER_VERSION:
         message = (
             f"is {version}, but this program renders version {RENDER_VERSION}; check with the "
@@ -182,9 +182,9 @@ def _marked(files: Mapping[str, str]) -> dict[str, str]:
 
 def _with_ended(config: Config, files: Mapping[str, str], now: datetime) -> Config:
     """Return the configuration without overrides that have ended or expired."""
-    config = config.with_ended(ended_override_file.read(_marked(files)))
-    expired = {one.name: written(one.end) for one in expired_overrides(config, now) if one.end}
-    return config.with_ended({**config.ended, **expired})
+    config = config.with_ended_overrides(ended_override_file.read(_marked(files)))
+    expired = {one.name: format_time(one.end) for one in expired_overrides(config, now) if one.end}
+    return config.with_ended_overrides({**config.ended_overrides, **expired})
 
 
 def _warnings(state: State, now: datetime) -> tuple[Fault, ...]:

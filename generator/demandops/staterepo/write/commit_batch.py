@@ -130,7 +130,7 @@ class CommitBatch:
                 state, change, keys = self._render_for_new_config(state, before, good, now)
             except InvalidInput as error:
                 problems += error.faults
-                config = before.state.config.with_ended(state.config.ended)
+                config = before.state.config.with_ended_overrides(state.config.ended_overrides)
                 state = replace(before.state, ledger=state.ledger, config=config)
                 snapshot, good, faults = self._quarantine(
                     replace(snapshot, state=state), before, good
@@ -317,7 +317,7 @@ def _start_leases(state: State, now: datetime) -> tuple[State, dict[str, str]]:
     ledger, files = state.ledger, {}
     for claim in ledger.unstarted_claims():
         assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
-        started = replace(claim, lease=claim.lease.begun(now))
+        started = replace(claim, lease=claim.lease.restarted(now))
         ledger = ledger.replace(claim.key, started)
         files[claim_file.path_of(claim.key)] = claim_file.text_of(started)
     return replace(state, ledger=ledger), files

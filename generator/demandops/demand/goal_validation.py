@@ -1,7 +1,7 @@
-"""The form of a goal: what of plain data fits a model, and every fault of what does not.
+"""Validation of the form of a goal: the valid part of plain data, and the faults of the rest.
 
-A field of the wrong form is left out and the rest is taken all the same, so that faults of form
-and of content are told together.
+Fields of the wrong form are left out and the others kept, so that faults of form and of content
+can be reported together.
 """
 
 from __future__ import annotations
@@ -12,24 +12,24 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from demandops import strict_yaml
-from demandops.config.file_model import faults_of, field_path
+from demandops.config.base_model import faults_of, field_path
 from demandops.errors import Fault, fault
 
 _DEEPEST = 100
-"""Levels of a goal, as many as of one in YAML."""
+"""The deepest nesting of a goal, the same as in YAML."""
 
 Goal = TypeVar("Goal", bound=BaseModel)
 
 
-def valid_part(
+def parse_valid_part(
     data: dict[str, Any], model: type[Goal], lists_of_text: Container[str]
 ) -> tuple[Goal, list[Fault]]:
-    """Return what of ``data`` has the form of ``model``, and the faults of the rest.
+    """Return the part of ``data`` that has the form of ``model``, and the faults of the rest.
 
     Args:
-        data: the goal as it came.
-        model: one whose every field has a default.
-        lists_of_text: its fields that are lists of text.
+        data: the goal.
+        model: a model with a default for every field.
+        lists_of_text: the fields of the model that are lists of text.
     """
     faults: list[Fault] = []
     pruned = _with_keys_of_text(data, (), faults)
@@ -45,7 +45,7 @@ def valid_part(
 def _with_keys_of_text(
     data: object, location: tuple[int | str, ...], faults: list[Fault]
 ) -> object:
-    """Return ``data`` without the entries whose key is no text, which are told."""
+    """Return ``data`` without the entries whose key is not text; add a fault for each."""
     if len(location) > _DEEPEST and isinstance(data, dict | list):
         message = f"is nested deeper than {_DEEPEST} levels; make it flatter"
         faults.append(fault(field_path(location[:2]), message))
@@ -59,7 +59,7 @@ def _with_keys_of_text(
         if isinstance(key, str):
             kept[key] = _with_keys_of_text(value, (*location, key), faults)
         else:
-            message = f"the key {strict_yaml.brief(key)} must be text; put it in quotes"
+            message = f"the key {strict_yaml.short_repr(key)} must be text; put it in quotes"
             faults.append(fault(field_path(location), message))
     return kept
 
@@ -70,12 +70,12 @@ def _blanked(
     lists_of_text: Container[str],
     within: str = "",
 ) -> object:
-    """Return ``data`` without what stands at ``location``.
+    """Return ``data`` without the value at ``location``.
 
-    A field goes, so that its default holds; a list's item becomes an empty one, so that those
-    behind it keep their places.
+    A field is removed, so that its default applies. An item of a list is replaced by an empty one,
+    so that later items keep their positions.
     """
-    if not location:  # the whole of it, as for a key that is no Unicode text
+    if not location:  # the fault concerns all of it, for example a key with a lone surrogate
         return {}
     head, *rest = location
     if isinstance(data, list) and isinstance(head, int):

@@ -1,7 +1,7 @@
-"""The base of every model that is parsed from a file or a message.
+"""The base classes of every model that is parsed from a file or a message.
 
-Frozen, strict, unknown fields refused; :func:`parse` turns pydantic's report into faults that
-name the field the way a person would look for it.
+Models are frozen and strict, and reject unknown fields. :func:`parse` turns pydantic's errors into
+faults that name the field as it is written in the file.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
 
 from demandops import strict_yaml
-from demandops.errors import Fault, InvalidInput, fault, near
+from demandops.errors import Fault, InvalidInput, fault, suggestion
 from demandops.settings import API_VERSION
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -19,23 +19,23 @@ Model = TypeVar("Model", bound=BaseModel)
 DnsLabel = Annotated[
     str, StringConstraints(pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$", max_length=63)
 ]
-"""A name that Kubernetes takes as it is (RFC 1123 label)."""
+"""A name that is valid in Kubernetes (RFC 1123 label)."""
 
 Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_length=63)]
-"""A name that people give to roles, services and images in definitions."""
+"""The name of a role or a channel in a configuration file."""
 
 Approval = Literal["none", "required"]
-"""Whether a person has to agree before a demand is carried out."""
+"""Whether a demand needs a person's approval."""
 
 
-class Frozen(BaseModel):
-    """A value that cannot change, with no room for misspelt fields."""
+class FrozenModel(BaseModel):
+    """An immutable value that rejects unknown fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-class FileModel(Frozen):
-    """A file that people write: it says which format it is in."""
+class FileModel(FrozenModel):
+    """A configuration file; ``apiVersion`` names its format."""
 
     apiVersion: Literal["demandops/v1"]
 
@@ -52,7 +52,7 @@ def field_path(location: tuple[int | str, ...]) -> str:
 
 
 def faults_of(error: ValidationError, model: type[BaseModel], file: str = "") -> list[Fault]:
-    """Return every fault of a failed validation, told as where, what and how to mend it."""
+    """Return every fault of a failed validation."""
     return [
         fault(field_path(item["loc"]), _message(dict(item), model)).within(file)
         for item in error.errors(include_url=False)
@@ -77,13 +77,13 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
     if kind == "extra_forbidden":
         name = str(item["loc"][-1])
         known = _fields(model) if len(item["loc"]) == 1 else []
-        return "is not a field here; remove it or mend its spelling" + (
-            near(name, known) if known else ""
+        return "is not a field here; remove it or correct its spelling" + (
+            suggestion(name, known) if known else ""
         )
     if kind == "string_type" and isinstance(value, int | float):
-        return f"must be text, not {strict_yaml.brief(value)}; put it in quotes"
+        return f"must be text, not {strict_yaml.short_repr(value)}; put it in quotes"
     if kind == "literal_error":
-        return f"is {strict_yaml.brief(value)}, but must be {item['ctx']['expected']}"
+        return f"is {strict_yaml.short_repr(value)}, but must be {item['ctx']['expected']}"
     if kind == "string_pattern_mismatch":
         return (
             f"{value!r} is not a name that can be used here; it must match {item['ctx']['pattern']}"
@@ -93,7 +93,7 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
     if kind == "string_too_short":
         return "is empty; fill it in"
     expected = _EXPECTED.get(kind) or f"{item['msg'][:1].lower()}{item['msg'][1:]}"
-    return f"{expected}, not {strict_yaml.brief(value)}"
+    return f"{expected}, not {strict_yaml.short_repr(value)}"
 
 
 def _fields(model: type[BaseModel]) -> list[str]:
@@ -101,7 +101,11 @@ def _fields(model: type[BaseModel]) -> list[str]:
 
 
 def parse(model: type[Model], data: object, file: str = "") -> Model:
-    """Validate ``data``; raise :class:`InvalidInput` with every fault, each naming ``file``."""
+    """Return ``data`` as ``model``.
+
+    Raises:
+        InvalidInput: with every fault; each names ``file``.
+    """
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -109,7 +113,11 @@ def parse(model: type[Model], data: object, file: str = "") -> Model:
 
 
 def parse_file(model: type[Model], text: str, file: str) -> Model:
-    """Parse one YAML file into ``model``; raise :class:`InvalidInput` with every fault."""
+    """Return the text of a YAML file as ``model``.
+
+    Raises:
+        InvalidInput: with every fault.
+    """
     try:
         data = strict_yaml.load(text)
     except InvalidInput as error:

@@ -1,4 +1,4 @@
-"""Reading configuration files item by item, so that one broken entry hides no other fault."""
+"""The reader of configuration files: it reads item by item, to find the faults of every item."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from demandops import strict_yaml
-from demandops.config.file_model import DnsLabel, faults_of, parse, parse_file
+from demandops.config.base_model import DnsLabel, faults_of, parse, parse_file
 from demandops.errors import Fault, InvalidInput, fault
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -17,24 +17,24 @@ Raw = TypeVar("Raw", list[Any], dict[str, Any])
 _NAME = TypeAdapter(DnsLabel)
 
 
-class ItemReader:
-    """The files of one state repo, and every fault found in them so far."""
+class ConfigReader:
+    """Reads the configuration files of one state repo and collects every fault."""
 
     def __init__(self, files: Mapping[str, str]) -> None:
         self.files = files
         self.faults: list[Fault] = []
-        self._places: dict[str, dict[str, int]] = {}
-        self._unsound: set[str] = set()
+        self._positions: dict[str, dict[str, int]] = {}
+        self._incomplete: set[str] = set()
 
-    def tell(self, file: str, field: str, message: str) -> None:
-        """Note a fault."""
+    def add_fault(self, file: str, field: str, message: str) -> None:
+        """Add a fault to :attr:`faults`."""
         self.faults.append(fault(field, message).within(file))
 
-    def one(self, file: str, model: type[Model]) -> Model | None:
-        """Parse a file into one model; nothing where it is missing or faulty, which is noted."""
+    def read_file(self, file: str, model: type[Model]) -> Model | None:
+        """Return a file as ``model``; if it is missing or invalid, add the faults."""
         text = self.files.get(file)
         if text is None:
-            self.tell(file, "", "is missing; `demandops init` shows what it holds")
+            self.add_fault(file, "", "is missing; `demandops init` creates an example")
             return None
         try:
             return parse_file(model, text, file)
@@ -42,34 +42,36 @@ class ItemReader:
             self.faults += error.faults
             return None
 
-    def listed(
+    def read_list(
         self, file: str, whole: type[BaseModel], field: str, item: type[Model], key: str
     ) -> dict[str, Model]:
-        """Parse a file that is a list of items; return the sound ones by their name."""
-        found: dict[str, Model] = {}
-        places: dict[str, int] = {}
+        """Return the valid items of a file that lists items, by name; add the others' faults."""
+        items: dict[str, Model] = {}
+        positions: dict[str, int] = {}
         raw = self._collection(file, whole, field, list)
-        sound = raw is not None
+        complete = raw is not None
         for index, entry in enumerate(raw or ()):
             name = entry.get(key) if isinstance(entry, dict) else None
-            if isinstance(name, str) and name in places:
-                self.tell(file, f"{field}[{index}].{key}", f"'{name}' stands twice; remove one")
+            if isinstance(name, str) and name in positions:
+                self.add_fault(
+                    file, f"{field}[{index}].{key}", f"'{name}' appears twice; remove one"
+                )
                 continue
             parsed = self._item(file, f"{field}[{index}]", item, entry)
             if parsed is None or not isinstance(name, str):
-                sound = False
+                complete = False
                 continue
-            found[name], places[name] = parsed, index
-        self._places[file] = places
-        if not sound:
-            self._unsound.add(file)
-        return found
+            items[name], positions[name] = parsed, index
+        self._positions[file] = positions
+        if not complete:
+            self._incomplete.add(file)
+        return items
 
-    def named(
+    def read_mapping(
         self, file: str, whole: type[BaseModel], field: str, item: type[Model]
     ) -> dict[str, Model]:
-        """Parse a file that maps names to items; return the sound ones."""
-        found: dict[str, Model] = {}
+        """Return the valid items of a file that maps names to items; add the others' faults."""
+        items: dict[str, Model] = {}
         raw = self._collection(file, whole, field, dict)
         for name, entry in (raw or {}).items():
             parsed = self._item(file, f"{field}.{name}", item, entry)
@@ -77,36 +79,36 @@ class ItemReader:
                 _NAME.validate_python(name)
             except ValidationError as error:
                 self.faults += [
-                    fault(f"{field}.{name}", one.message).within(file)
-                    for one in faults_of(error, item)
+                    fault(f"{field}.{name}", found.message).within(file)
+                    for found in faults_of(error, item)
                 ]
                 parsed = None
             if parsed is not None:
-                found[name] = parsed
-        self._places[file] = {name: index for index, name in enumerate(found)}
-        if raw is None or len(found) < len(raw):
-            self._unsound.add(file)
-        return found
+                items[name] = parsed
+        self._positions[file] = {name: index for index, name in enumerate(items)}
+        if raw is None or len(items) < len(raw):
+            self._incomplete.add(file)
+        return items
 
-    def place(self, file: str, name: str) -> int:
-        """Return where in its list an item stands."""
-        return self._places[file][name]
+    def index_of(self, file: str, name: str) -> int:
+        """Return the position of an item in its file."""
+        return self._positions[file][name]
 
-    def lacks(self, file: str, name: str) -> bool:
-        """Tell whether a file has no item of that name; not where it may be one that is faulty."""
-        return file not in self._unsound and name not in self._places[file]
+    def is_missing(self, file: str, name: str) -> bool:
+        """Return whether a file surely has no such item; False if an invalid item could be it."""
+        return file not in self._incomplete and name not in self._positions[file]
 
-    def names(self, file: str) -> list[str]:
+    def item_names(self, file: str) -> list[str]:
         """Return the names of a file's items."""
-        return list(self._places[file])
+        return list(self._positions[file])
 
     def _collection(
         self, file: str, whole: type[BaseModel], field: str, kind: type[Raw]
     ) -> Raw | None:
-        """Return what stands in ``field``, once the rest of the file is found sound or told."""
+        """Return the raw value of ``field``; add the faults of the file's other fields."""
         text = self.files.get(file)
         if text is None:
-            self.one(file, whole)
+            self.read_file(file, whole)
             return None
         try:
             data = strict_yaml.load(text)
@@ -115,7 +117,7 @@ class ItemReader:
             return None
         raw = data.get(field) if isinstance(data, dict) else None
         if not isinstance(data, dict) or not isinstance(raw, kind):
-            self.one(file, whole)
+            self.read_file(file, whole)
             return None
         try:
             parse(whole, {**data, field: kind()}, file)
