@@ -23,8 +23,9 @@ import yaml
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from demandops.cli import main
-from model.books import Books, Goal, Result, in_model_words, object_lists
-from model.goals import SKELETON, Maker
+
+from tests.model.books import Books, Goal, Result, in_model_words, object_lists
+from tests.model.goals import SKELETON, Maker
 
 REQUESTS, CALLS = 150, 6
 SEEDS = range(1, 1 + 2 * int(os.environ.get("DEMANDOPS_EXAMPLES", "1")))

@@ -10,8 +10,8 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from model.books import Books
-from model.goals import SKELETON
+from tests.model.books import Books
+from tests.model.goals import SKELETON
 
 EXPERIMENT = Path(__file__).resolve().parents[2] / "examples" / "experiment"
 STATION_CLOUD = "station00 /stations/station00/pointcloud"

@@ -49,7 +49,7 @@ GIT_ENVIRONMENT = {
     "LC_ALL": "C.UTF-8",
 }
 
-_DRIVER = Path(__file__).with_name("driver.py")
+_DRIVER = Path(__file__).parents[2] / "kit" / "driver.py"
 _CHECKOUT = Path(__file__).parents[3]
 
 

@@ -14,7 +14,8 @@ from demandops.errors import Refused
 from demandops.ledger.apply import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.staterepo import new_repo
-from model.books import Goal, in_model_words, object_lists
+
+from tests.model.books import Goal, in_model_words, object_lists
 
 NOW = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
 

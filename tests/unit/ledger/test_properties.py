@@ -18,8 +18,10 @@ from demandops.ledger.apply import Ledger
 from hypothesis import assume, given, note
 from hypothesis import strategies as st
 from inmemory import NOW, Repo, outcome
-from model.books import Books, Demand, Goal
-from model.goals import (
+from trying import TIMES, chances, examples, told
+
+from tests.model.books import Books, Demand, Goal
+from tests.model.goals import (
     SKELETON,
     STATION_CLOUD,
     VEHICLE_CLOUD,
@@ -31,7 +33,6 @@ from model.goals import (
     shutdown_of,
     summary,
 )
-from trying import TIMES, chances, examples, told
 
 
 def demand_in(claim: Claim) -> tuple[str, str, Demand]:

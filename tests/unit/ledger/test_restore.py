@@ -18,7 +18,8 @@ from demandops.errors import Refused
 from demandops.ledger.apply import Ledger
 from demandops.ledger.restoration import Restoration
 from inmemory import NOW, Repo
-from model.goals import Maker
+
+from tests.model.goals import Maker
 
 LATER = NOW + timedelta(hours=3)
 

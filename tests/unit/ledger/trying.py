@@ -12,8 +12,9 @@ from typing import Any
 
 from hypothesis import HealthCheck, Phase, note, settings
 from hypothesis import strategies as st
-from model.books import Goal
-from model.goals import summary
+
+from tests.model.books import Goal
+from tests.model.goals import summary
 
 TIMES = int(os.environ.get("DEMANDOPS_EXAMPLES", "1"))
 

@@ -1,0 +1,40 @@
+"""Settings of Hypothesis: the same examples every time, so that no build fails by chance.
+
+``DEMANDOPS_EXAMPLES=20`` tries twenty times as many, and others each time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from typing import Any
+
+from hypothesis import HealthCheck, Phase, note, settings
+from hypothesis import strategies as st
+
+from tests.model.books import Goal
+from tests.model.goals import summary
+
+TIMES = int(os.environ.get("DEMANDOPS_EXAMPLES", "1"))
+
+chances = st.randoms(use_true_random=False)
+
+
+def examples(count: int) -> Callable[[Any], Any]:
+    """Try so many examples, the same ones every time unless more are asked for."""
+    return settings(
+        max_examples=count * TIMES,
+        derandomize=TIMES == 1,
+        database=None,
+        phases=[Phase.explicit, Phase.generate, Phase.shrink],
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+    )
+
+
+def told(requests: list[Goal]) -> list[Goal]:
+    """Have the requests shown where a test fails."""
+    for request in requests:
+        note(json.dumps(summary(request)))
+    return requests
