@@ -28,18 +28,28 @@ def pytest_configure(config: pytest.Config) -> None:
     )
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep journals, clones and git away from the set-up of this machine's user."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path_factory.mktemp("home")))
+        patch.delenv("DEMANDOPS_STATE_REPO", raising=False)
+        for name, value in repo.NO_GIT_CONFIG.items():
+            patch.setenv(name, value)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep journals and clones in a temporary folder."""
+    """Keep the journals and clones of a test in a folder of its own."""
     home = tmp_path / "home"
     monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(home))
-    monkeypatch.delenv("DEMANDOPS_STATE_REPO", raising=False)
     return home
 
 
 @pytest.fixture
 def git_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have git ask no user's set-up, and commit as Petra."""
+    """Commit as Petra."""
     for name, value in repo.GIT_ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
 
@@ -106,6 +116,17 @@ def url(bare: Path) -> str:
 def person(bare: Path, tmp_path: Path) -> Person:
     """A person with a clone of the same state repo."""
     return Person(bare, tmp_path / "person")
+
+
+@pytest.fixture(scope="session")
+def _checkout_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return repo.init(tmp_path_factory.mktemp("template") / "state-repo", bare=False)
+
+
+@pytest.fixture
+def checkout(_checkout_template: Path, tmp_path: Path) -> Path:
+    """A state repo with a working tree."""
+    return Path(shutil.copytree(_checkout_template, tmp_path / "state-repo"))
 
 
 # ---- the program ----

@@ -15,18 +15,6 @@ from typing import Any
 import pygit2
 import pytest
 import yaml
-from asking import (
-    BODY,
-    CLOUD,
-    FAST,
-    NOW,
-    STATION_CLOUD,
-    Books,
-    application,
-    connection,
-    goal,
-    skeleton,
-)
 from demandops.cli.main import run
 from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from demandops.errors import Refused
@@ -37,6 +25,11 @@ from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import all_keys
 from demandops.staterepo import new_repo
 from demandops.staterepo.git import tree as trees
+
+from tests.kit.books import NOW
+from tests.kit.books import MemoryRepo as Books
+from tests.kit.config import FAST, skeleton
+from tests.kit.goals import BODY, CLOUD, STATION_CLOUD, application, connection, goal
 
 HERE = Path(__file__).parent
 RECORDER, MONITOR = 2, 3

@@ -15,15 +15,15 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import (
+
+from tests.kit.config import FAST, brokers
+from tests.kit.goals import (
     BODY,
     CLOUD,
     EGO,
-    FAST,
     ROS_NAMES,
     STATION_CLOUD,
     application,
-    brokers,
     connection,
     goal,
     perception,

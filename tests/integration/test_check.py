@@ -4,28 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from demandops.cli.main import run
 
+from tests.kit.repo import git
+
 CHART = "appdefs/object-detection-fusion/charts/object-fusion"
-
-
-@pytest.fixture(scope="module")
-def laid_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("check") / "state-repo"
-    assert run(["init", str(folder)]) == 0
-    return folder
-
-
-@pytest.fixture
-def checkout(laid_down: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path / "data"))
-    shutil.copytree(laid_down, tmp_path / "state-repo")
-    return tmp_path / "state-repo"
 
 
 NEW_CHART = """\
@@ -56,12 +43,6 @@ def check(checkout: Path, capsys: pytest.CaptureFixture[str]) -> Check:
         return code, out, printed.err
 
     return checked
-
-
-def git(folder: Path, *args: str) -> str:
-    who = ["-c", "user.name=someone", "-c", "user.email=someone@example.invalid"]
-    command = ["git", "-C", str(folder), *who, *args]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
 def head(folder: Path) -> str:
@@ -204,7 +185,7 @@ def test_an_application_definition_that_is_in_use_cannot_be_deleted(
         )
     )
     bare = checkout.parent / "state.git"
-    subprocess.run(["git", "clone", "-q", "--bare", checkout, bare], check=True)
+    git(checkout.parent, "clone", "-q", "--bare", str(checkout), str(bare))
     assert run(["request", str(goal), "--state-repo", str(bare)]) == 0
     git(checkout, "pull", "-q", str(bare), "main")
     (checkout / "appdefs" / "object-detection-fusion" / "appdef.yaml").unlink()

@@ -16,11 +16,12 @@ from typing import Any
 import pygit2
 import pytest
 import yaml
-from asking import APP, CLOUD, FAST, Goal, application, connection, goal, perception
 from demandops import __version__
 from demandops.cli.views import bookkeeping
 
-EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("*.yaml"))
+from tests.kit.config import FAST
+from tests.kit.goals import APP, CLOUD, EXPERIMENT, Goal, application, connection, goal, perception
+
 SHA = re.compile(r"[0-9a-f]{40}")
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 SOURCE_END = "mqtt-vehicle01-edge-source-092a70a6cc97"

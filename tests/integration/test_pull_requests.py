@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,8 @@ import yaml
 from demandops.cli.main import run
 from demandops.cli.repo import pull_request_comment
 from demandops.staterepo.pull_request import merge_check as checking
+
+from tests.kit.repo import git
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "experiment"
 GOLDEN = Path(__file__).with_name("pull-request.md")
@@ -26,31 +27,16 @@ LOST = "is generated, and an edit by hand is lost; take it back"
 Check = Callable[..., tuple[int, str, str]]
 
 
-def git(folder: Path, *args: str) -> str:
-    who = ["-c", "user.name=Petra", "-c", "user.email=petra@example.org"]
-    command = ["git", "-C", str(folder), *who, *args]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
-
 @pytest.fixture(scope="module")
-def laid_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def laid_down(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bare state repo in which vehicle00's demand runs."""
-    folder = tmp_path_factory.mktemp("pull-requests") / "state.git"
-    assert run(["init", str(folder), "--bare"]) == 0
+    folder = Path(shutil.copytree(bare_template, tmp_path_factory.mktemp("booked") / "state.git"))
     book(folder, "1-vehicle00-joins")
     return folder
 
 
 def book(bare: Path, step: str) -> None:
     assert run(["request", str(EXAMPLES / f"{step}.yaml"), "--state-repo", str(bare)]) == 0
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _data(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path_factory.mktemp("data")))
-        patch.delenv("DEMANDOPS_STATE_REPO", raising=False)
-        yield
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ import json
 import os
 import re
 import subprocess
-import sys
 import tarfile
 from pathlib import Path
 from random import Random
@@ -19,9 +18,6 @@ from typing import Any
 
 import pytest
 import yaml
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from demandops.cli import main
 
 from tests.model.books import Books, Goal, Result, in_model_words, object_lists
@@ -79,7 +75,6 @@ def demandops(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> CommandLine:
     """A new bare state repo and the command line for it."""
-    monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setenv("DEMANDOPS_STATE_REPO", str(tmp_path / "state.git"))
     command = CommandLine(tmp_path / "state.git", capsys)
     code, _ = command("init", str(command.state_repo), "--bare")

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from asking import connection, goal
 from demandops.staterepo.git.signing import Signer, SigningFailed
+
+from tests.kit.goals import connection, goal
 
 Run = Callable[..., Any]
 

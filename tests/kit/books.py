@@ -40,12 +40,14 @@ class MemoryRepo:
     ) -> None:
         """Start from the skeleton with some files changed, or from a state."""
         self.now = now
-        self._initial = dict(skeleton())
-        if state is None and not changed:
-            self.state = _unchanged()
+        if state is not None:
+            self.state, self._initial = state, rendered(state)
+        elif not changed:
+            self.state, self._initial = _unchanged(), dict(skeleton())
         else:
-            self.state = state or State.of(load(configuration(changed)), Ledger())
-            self._initial = {**configuration(changed), **rendered(self.state)}
+            files = configuration(changed)
+            self.state = State.of(load(files), Ledger())
+            self._initial = files | rendered(self.state)
         self.files = dict(self._initial)
 
     def copy(self) -> MemoryRepo:

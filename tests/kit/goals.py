@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,10 @@ EGO: Topic = ("/vehicles/vehicle00/ego_data", "vehicle00")
 STATION_CLOUD: Topic = ("/stations/station00/pointcloud", "station00")
 
 BODY = "apps[0].object_detection_fusion_app"
+ROS_NAMES = (
+    "is not a topic name that ROS 2 allows; use letters, digits and '_' between single '/', no "
+    "part starting with a digit"
+)
 
 EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("*.yaml"))
 """The files of the paper's eight demands, in order."""
@@ -127,29 +131,3 @@ def experiment(step: int) -> Goal:
     """Return the demand of a step of the paper's experiment; the first step is 1."""
     made: Goal = yaml.safe_load(EXPERIMENT[step - 1].read_text())
     return made
-
-
-def routes(demand: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a ``Demand`` document for connections in short form.
-
-    A connection has ``topics`` as the ledger writes them, its ``type`` by name, and may name its
-    ``requesters``; the first one's requesters make the demand.
-    """
-    connections = []
-    for item in demand["connections"]:
-        topics = [
-            {"source": source, **({"target": said} if isinstance(said, str) else said)}
-            for source, said in item.get("topics", {}).items()
-        ]
-        kept = {name: value for name, value in item.items() if name != "requesters"}
-        connections.append(kept | {"topics": topics})
-    ids = ", ".join(item["id"] for item in demand["connections"])
-    requesters = demand["connections"][0].get("requesters", ["vehicle00"])
-    head = {
-        "kind": "Demand",
-        "demand": f"{demand.get('id', 'request')} of {' '.join(requesters)}: {ids}",
-        "requesters": requesters,
-    }
-    if demand.get("shutdown"):
-        return head | {"operation": "release"}
-    return head | {"connections": connections}

@@ -21,30 +21,32 @@ from demandops.staterepo.load import snapshot as snapshots
 
 from tests.kit.books import NOW
 
-GIT_ENVIRONMENT = {
+NO_GIT_CONFIG = {
     "GIT_CONFIG_GLOBAL": os.devnull,
     "GIT_CONFIG_NOSYSTEM": "1",
+    "GIT_TERMINAL_PROMPT": "0",
+    "LC_ALL": "C.UTF-8",
+}
+GIT_ENVIRONMENT = NO_GIT_CONFIG | {
     "GIT_AUTHOR_NAME": "Petra Platform",
     "GIT_AUTHOR_EMAIL": "petra@example.org",
     "GIT_COMMITTER_NAME": "Petra Platform",
     "GIT_COMMITTER_EMAIL": "petra@example.org",
-    "GIT_TERMINAL_PROMPT": "0",
-    "LC_ALL": "C.UTF-8",
 }
 
 POLICY = "policy/access-domains.yaml"
 
 
-def init(path: Path) -> Path:
-    """Make a bare state repo, as ``demandops init --bare`` does."""
-    new_repo.init(path, NOW, bare=True, gitops="flux")
+def init(path: Path, *, bare: bool = True) -> Path:
+    """Make a state repo, as ``demandops init`` does."""
+    new_repo.init(path, NOW, bare=bare, gitops="flux")
     return path
 
 
 def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
     """Run git in a folder and return its output without the last line break."""
     done = subprocess.run(
-        ["git", "-C", os.fspath(folder), *args],
+        ["git", "-C", os.fspath(folder).removeprefix("file://"), *args],
         capture_output=True,
         text=True,
         errors="replace",
@@ -207,6 +209,12 @@ def commits(repo: Path, revisions: str = "main") -> list[Commit]:
 def tip(repo: Path) -> str:
     """Return the newest commit of main."""
     return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)
+
+
+def read(repo: Path, path: str) -> str:
+    """Return a file of main, empty when it is not there."""
+    git = pygit2.Repository(str(repo))
+    return trees.read_text(git[tip(repo)].peel(pygit2.Tree), path) or ""
 
 
 def operations(repo: Path) -> list[str]:

@@ -14,7 +14,6 @@ from concurrent.futures import TimeoutError as NotAnswered
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 import yaml
 from demandops import settings
 from demandops.cli.main import run
@@ -22,18 +21,15 @@ from demandops.errors import QueueFull, Withdrawn
 from demandops.service import Generator
 from demandops.staterepo.load import problem_report
 from demandops.staterepo.write.journal import Journal
-from git_over_http import Server, serving
-from staterepo_rig import Person, Stages, goal, leave
+
+from tests.kit import rig
+from tests.kit.git_over_http import Server, serving
+from tests.kit.rig import Person, Stages, goal, leave
 
 NODES, CLUSTERS = "inventory/nodes.yaml", "inventory/clusters.yaml"
 BROKERS, CHARTS = "inventory/brokers.yaml", "registry/charts.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 SOON_S = 0.1
-
-
-@pytest.fixture
-def person(bare: Path, tmp_path: Path) -> Person:
-    return Person(bare, tmp_path / "person")
 
 
 @pytest.fixture

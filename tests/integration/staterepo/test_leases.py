@@ -15,14 +15,15 @@ from typing import Any
 
 import pygit2
 import pytest
-import staterepo_rig as rig
 from demandops import settings
 from demandops.demand.claim import Claim
 from demandops.errors import Refused
 from demandops.service import Generator, worker
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.write import journal
-from staterepo_rig import Person
+
+from tests.kit import rig
+from tests.kit.rig import Person
 
 DOMAINS = "policy/access-domains.yaml"
 POLICY = """\
@@ -48,13 +49,13 @@ def _with_policy(repo: Path, more: str = "") -> Path:
 
 
 @pytest.fixture(scope="session")
-def _leased_template(_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def _leased_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("leased") / "state.git"
-    return _with_policy(Path(shutil.copytree(_template, folder)))
+    return _with_policy(Path(shutil.copytree(bare_template, folder)))
 
 
 @pytest.fixture
-def new_repo(_leased_template: Path, tmp_path: Path) -> Callable[[str], Path]:
+def new_repo(_leasedbare_template: Path, tmp_path: Path) -> Callable[[str], Path]:
     """Make further bare state repos, whose leases have no slack."""
 
     def make(name: str) -> Path:

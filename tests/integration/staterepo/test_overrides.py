@@ -12,32 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import staterepo_rig as rig
 import yaml
 from demandops.errors import InvalidInput, Refused
 from demandops.service import Generator
-from staterepo_rig import Person
+
+from tests.kit import rig
+from tests.kit.config import override
+from tests.kit.rig import Person
 
 EDGE = "clusters/c-its/perception/edge"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"
 WATCHED: dict[str, Any] = {"services": ["object-detection"], "nodes": ["edge"]}
-
-
-def override(*select: dict[str, Any], **fields: Any) -> str:
-    head = {"apiVersion": "demandops/v1", "kind": "Override"}
-    told = {"reason": "a field test", "owner": "petra", "select": list(select)}
-    return yaml.safe_dump(head | told | fields, sort_keys=False)
-
-
-@pytest.fixture
-def person(bare: Path, tmp_path: Path) -> Person:
-    return Person(bare, tmp_path / "person")
-
-
-@pytest.fixture
-def generator(bare: Path) -> Iterator[Generator]:
-    with rig.running(bare) as running:
-        yield running
 
 
 @pytest.fixture

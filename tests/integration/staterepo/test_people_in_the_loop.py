@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import staterepo_rig as rig
 import yaml
 from demandops.service import Generator
-from staterepo_rig import Person
+
+from tests.kit import rig
+from tests.kit.rig import Person
 
 FURTHER = int(os.environ.get("DEMANDOPS_LOAD_FURTHER", "60"))
 INTERVAL_S = 0.5

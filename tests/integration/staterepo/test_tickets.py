@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import staterepo_rig as rig
 from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
 from demandops.service import Generator, Ticket
-from staterepo_rig import Drivers, Gate, Stages, demand, goal
+
+from tests.kit import rig
+from tests.kit.rig import Drivers, Gate, Stages, demand, goal
 
 # ---- taking back ----
 

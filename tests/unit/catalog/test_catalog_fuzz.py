@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import FAST, configuration, skeleton
 from demandops.config.load import load
 from demandops.decision import State, rehearse
 from demandops.errors import InvalidInput
 from demandops.ledger.apply import Ledger
+
+from tests.kit.config import FAST, configuration, skeleton
 
 FILES = sorted(
     path

@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from asking import Books, configuration, perception, skeleton
 from demandops.config.load import load
 from demandops.decision import State, rehearse
 from demandops.errors import InvalidInput
 from demandops.ledger.apply import Ledger
+
+from tests.kit.books import MemoryRepo as Books
+from tests.kit.config import configuration, skeleton
+from tests.kit.goals import perception
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 from demandops.cluster.health import Health, Named, Place, Target, Watched, reading
 
-from tests.unit.cluster.commits import Letters
-from tests.unit.cluster.test_flux import condition, deployment
+from tests.kit.cluster import Letters, condition, deployment
 
 URL = "https://git.example/fleet.git"
 COMMITS = Letters()

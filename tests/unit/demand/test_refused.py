@@ -5,16 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from asking import (
+
+from tests.kit.books import MemoryRepo as Books
+from tests.kit.config import brokers
+from tests.kit.goals import (
     APP,
     BODY,
     CLOUD,
     EGO,
     ROS_NAMES,
-    Books,
     Goal,
     application,
-    brokers,
     connection,
     goal,
     perception,

@@ -22,8 +22,8 @@ from demandops.ledger import claim_file as ledger_format
 from demandops.ledger.apply import Ledger
 from hypothesis import given, note
 from hypothesis import strategies as st
-from trying import chances, examples
 
+from tests.kit.chance import chances, examples
 from tests.model.leases import BY_MESSAGE, Goal, Promises, Subject
 from tests.scenarios import running
 

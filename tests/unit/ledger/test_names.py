@@ -14,9 +14,9 @@ from demandops.demand.demand_request import id_problem
 from demandops.plan import naming
 from hypothesis import given
 from hypothesis import strategies as st
-from inmemory import Repo
-from trying import examples, told
 
+from tests.kit.books import MemoryRepo as Repo
+from tests.kit.chance import examples, told
 from tests.model.goals import goal
 
 DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")

@@ -17,9 +17,10 @@ from demandops.ledger import claim_file as ledger_format
 from demandops.ledger.apply import Ledger
 from hypothesis import assume, given, note
 from hypothesis import strategies as st
-from inmemory import NOW, Repo, outcome
-from trying import TIMES, chances, examples, told
 
+from tests.kit.books import NOW, outcome
+from tests.kit.books import MemoryRepo as Repo
+from tests.kit.chance import TIMES, chances, examples, told
 from tests.model.books import Books, Demand, Goal
 from tests.model.goals import (
     SKELETON,

@@ -17,8 +17,9 @@ from demandops.demand.lease import Lease
 from demandops.errors import Refused
 from demandops.ledger.apply import Ledger
 from demandops.ledger.restoration import Restoration
-from inmemory import NOW, Repo
 
+from tests.kit.books import NOW
+from tests.kit.books import MemoryRepo as Repo
 from tests.model.goals import Maker
 
 LATER = NOW + timedelta(hours=3)

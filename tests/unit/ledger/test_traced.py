@@ -14,9 +14,9 @@ from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys
 from hypothesis import given
 from hypothesis import strategies as st
-from inmemory import Repo
-from trying import TIMES, chances, examples, told
 
+from tests.kit.books import MemoryRepo as Repo
+from tests.kit.chance import TIMES, chances, examples, told
 from tests.model.goals import Maker
 
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import CLOUD, EGO, NOW, STATION_CLOUD, Books, application, connection, goal
 from demandops.decision import decide, rendered
 from demandops.demand.claim import KEPT, Subject, SubjectKind
 from demandops.demand.demand_request import DemandRequest, Operation
@@ -20,6 +19,10 @@ from demandops.errors import InvalidInput, Refused
 from demandops.plan.views.bookkeeping import bookkeeping
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from tests.kit.books import NOW
+from tests.kit.books import MemoryRepo as Books
+from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal
 
 HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
 
