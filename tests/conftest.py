@@ -13,7 +13,7 @@ import pytest
 import yaml
 from demandops.service import Generator
 
-from tests.kit import repo
+from tests.kit import repo, sync
 from tests.kit.cli import Ran, Run, runner
 from tests.kit.generator import running
 from tests.kit.processes import Drivers
@@ -26,6 +26,8 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", f"limit(seconds): fail the test when it takes longer (default {_LIMIT_S:.0f})"
     )
+    config.addinivalue_line("markers", "synced: force writes to disk, as the program does")
+    sync.force(False)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -45,6 +47,14 @@ def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     home = tmp_path / "home"
     monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(home))
     return home
+
+
+@pytest.fixture(autouse=True)
+def synced(request: pytest.FixtureRequest) -> bool:
+    """Force writes to disk in tests marked so, and in no others; tell which this is."""
+    on = request.node.get_closest_marker("synced") is not None
+    sync.force(on)
+    return on
 
 
 @pytest.fixture
@@ -83,9 +93,15 @@ def bare_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def new_repo(bare_template: Path, tmp_path: Path) -> Callable[[str], Path]:
+def new_repo(bare_template: Path, tmp_path: Path, synced: bool) -> Callable[[str], Path]:
     """Make bare state repos by name."""
-    return lambda name: Path(shutil.copytree(bare_template, tmp_path / name))
+
+    def make(name: str) -> Path:
+        made = Path(shutil.copytree(bare_template, tmp_path / name))
+        sync.force_in(made, synced)
+        return made
+
+    return make
 
 
 @pytest.fixture
@@ -166,7 +182,8 @@ def _all_drivers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drivers]:
 
 
 @pytest.fixture
-def drivers(_all_drivers: Drivers, git_environment: None) -> Iterator[Drivers]:
+def drivers(_all_drivers: Drivers, git_environment: None, synced: bool) -> Iterator[Drivers]:
     """Start generators in processes of their own; those left running are killed at the end."""
+    _all_drivers.synced = synced
     yield _all_drivers
     _all_drivers.kill_runs()

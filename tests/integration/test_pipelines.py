@@ -54,15 +54,15 @@ def gitlab() -> dict[str, Any]:
     ],
     ids=["github", "gitlab"],
 )
-def test_a_pipeline_is_valid_by_its_schema(laid_down: Path, path: str, options: list[str]) -> None:
-    command = [sys.executable, "-m", "check_jsonschema", *options, str(laid_down / path)]
+def test_a_pipeline_is_valid_by_its_schema(checkout: Path, path: str, options: list[str]) -> None:
+    command = [sys.executable, "-m", "check_jsonschema", *options, str(checkout / path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize("path", new_repo.PIPELINES, ids=["github", "gitlab"])
-def test_a_pipeline_installs_the_version_that_laid_it_down(laid_down: Path, path: str) -> None:
-    assert re.findall(r"demandops==(\S+)", (laid_down / path).read_text()) == [__version__]
+def test_a_pipeline_installs_the_version_that_laid_it_down(checkout: Path, path: str) -> None:
+    assert re.findall(r"demandops==(\S+)", (checkout / path).read_text()) == [__version__]
 
 
 def test_who_may_write_runs_nothing_of_the_pull_request(github: dict[str, Any]) -> None:

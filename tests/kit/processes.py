@@ -19,8 +19,8 @@ from typing import Any
 from tests.kit.goals import Goal
 from tests.kit.repo import GIT_ENVIRONMENT
 
-_DRIVER = Path(__file__).with_name("driver.py")
 _CHECKOUT = Path(__file__).parents[2]
+_SOURCES = (_CHECKOUT, _CHECKOUT / "generator", _CHECKOUT / "ros_bridge")
 
 
 def demand(name: str, made: Goal, operation: str | None = None) -> dict[str, Any]:
@@ -91,11 +91,12 @@ class Drivers:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._runs: list[Run] = []
+        self.synced = False
         self._process = subprocess.Popen(
-            [sys.executable, str(_DRIVER)],
+            [sys.executable, "-m", "tests.kit.driver"],
             stdin=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONPATH": str(_CHECKOUT)},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, _SOURCES))},
         )
 
     def start(
@@ -115,6 +116,7 @@ class Drivers:
             "lanes": lanes,
             "opening": opening,
             "die_at": die_at,
+            "synced": self.synced,
             "cwd": str(cwd or Path.cwd()),
             "environment": {name: os.environ[name] for name in names},
             "to": str(pipe),

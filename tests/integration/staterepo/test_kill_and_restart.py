@@ -14,6 +14,8 @@ from demandops.service import Generator
 from tests.kit import rig
 from tests.kit.rig import Drivers, Run, Told, demand, goal, leave
 
+pytestmark = pytest.mark.synced
+
 KILLS = 15
 LANES = 4
 

@@ -18,6 +18,8 @@ import pytest
 from tests.kit import git_over_http, rig
 from tests.kit.rig import Drivers, Goal
 
+pytestmark = pytest.mark.synced
+
 GENERATORS = 4
 DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "64"))
 SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))

@@ -12,6 +12,8 @@ from demandops.service import Generator, Receipt, Ticket
 from tests.kit import rig
 from tests.kit.rig import Drivers, demand, goal, leave
 
+pytestmark = pytest.mark.synced
+
 EACH = 32
 
 
