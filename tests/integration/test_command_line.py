@@ -21,6 +21,7 @@ from demandops.cli.views import bookkeeping
 
 from tests.kit.config import FAST
 from tests.kit.goals import APP, CLOUD, EXPERIMENT, Goal, application, connection, goal, perception
+from tests.kit.repo import git
 
 SHA = re.compile(r"[0-9a-f]{40}")
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
@@ -70,9 +71,7 @@ class TestInit:
         assert SHA.fullmatch(found.pop("commit"))
         assert found == {"directory": str(folder), "gitops": "flux", "bare": False}
         assert (folder / "inventory" / "nodes.yaml").is_file()
-        assert not subprocess.run(
-            ["git", "-C", folder, "status", "--porcelain"], capture_output=True, check=True
-        ).stdout
+        assert not git(folder, "status", "--porcelain")
         assert demandops("check", folder).code == 0
 
     def test_a_state_repo_for_argo_cd(self, demandops: Run, tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ def test_edited_values_image_and_replicas_become_an_override_to_paste(
         "apiVersion: demandops/v1\n"
         "kind: Override\n"
         'reason: "Say here why; this stands for an edit of a generated file by hand"\n'
-        "owner: Petra\n"
+        'owner: "Petra Platform"\n'
         "select:\n"
         "- applications:\n"
         "  - edge/object_detection_fusion\n"

@@ -16,7 +16,6 @@ import pygit2
 import yaml
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.staterepo import new_repo, reader
-from demandops.staterepo.git import tree as trees
 from demandops.staterepo.load import snapshot as snapshots
 
 from tests.kit.books import NOW
@@ -57,6 +56,12 @@ def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
     return done.stdout.removesuffix("\n")
 
 
+def _index(path: Path, revision: str) -> tuple[pygit2.Repository, pygit2.Index]:
+    repo, index = pygit2.Repository(str(path)), pygit2.Index()
+    index.read_tree(repo.revparse_single(revision).peel(pygit2.Tree))
+    return repo, index
+
+
 class GitRepo:
     """A bare state repo of one test, read with pygit2 and not with the program."""
 
@@ -77,21 +82,10 @@ class GitRepo:
         repo = pygit2.Repository(str(self.path))
         return [commit.message for commit in repo.walk(self.tip)]
 
-    def files(self, under: str = "") -> dict[str, str]:
-        """Return path → text of every file at the tip, below one folder or all."""
-        repo = pygit2.Repository(str(self.path))
-        found: dict[str, str] = {}
-
-        def walk(tree: pygit2.Tree, prefix: str) -> None:
-            for entry in tree:
-                path = f"{prefix}{entry.name}"
-                if isinstance(entry, pygit2.Tree):
-                    walk(entry, f"{path}/")
-                elif isinstance(entry, pygit2.Blob):
-                    found[path] = entry.data.decode()
-
-        walk(repo[self.tip].peel(pygit2.Tree), "")
-        return {path: text for path, text in found.items() if path.startswith(under)}
+    def files(self, under: str = "", revision: str = "main") -> dict[str, str]:
+        """Return path → text of every file at a commit, below one folder or all."""
+        repo, index = _index(self.path, revision)
+        return {e.path: repo[e.id].data.decode() for e in index if e.path.startswith(under)}
 
     def manifests(self) -> dict[str, str]:
         """Return what a GitOps controller reads."""
@@ -99,9 +93,15 @@ class GitRepo:
 
     def commit(self, changed: dict[str, str | None], text: str = "By hand\n") -> str:
         """Commit as a person would, and return the commit."""
-        repo = pygit2.Repository(str(self.path))
-        tree = trees.write(repo, repo[self.tip].peel(pygit2.Tree), changed)
+        repo, index = _index(self.path, "main")
+        for path, new in changed.items():
+            if new is None:
+                index.remove(path)
+            else:
+                blob = repo.create_blob(new.encode())
+                index.add(pygit2.IndexEntry(path, blob, pygit2.enums.FileMode.BLOB))
         who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
+        tree = index.write_tree(repo)
         return str(repo.create_commit("refs/heads/main", who, who, text, tree, [self.tip]))
 
 
@@ -213,8 +213,7 @@ def tip(repo: Path) -> str:
 
 def read(repo: Path, path: str) -> str:
     """Return a file of main, empty when it is not there."""
-    git = pygit2.Repository(str(repo))
-    return trees.read_text(git[tip(repo)].peel(pygit2.Tree), path) or ""
+    return GitRepo(repo).files(path).get(path, "")
 
 
 def operations(repo: Path) -> list[str]:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import fcntl
+import io
 import json
 import os
 import random
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from typing import Any
 import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
+from demandops.cli.main import run
 from demandops_ros.messages import from_data
 from demandops_ros.node import DEEP
 from rclpy.action import ActionClient
@@ -79,17 +80,9 @@ class Served:
     environment: dict[str, str]
 
     def demandops(self, *args: str) -> str:
-        command = [
-            sys.executable,
-            "-m",
-            "demandops.cli.main",
-            *args,
-            "--state-repo",
-            self.state_repo,
-        ]
-        return subprocess.run(
-            command, env=self.environment, check=True, capture_output=True, text=True
-        ).stdout
+        with redirect_stdout(io.StringIO()) as printed:
+            assert run([*args, "--state-repo", self.state_repo]) == 0
+        return printed.getvalue()
 
     def bookkeeping(self) -> dict[str, Any]:
         data: dict[str, Any] = json.loads(self.demandops("bookkeeping", "--output", "json"))

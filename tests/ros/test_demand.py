@@ -22,7 +22,7 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
-from tests.kit.repo import GitRepo
+from tests.kit.repo import GitRepo, git
 from tests.kit.repo import init as new_state_repo
 from tests.kit.repo import read as text
 from tests.kit.ros import Serve
@@ -58,9 +58,9 @@ def client(ros_domain: int) -> Iterator[DemandClient]:
 
 
 def operations(state_repo: Path) -> list[str]:
-    command = ["git", "-C", str(state_repo), "log", "--format=%(trailers:key=Operation,valueonly)"]
-    out = subprocess.run([*command, "main"], check=True, capture_output=True, text=True).stdout
-    return out.split()[::-1]
+    return git(state_repo, "log", "--format=%(trailers:key=Operation,valueonly)", "main").split()[
+        ::-1
+    ]
 
 
 def wait(condition: Any, what: str, seconds: float = 60.0) -> None:

@@ -103,7 +103,7 @@ def test_a_push_that_the_webhook_hears_of_is_followed_at_once(
     client.wait(
         lambda: (
             subprocess.run(command, capture_output=True, text=True, check=True).stdout
-            == "Petra Platform DemandOps generator\n"
+            == "A person DemandOps generator\n"
         )
     )
     assert served.stop() == 0

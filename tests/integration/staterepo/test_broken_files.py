@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from tests.kit import rig
+from tests.kit.repo import read as text
 from tests.kit.rig import Person, goal, leave
 
 NODES, IMAGES = "inventory/nodes.yaml", "registry/images.yaml"
@@ -26,10 +27,6 @@ select: [{services: [object-detection], nodes: [edge]}]
 replicas: 2
 """
 BROKEN = TWO.replace("replicas: 2", "replicas: many").replace("object-detection", "object-fusion")
-
-
-def text(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}", check=False)
 
 
 def replicas(bare: Path) -> Any:

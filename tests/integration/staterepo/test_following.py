@@ -24,6 +24,7 @@ from demandops.staterepo.write.journal import Journal
 
 from tests.kit import rig
 from tests.kit.git_over_http import Server, serving
+from tests.kit.repo import read as file_of
 from tests.kit.rig import Person, Stages, goal, leave
 
 NODES, CLUSTERS = "inventory/nodes.yaml", "inventory/clusters.yaml"
@@ -49,10 +50,6 @@ def place(request: pytest.FixtureRequest, bare: Path) -> str:
     if request.param == "embedded":
         return str(bare)
     return bare.as_uri() if request.param == "file-url" else request.getfixturevalue("http")
-
-
-def file_of(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}") + "\n"
 
 
 def without_vehicle01(bare: Path) -> dict[str, str | None]:

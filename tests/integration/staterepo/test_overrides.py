@@ -18,6 +18,7 @@ from demandops.service import Generator
 
 from tests.kit import rig
 from tests.kit.config import override
+from tests.kit.repo import read as file
 from tests.kit.rig import Person
 
 EDGE = "clusters/c-its/perception/edge"
@@ -30,10 +31,6 @@ def anywhere(address: str) -> Iterator[Generator]:
     """A generator on the state repo in place, and one on a remote."""
     with rig.running(address) as running:
         yield running
-
-
-def file(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}", check=False)
 
 
 def parsed(bare: Path, path: str) -> Any:

@@ -17,6 +17,7 @@ import yaml
 from demandops.service import Generator
 
 from tests.kit import rig
+from tests.kit.repo import read as text
 from tests.kit.rig import Person
 
 FURTHER = int(os.environ.get("DEMANDOPS_LOAD_FURTHER", "60"))
@@ -37,10 +38,6 @@ replicas: 2
 BROKEN = OVERRIDE.replace("replicas: 2", "replicas: many").replace("detection]", "fusion]")
 FOLLOWED = "Carry out changes made in the state repo"
 REPORT = ".demandops/reports/problems.yaml"
-
-
-def text(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}", check=False)
 
 
 def values(bare: Path, path: str) -> Any:

@@ -12,6 +12,7 @@ from demandops.staterepo import reader
 from demandops.staterepo.audit.verification import Verdict
 
 from tests.kit import rig
+from tests.kit.repo import read as file
 from tests.kit.rig import Person
 
 FORGED = "Forged\n\nOperation: {}\nDemand-Id: none\n{}Render-Version: 1"
@@ -25,10 +26,6 @@ def override(**fields: object) -> str:
 
 def merge(person: Person, **overrides: str | None) -> None:
     person.change({f"overrides/{name}.yaml": text for name, text in overrides.items()})
-
-
-def file(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}") + "\n"
 
 
 def verdicts(bare: Path) -> dict[str, Verdict]:
