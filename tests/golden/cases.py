@@ -13,7 +13,7 @@ from pathlib import Path
 from demandops import strict_yaml
 from demandops.decision import State, rendered
 
-from tests.kit.books import MemoryRepo
+from tests.kit.memory import MemoryRepo
 
 HERE = Path(__file__).parent
 EXPERIMENT = HERE.parent.parent / "examples" / "experiment"

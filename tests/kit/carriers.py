@@ -11,8 +11,8 @@ from demandops.config.load import load
 from demandops.decision import State
 from demandops.ledger.apply import Ledger
 
-from tests.kit.books import MemoryRepo
 from tests.kit.config import configuration, skeleton
+from tests.kit.memory import MemoryRepo
 
 REACHABLE = {"zenoh": {"endpoint": "tcp/edge:7447"}}
 SPEAKS: dict[str, Any] = {"zenoh": {}}

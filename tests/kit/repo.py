@@ -18,7 +18,7 @@ from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.staterepo import new_repo, reader
 from demandops.staterepo.load import snapshot as snapshots
 
-from tests.kit.books import NOW
+from tests.kit.memory import NOW
 
 NO_GIT_CONFIG = {
     "GIT_CONFIG_GLOBAL": os.devnull,

@@ -1,7 +1,6 @@
 """What tests of generators on real state repos use, under one name."""
 # ruff: noqa: F401
 
-from tests.kit.books import NOW, books_after
 from tests.kit.generator import (
     PATIENCE_S,
     Gate,
@@ -15,6 +14,7 @@ from tests.kit.generator import (
 )
 from tests.kit.goals import Goal, impossible, leave
 from tests.kit.goals import numbered as goal
+from tests.kit.memory import NOW, books_after
 from tests.kit.processes import Drivers, Run, Told, demand, listen_to_all
 from tests.kit.repo import (
     GIT_ENVIRONMENT,

@@ -58,9 +58,8 @@ def client(ros_domain: int) -> Iterator[DemandClient]:
 
 
 def operations(state_repo: Path) -> list[str]:
-    return git(state_repo, "log", "--format=%(trailers:key=Operation,valueonly)", "main").split()[
-        ::-1
-    ]
+    form = "--format=%(trailers:key=Operation,valueonly)"
+    return git(state_repo, "log", "--reverse", form, "main").split()
 
 
 def wait(condition: Any, what: str, seconds: float = 60.0) -> None:

@@ -25,10 +25,10 @@ from demandops.service.timing.lease_expiry import LeaseClock
 from demandops.service.timing.rate_limit import RateLimit
 from pydantic import Field, model_validator
 
-from tests.kit.books import NOW as START
-from tests.kit.books import MemoryRepo
 from tests.kit.config import configuration as skeleton_config
 from tests.kit.config import skeleton
+from tests.kit.memory import NOW as START
+from tests.kit.memory import MemoryRepo
 
 HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from tests.integration.mqtt.conftest import PASSWORD, USER, Broker, Client, Pod
-from tests.kit.books import MemoryRepo
 from tests.kit.carriers import routes
+from tests.kit.memory import MemoryRepo
 
 DEMAND: dict[str, Any] = {
     "connections": [

@@ -13,17 +13,15 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
-import pygit2
 import pytest
 from demandops import settings
 from demandops.demand.claim import Claim
 from demandops.errors import Refused
 from demandops.service import Generator, worker
-from demandops.staterepo.git import tree as trees
 from demandops.staterepo.write import journal
 
 from tests.kit import rig
-from tests.kit.rig import Person
+from tests.kit.repo import GitRepo, Person
 
 DOMAINS = "policy/access-domains.yaml"
 POLICY = """\
@@ -40,11 +38,7 @@ def _now() -> datetime:
 
 def _with_policy(repo: Path, more: str = "") -> Path:
     """Commit a policy as a person would."""
-    git = pygit2.Repository(str(repo))
-    tip = git[git.references["refs/heads/main"].target]
-    who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
-    tree = trees.write(git, tip.peel(pygit2.Tree), {DOMAINS: POLICY % more})
-    git.create_commit("refs/heads/main", who, who, "Short leases\n", tree, [tip.id])
+    GitRepo(repo).commit({DOMAINS: POLICY % more}, "Short leases\n")
     return repo
 
 

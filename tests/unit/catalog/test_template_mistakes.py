@@ -10,9 +10,9 @@ from demandops.decision import State, rehearse
 from demandops.errors import InvalidInput
 from demandops.ledger.apply import Ledger
 
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.config import configuration, skeleton
 from tests.kit.goals import perception
+from tests.kit.memory import MemoryRepo as Books
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"

@@ -10,7 +10,6 @@ from demandops.demand.demand_request import ConnectionType
 from demandops.errors import Refused
 from demandops.ledger.apply import Ledger
 
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.carriers import (
     REACHABLE,
     SPEAKS,
@@ -21,6 +20,7 @@ from tests.kit.carriers import (
     state,
 )
 from tests.kit.goals import connection, goal
+from tests.kit.memory import MemoryRepo as Books
 
 
 def carried(before: State, asked: dict[str, Any]) -> ConnectionType:

@@ -14,10 +14,10 @@ from demandops.staterepo.history import commit_message
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
-from tests.kit.books import NOW
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.config import FAST
 from tests.kit.goals import APP, CLOUD, application, connection, goal
+from tests.kit.memory import NOW
+from tests.kit.memory import MemoryRepo as Books
 
 FEW = settings(
     max_examples=100,

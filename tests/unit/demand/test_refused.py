@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.config import brokers
 from tests.kit.goals import (
     APP,
@@ -20,6 +19,7 @@ from tests.kit.goals import (
     goal,
     perception,
 )
+from tests.kit.memory import MemoryRepo as Books
 
 NODES = "cloud, edge, station00, vehicle00, vehicle01, vehicle02, vehicle03"
 TYPES = "known: 0 (ROS), 1 (MQTT), 2 (ZENOH)"

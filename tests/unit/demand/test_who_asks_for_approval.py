@@ -8,9 +8,9 @@ import pytest
 import yaml
 from demandops.demand.lease import UNSTARTED
 
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.config import edited, skeleton
 from tests.kit.goals import APP, application, connection, goal, perception
+from tests.kit.memory import MemoryRepo as Books
 
 POLICY = "policy/access-domains.yaml"
 DOMAIN = "access domain 'perception'"
@@ -123,7 +123,7 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     from demandops.demand.approval_rule import proposed
     from demandops.ledger import claim_file as ledger_format
 
-    from tests.kit.books import NOW
+    from tests.kit.memory import NOW
 
     books = Books(policy(approval="required"))
     decision = decide(books.state, put(lease=60), NOW, books.files.get)

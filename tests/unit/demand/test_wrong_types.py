@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.goals import BODY, application, connection, goal, perception
+from tests.kit.memory import MemoryRepo as Books
 
 WRONG: dict[str, tuple[object, list[str]]] = {
     "no mapping": ([], [": a request is a mapping with id, apps, connections and shutdown"]),

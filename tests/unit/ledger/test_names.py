@@ -15,8 +15,8 @@ from demandops.plan import naming
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.books import MemoryRepo as Repo
 from tests.kit.chance import examples, told
+from tests.kit.memory import MemoryRepo as Repo
 from tests.model.goals import goal
 
 DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")

@@ -18,9 +18,9 @@ from demandops.ledger.apply import Ledger
 from hypothesis import assume, given, note
 from hypothesis import strategies as st
 
-from tests.kit.books import NOW, outcome
-from tests.kit.books import MemoryRepo as Repo
 from tests.kit.chance import TIMES, chances, examples, told
+from tests.kit.memory import NOW, outcome
+from tests.kit.memory import MemoryRepo as Repo
 from tests.model.books import Books, Demand, Goal
 from tests.model.goals import (
     SKELETON,

@@ -18,8 +18,8 @@ from demandops.errors import Refused
 from demandops.ledger.apply import Ledger
 from demandops.ledger.restoration import Restoration
 
-from tests.kit.books import NOW
-from tests.kit.books import MemoryRepo as Repo
+from tests.kit.memory import NOW
+from tests.kit.memory import MemoryRepo as Repo
 from tests.model.goals import Maker
 
 LATER = NOW + timedelta(hours=3)

@@ -15,8 +15,8 @@ from demandops.plan.release_keys import ReleaseKey, all_keys
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.books import MemoryRepo as Repo
 from tests.kit.chance import TIMES, chances, examples, told
+from tests.kit.memory import MemoryRepo as Repo
 from tests.model.goals import Maker
 
 

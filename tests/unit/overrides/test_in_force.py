@@ -20,9 +20,9 @@ from demandops.plan.views.bookkeeping import bookkeeping
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.kit.books import NOW
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal
+from tests.kit.memory import NOW
+from tests.kit.memory import MemoryRepo as Books
 
 HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
 

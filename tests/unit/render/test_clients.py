@@ -22,9 +22,9 @@ from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connections import client_schema
 from demandops.render.connections.ros import dds_type
 
-from tests.kit.books import MemoryRepo
 from tests.kit.carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.config import skeleton
+from tests.kit.memory import MemoryRepo
 
 
 class World(MemoryRepo):

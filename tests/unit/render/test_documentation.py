@@ -10,8 +10,8 @@ import yaml
 from demandops.demand import transport_choice
 from demandops.demand.route import RouteOptions
 
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.config import skeleton
+from tests.kit.memory import MemoryRepo as Books
 
 PAGE = (Path(__file__).parents[3] / "docs" / "connections.md").read_text()
 

@@ -14,9 +14,9 @@ import pytest
 import yaml
 from demandops import strict_yaml
 
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.config import skeleton
 from tests.kit.goals import application, connection, goal
+from tests.kit.memory import MemoryRepo as Books
 
 NODES = "inventory/nodes.yaml"
 

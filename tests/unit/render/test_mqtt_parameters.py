@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.kit.books import MemoryRepo as Books
 from tests.kit.config import brokers
 from tests.kit.goals import connection, goal
+from tests.kit.memory import MemoryRepo as Books
 
 TOPIC_KEYS = {
     "ros2mqtt": {"mqtt_topic", "primitive", "json", "ros_type", "inject_timestamp", "advanced"},

@@ -11,7 +11,7 @@ import pytest
 from demandops.decision import Decision
 
 from tests.kit import goals
-from tests.kit.books import MemoryRepo
+from tests.kit.memory import MemoryRepo
 
 NOW = datetime(2026, 3, 1, 12, 0, 7, tzinfo=timezone.utc)
 
