@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
@@ -43,19 +42,10 @@ def _with_policy(repo: Path, more: str = "") -> Path:
 
 
 @pytest.fixture(scope="session")
-def _leased_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bare state repo whose leases have no slack."""
     folder = tmp_path_factory.mktemp("leased") / "state.git"
     return _with_policy(Path(shutil.copytree(bare_template, folder)))
-
-
-@pytest.fixture
-def new_repo(_leasedbare_template: Path, tmp_path: Path) -> Callable[[str], Path]:
-    """Make further bare state repos, whose leases have no slack."""
-
-    def make(name: str) -> Path:
-        return Path(shutil.copytree(_leased_template, tmp_path / name))
-
-    return make
 
 
 def put(demand: str, lease: str | int | None = 1, who: str = "vehicle00", **more: Any) -> rig.Goal:
