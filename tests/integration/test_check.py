@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from demandops.cli.main import run
 
+from tests.kit.cli import Run
 from tests.kit.repo import git
 
 CHART = "appdefs/object-detection-fusion/charts/object-fusion"
@@ -34,13 +35,10 @@ Check = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def check(checkout: Path, capsys: pytest.CaptureFixture[str]) -> Check:
+def check(checkout: Path, demandops: Run) -> Check:
     def checked(*args: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = run(["check", str(checkout), *args])
-        printed = capsys.readouterr()
-        out = printed.out.replace(f"{checkout}", "REPO").replace(head(checkout)[:10], "BASE")
-        return code, out, printed.err
+        code, out, err = demandops("check", checkout, *args)
+        return code, out.replace(f"{checkout}", "REPO").replace(head(checkout)[:10], "BASE"), err
 
     return checked
 
