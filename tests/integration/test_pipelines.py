@@ -25,7 +25,6 @@ from tests.kit.http import Answer, Call, serving
 from tests.kit.repo import git
 
 GITHUB, GITLAB = new_repo.PIPELINES
-ROOT = str(Path(__file__).parents[2])
 BASH = shutil.which("bash") or "bash"
 
 
@@ -106,7 +105,7 @@ def test_github_checks_and_reports(
     done = subprocess.run(
         [BASH, "-e", "-c", step["run"]],
         cwd=repo,
-        env=environment(tmp_path, BASE="origin/main", PYTHONPATH=ROOT, **more),
+        env=environment(tmp_path, BASE="origin/main", **more),
         check=False,
     )
     assert done.returncode == (0 if sound else 1)
@@ -131,7 +130,7 @@ def test_gitlab_checks_and_reports(
     done = subprocess.run(
         [BASH, "-e", "-c", script.replace("/tmp/demandops/bin/demandops", str(program))],
         cwd=repo,
-        env=environment(tmp_path, CI_MERGE_REQUEST_TARGET_BRANCH_NAME="main", PYTHONPATH=ROOT),
+        env=environment(tmp_path, CI_MERGE_REQUEST_TARGET_BRANCH_NAME="main"),
         capture_output=True,
         text=True,
         check=False,
