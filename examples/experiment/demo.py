@@ -16,11 +16,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import paper
 from rich.console import Console
 from rich.table import Table
-
-sys.path.insert(0, str(Path(__file__).parent))
-import paper
 
 HERE = Path(__file__).resolve().parent
 BUILD = HERE.parent.parent / "build" / "demo"

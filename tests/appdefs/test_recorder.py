@@ -6,28 +6,13 @@ has no parameters, so what merges them is tested below the wire, by ledger and p
 
 from __future__ import annotations
 
-import json
 from datetime import timedelta
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import pygit2
 import pytest
 import yaml
-from asking import (
-    BODY,
-    CLOUD,
-    FAST,
-    NOW,
-    STATION_CLOUD,
-    Books,
-    application,
-    connection,
-    goal,
-    skeleton,
-)
-from demandops.cli.main import run
 from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from demandops.errors import Refused
 from demandops.ledger.apply import apply
@@ -35,8 +20,13 @@ from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import all_keys
-from demandops.staterepo import new_repo
-from demandops.staterepo.git import tree as trees
+
+from tests.kit.cli import Run
+from tests.kit.config import FAST, skeleton
+from tests.kit.goals import BODY, CLOUD, STATION_CLOUD, application, connection, goal
+from tests.kit.memory import NOW
+from tests.kit.memory import MemoryRepo as Books
+from tests.kit.repo import GitRepo
 
 HERE = Path(__file__).parent
 RECORDER, MONITOR = 2, 3
@@ -79,15 +69,8 @@ def monitor(id: str = "cloud/monitor", **more: Any) -> dict[str, Any]:
     return application(id, type=MONITOR, **{"node": "cloud", **more})
 
 
-def test_it_is_demanded_with_yaml_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    state = tmp_path / "state.git"
-    new_repo.init(state, NOW, bare=True, gitops="flux")
-    repo = pygit2.Repository(str(state))
-    tip = repo[repo.references["refs/heads/main"].target]
-    who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
-    tree = trees.write(repo, tip.peel(pygit2.Tree), additions())
-    repo.create_commit("refs/heads/main", who, who, "Add the recorder\n", tree, [tip.id])
-
+def test_it_is_demanded_with_yaml_alone(demandops: Run, state: GitRepo, tmp_path: Path) -> None:
+    state.commit(dict(additions()), "Add the recorder\n")
     file = tmp_path / "record.yaml"
     file.write_text(
         """
@@ -102,11 +85,10 @@ def test_it_is_demanded_with_yaml_alone(tmp_path: Path, capsys: pytest.CaptureFi
               source_node_id: vehicle00
         """
     )
-    assert run(["request", str(file), "--state-repo", str(state), "--output", "json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
+    (row,) = demandops("request", file, "--state-repo", state.path, "--output", "json").json()
     assert (row["outcome"], row["warnings"]) == ("booked", [UNCARRIED])
-    assert run(["bookkeeping", "--state-repo", str(state), "--output", "json"]) == 0
-    found = json.loads(capsys.readouterr().out)["services"]
+    ran = demandops("bookkeeping", "--state-repo", state.path, "--output", "json")
+    found = ran.json()["services"]
     assert found == {
         "drv-vehicle00-vehicle00": {
             "applications": ["edge/record"],
@@ -127,7 +109,7 @@ def test_it_is_demanded_with_yaml_alone(tmp_path: Path, capsys: pytest.CaptureFi
             "requesters": ["vehicle00"],
         },
     }
-    assert run(["verify", "--state-repo", str(state)]) == 0
+    assert demandops("verify", "--state-repo", state.path).code == 0
 
 
 def test_no_python_of_the_generator_knows_it() -> None:

@@ -14,16 +14,16 @@ from typing import Any
 
 import pygit2
 from demandops import strict_yaml
-from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.decision import State, admit, rendered_files
 from demandops.ledger import claim_file
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
-from demandops.settings import GENERATED_ROOTS
-from demandops.staterepo import new_repo
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
+
+from tests.kit import goals
+from tests.kit.config import configuration
 
 VEHICLES_PER_EDGE = 10
 RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
@@ -45,31 +45,15 @@ def edge_id(number: int) -> str:
 
 def goal(edge: str, vehicle: str, *, shutdown: bool = False) -> dict[str, Any]:
     """One vehicle's demand for perception on one edge."""
-    topics = [f"/{vehicle}/ego_data", f"/{vehicle}/points"]
-    application = {
-        "header": {"id": f"{edge}/fusion", "node_id": edge},
-        "type": 1,
-        "object_detection_fusion_app": {
-            "requester_ids": [vehicle],
-            "ego_data_topics": [{"topic_name": topics[0], "source_node_id": vehicle}],
-            "pointcloud_topics": [{"topic_name": topics[1], "source_node_id": vehicle}],
-        },
-    }
-    connection = {
-        "id": f"{vehicle}/{edge}",
-        "requester_ids": [vehicle],
-        "type": 1,
-        "source_node_id": vehicle,
-        "target_node_id": edge,
-        "source_topics": topics,
-        "target_topics": topics,
-    }
-    return {
-        "id": "bench",
-        "shutdown": shutdown,
-        "apps": [application],
-        "connections": [connection],
-    }
+    ego, points = f"/{vehicle}/ego_data", f"/{vehicle}/points"
+    app = goals.application(
+        f"{edge}/fusion", node=edge, who=[vehicle], ego=[(ego, vehicle)], clouds=[(points, vehicle)]
+    )
+    ends = vehicle, edge
+    link = goals.connection(
+        f"{vehicle}/{edge}", who=[vehicle], ends=ends, topics=[ego, points], broker=""
+    )
+    return goals.goal([app], [link], id="bench", shutdown=shutdown)
 
 
 def _region(number: int, edges_per_cluster: int) -> str:
@@ -92,11 +76,7 @@ def _nodes(edges: int, edges_per_cluster: int) -> str:
 def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
     """Make a bare state repo with about ``releases`` releases running, by regions."""
     edges = max(1, round(releases / RELEASES_PER_EDGE))
-    files = {
-        path: text
-        for path, text in new_repo.files().items()
-        if path.split("/")[0] not in GENERATED_ROOTS  # they are of the skeleton's one cluster
-    }
+    files = configuration()
     files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster)
     regions = sorted({_region(number, edges_per_cluster) for number in range(edges)})
     files["inventory/clusters.yaml"] = strict_yaml.dump(
@@ -113,7 +93,7 @@ def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
             "brokers": [{"node": "cloud", "host": "broker", "port": 1883}],
         }
     )
-    config = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
+    config = load(files)
     state, now = State.of(config, Ledger()), datetime.now(timezone.utc)
     ledger = Ledger()
     for number in range(edges):

@@ -10,7 +10,7 @@ from tests.e2e.common.ros import Client
 from tests.e2e.rig.capture import uncaptured
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
-from tests.ros_domain import reserved
+from tests.kit.ros import reserved
 
 pytest.register_assert_rewrite("tests.e2e.common.answers")
 

@@ -8,19 +8,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from datetime import datetime, timezone
 from pathlib import Path
 
 from demandops import strict_yaml
-from demandops.config.config import CONFIG_ROOTS
-from demandops.config.load import load
-from demandops.decision import State, decide, rendered_files
-from demandops.ledger.ledger import Ledger
-from demandops.staterepo import new_repo
+from demandops.decision import State, rendered_files
+
+from tests.kit.memory import MemoryRepo
 
 HERE = Path(__file__).parent
 EXPERIMENT = HERE.parent.parent / "examples" / "experiment"
-NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
 
 CASES = (
     "experiment",
@@ -43,24 +39,15 @@ def requests_of(case: str) -> list[Path]:
 
 def start(case: str) -> tuple[State, dict[str, str]]:
     """Return the state before the first request, and the generated files."""
-    files = new_repo.files()
     overlay = HERE / case / "state-repo"
-    for path in sorted(overlay.rglob("*.yaml")):
-        files[path.relative_to(overlay).as_posix()] = path.read_text()
-    config = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
-    state = State.of(config, Ledger())
+    files = {p.relative_to(overlay).as_posix(): p.read_text() for p in overlay.rglob("*.yaml")}
+    state = MemoryRepo(files).state
     return state, rendered_files(state)
 
 
 def play(case: str) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield (request name, all generated files) after each request."""
-    state, world = start(case)
+    repo = MemoryRepo(state=start(case)[0])
     for file in requests_of(case):
-        decision = decide(state, strict_yaml.load(file.read_text()), NOW, world.get)
-        state = decision.state
-        for path, text in decision.files.items():
-            if text is None:
-                del world[path]
-            else:
-                world[path] = text
-        yield file.stem, dict(world)
+        repo.send(strict_yaml.load(file.read_text()))
+        yield file.stem, dict(repo.files)

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 from demandops.decision import rendered_files
 
-from tests.golden.cases import CASES, EXPERIMENT, HERE, play, requests_of, start
-
-sys.path.insert(0, str(EXPERIMENT))
+from tests.golden.cases import CASES, HERE, play, requests_of, start
 
 
 def _expected(case: str, name: str) -> dict[str, str]:

@@ -3,39 +3,30 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from asking import APP, application, connection, goal, perception
 from demandops.cli.main import run as run_command
 from demandops.ledger.claim_file import read
 
+from tests.kit.goals import APP, EXPERIMENT, application, connection, goal, perception
+from tests.kit.repo import git
+
 Run = Callable[..., Any]
 
-EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("*.yaml"))
 DETECTION = "od-edge-vehicle00"
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 PATH = f"clusters/c-its/perception/edge/{DETECTION}.yaml"
 
 
-def git(repo: Any, *args: str) -> str:
-    command = ["git", "-C", str(repo.path), *args]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.rstrip("\n")
-
-
 @pytest.fixture(scope="session")
-def _played(laid_down: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def _played(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The experiment's first six steps: all four join, vehicle00 and vehicle01 leave."""
-    folder = tmp_path_factory.mktemp("played")
-    shutil.copytree(laid_down, folder / "state.git")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DEMANDOPS_DATA_HOME", str(folder / "home"))
-        files = [str(file) for file in EXPERIMENT[:6]]
-        assert run_command(["request", *files, "--state-repo", str(folder / "state.git")]) == 0
-    return folder / "state.git"
+    folder = Path(shutil.copytree(bare_template, tmp_path_factory.mktemp("played") / "state.git"))
+    assert run_command(["request", *map(str, EXPERIMENT[:6]), "--state-repo", str(folder)]) == 0
+    return folder
 
 
 @pytest.fixture

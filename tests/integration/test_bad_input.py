@@ -15,19 +15,20 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import (
+
+from tests.kit.config import FAST, brokers
+from tests.kit.goals import (
     BODY,
     CLOUD,
     EGO,
-    FAST,
     ROS_NAMES,
     STATION_CLOUD,
     application,
-    brokers,
     connection,
     goal,
     perception,
 )
+from tests.kit.repo import git
 
 EXPERIMENT = Path(__file__).parents[2] / "examples" / "experiment"
 
@@ -508,11 +509,7 @@ class TestRefusals:
         assert (books["services"], books["connections"]) == ({}, {})
         left = [path for path in state.files("ledger/") if path.endswith(".yaml")]
         assert left == []
-        fsck = subprocess.run(
-            ["git", "-C", str(state.path), "fsck", "--strict", "--full"],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert fsck.returncode == 0, fsck.stdout + fsck.stderr
+        git(state, "fsck", "--strict", "--full")
 
 
 ATTACKS: dict[str, tuple[str | bytes, str]] = {

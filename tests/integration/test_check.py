@@ -4,28 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from demandops.cli.main import run
 
+from tests.kit.cli import Run
+from tests.kit.repo import git
+
 CHART = "appdefs/object-detection-fusion/charts/object-fusion"
-
-
-@pytest.fixture(scope="module")
-def laid_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("check") / "state-repo"
-    assert run(["init", str(folder)]) == 0
-    return folder
-
-
-@pytest.fixture
-def checkout(laid_down: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path / "data"))
-    shutil.copytree(laid_down, tmp_path / "state-repo")
-    return tmp_path / "state-repo"
 
 
 NEW_CHART = """\
@@ -47,21 +35,12 @@ Check = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def check(checkout: Path, capsys: pytest.CaptureFixture[str]) -> Check:
+def check(checkout: Path, demandops: Run) -> Check:
     def checked(*args: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = run(["check", str(checkout), *args])
-        printed = capsys.readouterr()
-        out = printed.out.replace(f"{checkout}", "REPO").replace(head(checkout)[:10], "BASE")
-        return code, out, printed.err
+        code, out, err = demandops("check", checkout, *args)
+        return code, out.replace(f"{checkout}", "REPO").replace(head(checkout)[:10], "BASE"), err
 
     return checked
-
-
-def git(folder: Path, *args: str) -> str:
-    who = ["-c", "user.name=someone", "-c", "user.email=someone@example.invalid"]
-    command = ["git", "-C", str(folder), *who, *args]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
 def head(folder: Path) -> str:
@@ -204,7 +183,7 @@ def test_an_application_definition_that_is_in_use_cannot_be_deleted(
         )
     )
     bare = checkout.parent / "state.git"
-    subprocess.run(["git", "clone", "-q", "--bare", checkout, bare], check=True)
+    git(checkout.parent, "clone", "-q", "--bare", str(checkout), str(bare))
     assert run(["request", str(goal), "--state-repo", str(bare)]) == 0
     git(checkout, "pull", "-q", str(bare), "main")
     (checkout / "appdefs" / "object-detection-fusion" / "appdef.yaml").unlink()

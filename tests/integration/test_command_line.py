@@ -16,11 +16,13 @@ from typing import Any
 import pygit2
 import pytest
 import yaml
-from asking import APP, CLOUD, FAST, Goal, application, connection, goal, perception
 from demandops import __version__
 from demandops.cli.views import bookkeeping
 
-EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("*.yaml"))
+from tests.kit.config import FAST
+from tests.kit.goals import APP, CLOUD, EXPERIMENT, Goal, application, connection, goal, perception
+from tests.kit.repo import git
+
 SHA = re.compile(r"[0-9a-f]{40}")
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 SOURCE_END = "mqtt-vehicle01-edge-source-092a70a6cc97"
@@ -69,9 +71,7 @@ class TestInit:
         assert SHA.fullmatch(found.pop("commit"))
         assert found == {"directory": str(folder), "gitops": "flux", "bare": False}
         assert (folder / "inventory" / "nodes.yaml").is_file()
-        assert not subprocess.run(
-            ["git", "-C", folder, "status", "--porcelain"], capture_output=True, check=True
-        ).stdout
+        assert not git(folder, "status", "--porcelain")
         assert demandops("check", folder).code == 0
 
     def test_a_state_repo_for_argo_cd(self, demandops: Run, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from demandops.cli.main import cli
-from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.decision import State, decide, refusal_text, rendered_files
 from demandops.errors import Refused
@@ -21,6 +20,8 @@ from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.render.output_check import check_files
 from demandops.staterepo import new_repo
+
+from tests.kit.config import configuration
 
 DOCS = Path(__file__).parents[2] / "docs"
 NOW = datetime(2026, 5, 4, 12, 0, tzinfo=timezone.utc)
@@ -40,9 +41,7 @@ def block(name: str, start: str) -> str:
 
 
 def state(**files: str) -> State:
-    found = new_repo.files() | files
-    config = {path: text for path, text in found.items() if path.split("/")[0] in CONFIG_ROOTS}
-    return State.of(load(config), Ledger())
+    return State.of(load(configuration(files)), Ledger())
 
 
 def demand() -> dict[str, Any]:

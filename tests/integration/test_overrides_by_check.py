@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from asking import perception
+
+from tests.kit.goals import perception
+from tests.kit.repo import git
 
 Run = Callable[..., Any]
 EDGE = "clusters/c-its/perception/edge"
@@ -24,12 +25,6 @@ owner: Petra
 select: [{services: [object-fusion]}]
 hold: true
 """
-
-
-def git(folder: Path, *args: str) -> str:
-    who = ["-c", "user.name=Petra", "-c", "user.email=petra@example.org"]
-    command = ["git", "-C", str(folder), *who, *args]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
 @pytest.fixture

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pygit2
 import pytest
 import yaml
-from asking import perception
 
-if TYPE_CHECKING:  # several folders have a conftest
-    from conftest import Ran, Run, StateRepo
+from tests.kit.cli import Ran, Run
+from tests.kit.goals import perception
+from tests.kit.repo import GitRepo as StateRepo
 
 HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
 

@@ -10,44 +10,37 @@ import stat
 import subprocess
 import sys
 import textwrap
-import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from demandops.cli.main import run
 from demandops.cli.repo.pull_request_comment import MARK
 from demandops.staterepo import new_repo
 
+from tests.kit.config import skeleton
+from tests.kit.http import Answer, Call, serving
+from tests.kit.repo import git
+
 GITHUB, GITLAB = new_repo.PIPELINES
-ROOT = str(Path(__file__).parents[2])
 BASH = shutil.which("bash") or "bash"
 
 
-@pytest.fixture(scope="module")
-def laid_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("pipelines") / "fleet"
-    assert run(["init", str(folder)]) == 0
-    return folder
-
-
 @pytest.fixture
-def repo(laid_down: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(laid_down, tmp_path / "fleet"))
+def repo(checkout: Path) -> Path:
+    return checkout
 
 
 @pytest.fixture(scope="module")
-def github(laid_down: Path) -> dict[str, Any]:
-    data: dict[str, Any] = yaml.safe_load((laid_down / GITHUB).read_text())
+def github() -> dict[str, Any]:
+    data: dict[str, Any] = yaml.safe_load(skeleton()[GITHUB])
     return data
 
 
 @pytest.fixture(scope="module")
-def gitlab(laid_down: Path) -> dict[str, Any]:
-    data: dict[str, Any] = yaml.safe_load((laid_down / GITLAB).read_text())
+def gitlab() -> dict[str, Any]:
+    data: dict[str, Any] = yaml.safe_load(skeleton()[GITLAB])
     return data
 
 
@@ -59,8 +52,8 @@ def gitlab(laid_down: Path) -> dict[str, Any]:
     ],
     ids=["github", "gitlab"],
 )
-def test_a_pipeline_is_valid_by_its_schema(laid_down: Path, path: str, options: list[str]) -> None:
-    command = [sys.executable, "-m", "check_jsonschema", *options, str(laid_down / path)]
+def test_a_pipeline_is_valid_by_its_schema(checkout: Path, path: str, options: list[str]) -> None:
+    command = [sys.executable, "-m", "check_jsonschema", *options, str(checkout / path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 
@@ -90,12 +83,6 @@ def put_demandops(at: Path) -> None:
     at.parent.mkdir(parents=True)
     at.write_text(f'#!{BASH}\nexec "{sys.executable}" -m demandops.cli.main "$@"\n')
     at.chmod(at.stat().st_mode | stat.S_IXUSR)
-
-
-def git(folder: Path, *args: str) -> None:
-    who = ["-c", "user.name=Petra", "-c", "user.email=petra@example.org"]
-    command = ["git", "-C", str(folder), *who, *args]
-    subprocess.run(command, check=True, capture_output=True)
 
 
 @pytest.fixture(params=["github", "gitlab"])
@@ -165,7 +152,7 @@ def test_github_checks_and_reports(
     done = subprocess.run(
         [BASH, "-e", "-c", step["run"]],
         cwd=repo,
-        env=environment(tmp_path, BASE="origin/main", PYTHONPATH=ROOT, **more),
+        env=environment(tmp_path, BASE="origin/main", **more),
         check=False,
     )
     assert done.returncode == (0 if sound else 1)
@@ -190,7 +177,7 @@ def test_gitlab_checks_and_reports(
     done = subprocess.run(
         [BASH, "-e", "-c", script.replace("/tmp/demandops/bin/demandops", str(program))],
         cwd=repo,
-        env=environment(tmp_path, CI_MERGE_REQUEST_TARGET_BRANCH_NAME="main", PYTHONPATH=ROOT),
+        env=environment(tmp_path, CI_MERGE_REQUEST_TARGET_BRANCH_NAME="main"),
         capture_output=True,
         text=True,
         check=False,
@@ -201,64 +188,41 @@ def test_gitlab_checks_and_reports(
     assert report in done.stdout
 
 
-class Notes(ThreadingHTTPServer):
+class Notes:
     """As much of GitLab as the note needs: who I am, and the notes of one merge request."""
 
     def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), _Handler)
+        self.url = ""
         self.notes: list[dict[str, Any]] = [
             {"id": number, "body": f"{MARK}\nby somebody else", "author": {"id": 1}}
             for number in range(120)
         ]
 
-
-class _Handler(BaseHTTPRequestHandler):
-    server: Notes
-
-    def _answer(self, data: object, **headers: str) -> None:
-        assert self.headers["PRIVATE-TOKEN"] == "token"
-        self.send_response(200)
-        for key, value in headers.items():
-            self.send_header(key.replace("_", "-"), value)
-        self.end_headers()
-        self.wfile.write(json.dumps(data).encode())
-
-    def do_GET(self) -> None:
-        if self.path == "/api/user":
-            self._answer({"id": 7})
-            return
-        assert self.path.startswith("/api/projects/5/merge_requests/3/notes?per_page=100&page=")
-        page = int(self.path.rsplit("=", 1)[1])
-        shown = self.server.notes[100 * (page - 1) : 100 * page]
-        more = len(self.server.notes) > 100 * page
-        self._answer(shown, X_Next_Page=str(page + 1) if more else "")
-
-    def _body(self) -> str:
-        return str(json.loads(self.rfile.read(int(self.headers["Content-Length"])))["body"])
-
-    def do_POST(self) -> None:
-        note = {"id": 500, "body": self._body(), "author": {"id": 7}}
-        self.server.notes.append(note)
-        self._answer(note)
-
-    def do_PUT(self) -> None:
-        (note,) = [one for one in self.server.notes if self.path.endswith(f"/notes/{one['id']}")]
-        note["body"] = self._body()
-        self._answer(note)
-
-    def log_message(self, format: str, *args: Any) -> None:
-        pass
+    def answer(self, call: Call) -> Answer:
+        assert call.headers["PRIVATE-TOKEN"] == "token"
+        if call.method == "POST":
+            self.notes.append({"id": 500, "body": call.json()["body"], "author": {"id": 7}})
+            return Answer.json(self.notes[-1])
+        if call.method == "PUT":
+            (note,) = [one for one in self.notes if call.path.endswith(f"/notes/{one['id']}")]
+            note["body"] = call.json()["body"]
+            return Answer.json(note)
+        if call.path == "/api/user":
+            return Answer.json({"id": 7})
+        assert call.path.startswith("/api/projects/5/merge_requests/3/notes?per_page=100&page=")
+        page = int(call.path.rsplit("=", 1)[1])
+        more = len(self.notes) > 100 * page
+        found = Answer.json(self.notes[100 * (page - 1) : 100 * page])
+        found.headers["X-Next-Page"] = str(page + 1) if more else ""
+        return found
 
 
 @pytest.fixture
 def notes() -> Iterator[Notes]:
-    server = Notes()
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    yield server
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    made = Notes()
+    with serving(made.answer) as server:
+        made.url = server.url
+        yield made
 
 
 def test_gitlabs_note_is_written_once_and_then_changed(
@@ -267,7 +231,7 @@ def test_gitlabs_note_is_written_once_and_then_changed(
     script = textwrap.dedent("\n".join(gitlab["demandops-note"]["script"]))
     script = script.replace("python note.py", f"{sys.executable} note.py")
     more = {
-        "CI_API_V4_URL": f"http://127.0.0.1:{notes.server_address[1]}/api",
+        "CI_API_V4_URL": f"{notes.url}/api",
         "CI_PROJECT_ID": "5",
         "CI_MERGE_REQUEST_IID": "3",
         "DEMANDOPS_NOTE_TOKEN": "token",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -10,9 +9,11 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import perception
 
-from tests.integration.conftest import Ran, Run, StateRepo
+from tests.kit.cli import Ran, Run
+from tests.kit.goals import perception
+from tests.kit.repo import GitRepo as StateRepo
+from tests.kit.repo import git
 
 POLICY = "policy/access-domains.yaml"
 
@@ -36,11 +37,6 @@ def send(demandops: Run) -> Send:
         return demandops("request", "-", "--state-repo", state.path, *more, stdin=text)
 
     return call
-
-
-def git(state: StateRepo, *args: str) -> str:
-    command = ["git", "-C", str(state.path), *args]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def test_a_demand_that_needs_approval_is_proposed_and_listed(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,9 @@ from demandops.cli.main import run
 from demandops.cli.repo import pull_request_comment
 from demandops.staterepo.pull_request import merge_check as checking
 
+from tests.kit.cli import Run
+from tests.kit.repo import git
+
 EXAMPLES = Path(__file__).parents[2] / "examples" / "experiment"
 GOLDEN = Path(__file__).with_name("pull-request.md")
 EDGE = "clusters/c-its/perception/edge"
@@ -23,39 +25,17 @@ DETECTION = f"{EDGE}/od-edge-station00.yaml"
 CLIENT = "clusters/c-its/perception/vehicle00/mqtt-vehicle00-edge-source-d3ca91c2df6c.yaml"
 LOST = "is generated, so a manual edit is lost; revert it"
 
-Check = Callable[..., tuple[int, str, str]]
 
-
-def git(folder: Path, *args: str) -> str:
-    who = ["-c", "user.name=Petra", "-c", "user.email=petra@example.org"]
-    command = ["git", "-C", str(folder), *who, *args]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
-
-@pytest.fixture(scope="module")
-def laid_down(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session")
+def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bare state repo in which vehicle00's demand runs."""
-    folder = tmp_path_factory.mktemp("pull-requests") / "state.git"
-    assert run(["init", str(folder), "--bare"]) == 0
+    folder = Path(shutil.copytree(bare_template, tmp_path_factory.mktemp("booked") / "state.git"))
     book(folder, "1-vehicle00-joins")
     return folder
 
 
 def book(bare: Path, step: str) -> None:
     assert run(["request", str(EXAMPLES / f"{step}.yaml"), "--state-repo", str(bare)]) == 0
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _data(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path_factory.mktemp("data")))
-        patch.delenv("DEMANDOPS_STATE_REPO", raising=False)
-        yield
-
-
-@pytest.fixture
-def bare(laid_down: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(laid_down, tmp_path / "state.git"))
 
 
 @pytest.fixture
@@ -68,18 +48,12 @@ def branch(bare: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def check(branch: Path, capsys: pytest.CaptureFixture[str]) -> Check:
-    def checked(*args: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = run(["check", str(branch), *args])
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return checked
+def check(branch: Path, demandops: Run) -> Run:
+    return lambda *args: demandops("check", branch, *args)
 
 
 @pytest.fixture
-def found(check: Check) -> Callable[..., dict[str, Any]]:
+def found(check: Run) -> Callable[..., dict[str, Any]]:
     return lambda *args: json.loads(check("--output", "json", *args)[1])
 
 
@@ -105,7 +79,7 @@ def claims(folder: Path, needle: str = "") -> list[Path]:
 
 
 def test_edited_values_image_and_replicas_become_an_override_to_paste(
-    branch: Path, check: Check
+    branch: Path, check: Run
 ) -> None:
     edit(branch / FUSION, ("replicas: 1", "replicas: 3"), ("domainId: 0", "domainId: 7"))
     text = (branch / FUSION).read_text()
@@ -120,7 +94,7 @@ def test_edited_values_image_and_replicas_become_an_override_to_paste(
         "apiVersion: demandops/v1\n"
         "kind: Override\n"
         'reason: "Say here why; this replaces a manual edit of a generated file"\n'
-        "owner: Petra\n"
+        'owner: "Petra Platform"\n'
         "select:\n"
         "- applications:\n"
         "  - edge/object_detection_fusion\n"
@@ -180,7 +154,7 @@ def test_other_edits_become_the_effect_that_is_made_for_them(
     assert suggested["also"] == also
 
 
-def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, check: Check) -> None:
+def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, check: Run) -> None:
     edit(branch / DETECTION, ("interval: 10m", "interval: 1m"))
     assert check()[2] == f"error: {DETECTION}: {LOST}, and change the configuration instead\n"
     (branch / DETECTION).write_text("kind: [\n")
@@ -201,7 +175,7 @@ def test_a_suggested_override_is_one_that_can_be_merged(
 
 
 def test_what_is_deleted_added_or_the_generators_own_is_refused_with_what_to_do(
-    branch: Path, check: Check
+    branch: Path, check: Run
 ) -> None:
     (branch / DETECTION).unlink()
     (branch / CLIENT).unlink()
@@ -242,7 +216,7 @@ def test_an_override_that_is_there_is_not_overwritten_by_the_one_suggested(
 # ---- claims and configuration, and what follows ----
 
 
-def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, check: Check) -> None:
+def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, check: Run) -> None:
     (claim,) = claims(branch, "connection: vehicle00/edge")
     claim.unlink()
     commit(branch)
@@ -269,7 +243,7 @@ def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, che
 
 
 def test_an_edited_claim_is_judged_as_a_claim(
-    branch: Path, check: Check, found: Callable[..., dict[str, Any]]
+    branch: Path, check: Run, found: Callable[..., dict[str, Any]]
 ) -> None:
     (claim,) = claims(branch, "kind: ApplicationClaim")
     sound = claim.read_text()
@@ -360,7 +334,7 @@ def test_a_symbolic_link_is_not_followed(
 
 
 def test_the_check_of_another_render_version_says_so(
-    branch: Path, check: Check, monkeypatch: pytest.MonkeyPatch
+    branch: Path, check: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(checking, "RENDER_VERSION", 2)
     assert check()[2] == (
@@ -446,7 +420,7 @@ def test_a_shallow_clone_is_told_how_to_become_whole(
     assert run(["check", str(folder), *base]) == 0
 
 
-def test_a_base_that_is_none_is_told(branch: Path, check: Check) -> None:
+def test_a_base_that_is_none_is_told(branch: Path, check: Run) -> None:
     code, out, errors = check("--base", "nowhere")
     assert (code, out) == (1, "")
     assert errors.startswith("error: 'nowhere' is not a commit")
@@ -461,7 +435,7 @@ def test_a_base_that_is_none_is_told(branch: Path, check: Check) -> None:
 # ---- Markdown ----
 
 
-def test_the_report_is_ready_to_be_posted(branch: Path, check: Check) -> None:
+def test_the_report_is_ready_to_be_posted(branch: Path, check: Run) -> None:
     edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
     (claim,) = claims(branch, "connection: vehicle00/edge")
     claim.unlink()
@@ -473,7 +447,7 @@ def test_the_report_is_ready_to_be_posted(branch: Path, check: Check) -> None:
     assert report == GOLDEN.read_text()
 
 
-def test_a_report_of_nothing_says_so(branch: Path, check: Check) -> None:
+def test_a_report_of_nothing_says_so(branch: Path, check: Run) -> None:
     base = git(branch, "rev-parse", "HEAD")[:10]
     assert check("--output", "markdown") == (
         0,
@@ -485,7 +459,7 @@ def test_a_report_of_nothing_says_so(branch: Path, check: Check) -> None:
     )
 
 
-def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Check) -> None:
+def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Run) -> None:
     evil = "`@everyone` </details> [x](javascript:0) ```` ![i](http://x) <b>|"
     (claim,) = claims(branch, "kind: ApplicationClaim")
     text = yaml.safe_load(claim.read_text())
@@ -518,7 +492,7 @@ def without_code(text: str) -> str:
     return kept + rest
 
 
-def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Check) -> None:
+def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Run) -> None:
     (claim,) = claims(branch, "kind: ApplicationClaim")
     crowd = [f"vehicle-{number:05}" for number in range(4_000)]
     claim.write_text(json.dumps(yaml.safe_load(claim.read_text()) | {"requesters": crowd}))

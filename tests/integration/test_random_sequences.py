@@ -6,13 +6,9 @@ between, both must say the same.
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
-import subprocess
-import sys
-import tarfile
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -20,11 +16,10 @@ from typing import Any
 import pytest
 import yaml
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from demandops.cli import main
-from model.books import Books, Goal, Result, in_model_words, object_lists
-from model.goals import SKELETON, Maker
+from tests.kit.cli import Run
+from tests.kit.repo import GitRepo, git
+from tests.model.books import Books, Goal, Result, in_model_words, object_lists
+from tests.model.goals import SKELETON, Maker
 
 REQUESTS, CALLS = 150, 6
 SEEDS = range(1, 1 + 2 * int(os.environ.get("DEMANDOPS_EXAMPLES", "1")))
@@ -33,57 +28,31 @@ SEEDS = range(1, 1 + 2 * int(os.environ.get("DEMANDOPS_EXAMPLES", "1")))
 class CommandLine:
     """``demandops`` in this process, on one state repo."""
 
-    def __init__(self, state_repo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        self.state_repo = state_repo
-        self._capsys = capsys
+    def __init__(self, repo: GitRepo, run: Run) -> None:
+        self.repo, self._run = repo, run
 
     def __call__(self, *arguments: str) -> tuple[int, Any]:
         """Run a command and return its exit code and the JSON that it prints."""
-        self._capsys.readouterr()
-        code = main.run([*arguments, "--output", "json"])
-        printed = self._capsys.readouterr()
-        assert printed.out, printed.err
-        return code, json.loads(printed.out)
-
-    def git(self, *arguments: str) -> bytes:
-        """Run git on the state repo and return all that it says."""
-        return subprocess.run(
-            ["git", "-C", str(self.state_repo), *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            check=True,
-            timeout=120,
-        ).stdout
+        ran = self._run(*arguments, "--state-repo", self.repo.path, "--output", "json")
+        assert ran.out, ran.err
+        return ran.code, ran.json()
 
     def commits(self) -> list[str]:
         """Return every commit, the oldest first."""
-        return self.git("rev-list", "--reverse", "main").decode().split()
+        return git(self.repo, "rev-list", "--reverse", "main").split()
 
     def view(self, revision: str) -> dict[str, Any]:
         """Return the bookkeeping at a commit, in the model's words."""
         code, data = self("bookkeeping", "--at", revision)
         assert code == 0
-        assert data.pop("commit") == self.git("rev-parse", revision).decode().strip()
-        return in_model_words(data, object_lists(self._manifests(revision)))
-
-    def _manifests(self, revision: str) -> list[str]:
-        archive = io.BytesIO(self.git("archive", revision, "clusters"))
-        with tarfile.open(fileobj=archive) as tar:
-            files = [tar.extractfile(member) for member in tar if member.isfile()]
-            return [file.read().decode() for file in files if file]
+        assert data.pop("commit") == git(self.repo, "rev-parse", revision)
+        return in_model_words(data, object_lists(self.repo.files("clusters/", revision).values()))
 
 
 @pytest.fixture
-def demandops(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> CommandLine:
-    """A new bare state repo and the command line for it."""
-    monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.setenv("DEMANDOPS_STATE_REPO", str(tmp_path / "state.git"))
-    command = CommandLine(tmp_path / "state.git", capsys)
-    code, _ = command("init", str(command.state_repo), "--bare")
-    assert code == 0
-    return command
+def command(demandops: Run, state: GitRepo) -> CommandLine:
+    """The command line for a new bare state repo."""
+    return CommandLine(state, demandops)
 
 
 def written(goals: list[Goal], folder: Path, name: str) -> list[str]:
@@ -112,12 +81,12 @@ def assert_told_as_expected(
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_state_repo_says_what_the_model_says_after_any_sequence_of_requests(
-    seed: int, demandops: CommandLine, tmp_path: Path
+    seed: int, command: CommandLine, tmp_path: Path
 ) -> None:
     books = Books(SKELETON)
     goals = Maker(Random(seed)).sequence(REQUESTS)
     views: dict[str, dict[str, Any]] = {}
-    first = demandops.commits()
+    first = command.commits()
     before = list(first)
     for call in range(CALLS):
         asked = goals[call * REQUESTS // CALLS : (call + 1) * REQUESTS // CALLS]
@@ -127,41 +96,41 @@ def test_a_state_repo_says_what_the_model_says_after_any_sequence_of_requests(
             if expected[-1].effective:
                 after_each.append(books.view())
 
-        code, rows = demandops("request", *written(asked, tmp_path, f"call-{call}"))
+        code, rows = command("request", *written(asked, tmp_path, f"call-{call}"))
 
-        after = demandops.commits()
+        after = command.commits()
         new = after[len(before) :]
         assert after[: len(before)] == before, "history is only ever added to"
         assert_told_as_expected(rows, expected, asked, new)
         assert code == (1 if any(result.outcome == "refused" for result in expected) else 0)
-        assert demandops.view("main") == books.view()
+        assert command.view("main") == books.view()
         views |= dict(zip(new, after_each, strict=True))
         before = after
     effective = len(before) - len(first)
     assert effective == len(views) > REQUESTS // 4
 
     for commit in Random(seed).sample(sorted(views), 6):
-        assert demandops.view(commit) == views[commit]
-    said = demandops.git("fsck", "--strict", "--full").decode().splitlines()
+        assert command.view(commit) == views[commit]
+    said = git(command.repo, "fsck", "--strict", "--full").splitlines()
     assert [line for line in said if not re.match(r"dangling |notice: ", line)] == []
-    code, verdicts = demandops("verify", f"{first[-1]}..main")
+    code, verdicts = command("verify", f"{first[-1]}..main")
     assert code == 0
     assert [verdict["commit"] for verdict in verdicts] == list(views)
     assert [v for v in verdicts if not v["holds"] or v["skipped"] or v["differing"]] == []
 
 
 def test_sending_everything_again_makes_no_further_commit(
-    demandops: CommandLine, tmp_path: Path
+    command: CommandLine, tmp_path: Path
 ) -> None:
     maker = Maker(Random(3), calm=True)
     goals = [maker.join() for _ in range(20)]
-    demandops("request", *written(goals, tmp_path, "first"))
-    before = demandops.commits()
+    command("request", *written(goals, tmp_path, "first"))
+    before = command.commits()
 
     again = [maker.again(request) for request in goals]
-    code, rows = demandops("request", *written(again, tmp_path, "again"))
+    code, rows = command("request", *written(again, tmp_path, "again"))
 
     assert code == 0
     assert {row["outcome"] for row in rows} == {"unchanged"}
     assert {row["commit"] for row in rows} == {before[-1]}
-    assert demandops.commits() == before
+    assert command.commits() == before

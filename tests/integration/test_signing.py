@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from asking import connection, goal
 from demandops.staterepo.git.signing import Signer, SigningFailed
+
+from tests.kit.goals import connection, goal
+from tests.kit.repo import branches, git
 
 Run = Callable[..., Any]
 
@@ -82,8 +84,7 @@ def test_git_accepts_the_signature(book: Run, state: Any, key: Path, tmp_path: P
     assert said.returncode == 0
     assert said.stderr.startswith('Good "git" signature for generator@example.org with ED25519 key')
     assert git_says(state, listed(keygen(tmp_path / "other")), tmp_path).returncode != 0
-    fsck = subprocess.run(["git", "-C", str(state.path), "fsck", "--strict"], check=False)
-    assert fsck.returncode == 0
+    git(state, "fsck", "--strict")
 
 
 @pytest.mark.parametrize("kind", ["rsa", "ecdsa"])
@@ -152,9 +153,7 @@ class TestProposals:
         state.commit({POLICY: yaml.safe_dump(policy)})
 
     def branch(self, state: Any) -> str:
-        command = ["git", "-C", str(state.path), "for-each-ref", "--format=%(refname:short)"]
-        asked = [*command, "refs/heads/demand"]
-        return subprocess.run(asked, check=True, capture_output=True, text=True).stdout.strip()
+        return "".join(branches(state.path))
 
     def test_its_commit_is_signed(self, book: Run, state: Any, key: Path, tmp_path: Path) -> None:
         assert book("a", "--signing-key", key).code == 0
@@ -194,13 +193,7 @@ def test_what_people_changed_is_carried_out_by_a_signed_commit(
     state.commit({path: None})
     assert book("b", "--signing-key", key).code == 0
     heads = [
-        subprocess.run(
-            ["git", "-C", str(state.path), "cat-file", "commit", commit],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.split("\n\n")[0]
-        for commit in ("main~1", "main~2")
+        git(state, "cat-file", "commit", commit).split("\n\n")[0] for commit in ("main~1", "main~2")
     ]
     assert ["\ngpgsig " in head for head in heads] == [True, False]
 

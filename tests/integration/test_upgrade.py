@@ -14,28 +14,19 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pygit2
 import pytest
 import yaml
-from asking import perception
 from demandops.errors import StateRepoError
 from demandops.service import Generator
 from demandops.staterepo import upgrade
 from demandops.staterepo.git import remote_repository
 
-Run = Callable[..., Any]
-StateRepo = Any
-
-
-class Ran(NamedTuple):
-    """What a command gave."""
-
-    code: int
-    out: str
-    err: str
-
+from tests.kit.cli import Ran, Run
+from tests.kit.goals import perception
+from tests.kit.repo import GitRepo as StateRepo
 
 ROOT = Path(__file__).parents[2]
 PARTS = ("generator", "ros_bridge", "templates", "appdefs", "state-repo-skeleton")

@@ -11,7 +11,7 @@ from copy import deepcopy
 from random import Random
 from typing import Any, TypeVar
 
-from model.books import Goal, Item, World
+from tests.model.books import Goal, Item, World
 
 T = TypeVar("T")
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from model.books import Books
-from model.goals import SKELETON
+from tests.model.books import Books
+from tests.model.goals import SKELETON
 
 EXPERIMENT = Path(__file__).resolve().parents[2] / "examples" / "experiment"
 STATION_CLOUD = "station00 /stations/station00/pointcloud"

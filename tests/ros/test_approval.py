@@ -6,11 +6,11 @@ from pathlib import Path
 
 import yaml
 
-from tests.ros.conftest import Client, Sent, Serve, new_state_repo
-from tests.ros.test_demand import edited, text
-from tests.ros.test_node import connection, git
-
-POLICY = "policy/access-domains.yaml"
+from tests.kit.goals import link as connection
+from tests.kit.repo import POLICY, GitRepo, git
+from tests.kit.repo import init as new_state_repo
+from tests.kit.repo import read as text
+from tests.kit.ros import Client, Sent, Serve
 
 
 def branch_of(client: Client, sent: Sent) -> str:
@@ -29,7 +29,7 @@ def test_a_goal_stays_open_until_a_person_has_decided(
     bare = new_state_repo(tmp_path / "strict.git")
     policy = yaml.safe_load(text(bare, POLICY))
     policy["domains"][0]["approval"] = "required"
-    edited(bare, {POLICY: yaml.safe_dump(policy)})
+    GitRepo(bare).commit({POLICY: yaml.safe_dump(policy)})
     served = serve(str(bare))
     client.ready()
     approved, denied, gone = (client.send(connection(number)) for number in (1, 2, 3))

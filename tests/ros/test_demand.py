@@ -11,12 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pygit2
 import pytest
 import rclpy
 import yaml
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
-from demandops.staterepo.git import tree as trees
 from demandops_interfaces.action import Demand
 from demandops_interfaces.msg import Bookkeeping
 from demandops_ros import DemandClient, DemandError
@@ -24,7 +22,10 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
-from tests.ros.conftest import Serve, new_state_repo
+from tests.kit.repo import GitRepo, git
+from tests.kit.repo import init as new_state_repo
+from tests.kit.repo import read as text
+from tests.kit.ros import Serve
 
 APPDEFS = Path(__file__).parent.parent / "appdefs"
 POINTS = "/vehicles/vehicle00/drivers/lidar/pointcloud"
@@ -43,26 +44,11 @@ LINK = {
 }
 
 
-def edited(state_repo: Path, files: dict[str, str]) -> None:
-    """Commit files, as a person would."""
-    repo = pygit2.Repository(str(state_repo))
-    tip = repo[repo.references["refs/heads/main"].target]
-    who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
-    tree = trees.write(repo, tip.peel(pygit2.Tree), files)
-    repo.create_commit("refs/heads/main", who, who, "Edit by hand\n", tree, [tip.id])
-
-
-def text(state_repo: Path, path: str) -> str:
-    repo = pygit2.Repository(str(state_repo))
-    tree = repo[repo.references["refs/heads/main"].target].peel(pygit2.Tree)
-    return trees.read_text(tree, path) or ""
-
-
 def with_policy(state_repo: Path, **more: Any) -> None:
     path = "policy/access-domains.yaml"
     policy = yaml.safe_load(text(state_repo, path))
     policy["domains"][0] |= more
-    edited(state_repo, {path: yaml.safe_dump(policy)})
+    GitRepo(state_repo).commit({path: yaml.safe_dump(policy)})
 
 
 @pytest.fixture
@@ -72,9 +58,8 @@ def client(ros_domain: int) -> Iterator[DemandClient]:
 
 
 def operations(state_repo: Path) -> list[str]:
-    command = ["git", "-C", str(state_repo), "log", "--format=%(trailers:key=Operation,valueonly)"]
-    out = subprocess.run([*command, "main"], check=True, capture_output=True, text=True).stdout
-    return out.split()[::-1]
+    form = "--format=%(trailers:key=Operation,valueonly)"
+    return git(state_repo, "log", "--reverse", form, "main").split()
 
 
 def wait(condition: Any, what: str, seconds: float = 60.0) -> None:
@@ -101,7 +86,7 @@ def test_a_third_type_of_application_is_demanded_with_yaml_alone(
         f"  {name}:\n    repository: ghcr.io/example/{name}\n    tag: v1\n"
         for name in ("driver", "recorder")
     )
-    edited(state, added)
+    GitRepo(state).commit(added)
     served = serve(str(state))
     stages: list[str] = []
     with client.demand(

@@ -8,30 +8,16 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
-import pygit2
 import pytest
-from demandops.staterepo.git import tree as trees
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from tests.ros.conftest import Client, Serve, new_state_repo
-from tests.ros.test_node import connection
+from tests.kit.goals import link as connection
+from tests.kit.repo import GitRepo, read
+from tests.kit.repo import init as new_state_repo
+from tests.kit.ros import Client, Serve
 
 NODES = "inventory/nodes.yaml"
 STATE, CONFIGURATION = "demandops: state repo", "demandops: configuration"
-
-
-def commit(bare: Path, path: str, text: str) -> None:
-    """Commit as a person would."""
-    repo = pygit2.Repository(str(bare))
-    tip = repo[repo.references["refs/heads/main"].target].peel(pygit2.Commit)
-    who = pygit2.Signature("Petra Platform", "petra@example.org", 1_770_000_000, 0)
-    tree = trees.write(repo, tip.tree, {path: text})
-    repo.create_commit("refs/heads/main", who, who, "By hand\n", tree, [tip.id])
-
-
-def read(bare: Path, path: str) -> str:
-    command = ["git", "-C", str(bare), "show", f"main:{path}"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 class Heard:
@@ -66,10 +52,10 @@ def test_diagnostics_tell_what_is_not_valid_and_that_the_remote_is_away(
     assert heard.statuses[STATE].hardware_id == url
 
     nodes = read(bare, NODES)
-    commit(bare, NODES, nodes.replace("cluster: c-its", "cluster: c-itz", 1))
+    GitRepo(bare).commit({NODES: nodes.replace("cluster: c-its", "cluster: c-itz", 1)})
     client.wait(lambda: heard.is_at(CONFIGURATION, DiagnosticStatus.WARN))
     assert heard.values(CONFIGURATION)["problem 1"].startswith(f"{NODES}: nodes[")
-    commit(bare, NODES, nodes)
+    GitRepo(bare).commit({NODES: nodes})
     client.wait(lambda: heard.is_at(CONFIGURATION, DiagnosticStatus.OK))
 
     away = bare.rename(tmp_path / "away.git")
@@ -105,7 +91,7 @@ def test_a_push_that_the_webhook_hears_of_is_followed_at_once(
     client.ready()
     assert client.call(connection(1)).status == "succeeded"
     brokers = read(bare, "inventory/brokers.yaml")
-    commit(bare, "inventory/brokers.yaml", brokers.replace("broker-edge", "broker-moved"))
+    GitRepo(bare).commit({"inventory/brokers.yaml": brokers.replace("broker-edge", "broker-moved")})
     client.wait(lambda: "listening for pushes at " in served.log.read_text())
     found = re.search(
         r"listening for pushes at (http://127.0.0.1:[0-9]+/push)", served.log.read_text()
@@ -117,7 +103,7 @@ def test_a_push_that_the_webhook_hears_of_is_followed_at_once(
     client.wait(
         lambda: (
             subprocess.run(command, capture_output=True, text=True, check=True).stdout
-            == "Petra Platform DemandOps generator\n"
+            == "A person DemandOps generator\n"
         )
     )
     assert served.stop() == 0

@@ -4,48 +4,19 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from demandops_interfaces.srv import GetBookkeeping
 
-from tests.ros.conftest import Client, Serve, Served, new_state_repo
-
-ROOT = Path(__file__).parent.parent.parent
-EXPERIMENT = sorted((ROOT / "examples" / "experiment").glob("[1-8]-*.yaml"))
-
-sys.path.insert(0, str(ROOT / "examples" / "experiment"))
-import paper  # noqa: E402 - the example's own table
-
-
-def experiment(step: int) -> dict[str, Any]:
-    goal: dict[str, Any] = yaml.safe_load(EXPERIMENT[step - 1].read_text())
-    return goal
-
-
-def connection(number: int, **more: Any) -> dict[str, Any]:
-    """A goal of its own: one connection, named by a number."""
-    topics = [f"/t{number}"]
-    fields = {
-        "id": f"c{number}",
-        "requester_ids": [f"r{number}"],
-        "type": 1,
-        "source_node_id": "vehicle00",
-        "target_node_id": "edge",
-        "source_topics": topics,
-        "target_topics": topics,
-    }
-    return {"id": f"request{number}", "connections": [fields | more]}
-
-
-def git(state_repo: str, *args: str) -> str:
-    command = ["git", "-C", state_repo.removeprefix("file://"), *args]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+from examples.experiment import paper
+from tests.kit.goals import experiment
+from tests.kit.goals import link as connection
+from tests.kit.repo import git
+from tests.kit.repo import init as new_state_repo
+from tests.kit.ros import Client, Serve, Served
 
 
 def slow_remote(bare: Path, seconds: float) -> str:

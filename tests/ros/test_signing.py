@@ -5,8 +5,10 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-from tests.ros.conftest import Client, Serve, new_state_repo
-from tests.ros.test_node import connection, git
+from tests.kit.goals import link as connection
+from tests.kit.repo import git
+from tests.kit.repo import init as new_state_repo
+from tests.kit.ros import Client, Serve
 
 
 def keygen(path: Path) -> Path:

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from datetime import datetime, timedelta, timezone
-from functools import lru_cache
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 from demandops.config.base_model import FrozenModel, parse_file
-from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered_files
@@ -23,15 +21,17 @@ from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, Refused
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
-from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.service.timing.lease_expiry import LeaseClock
 from demandops.service.timing.rate_limit import RateLimit
-from demandops.staterepo import new_repo
 from pydantic import Field, model_validator
+
+from tests.kit.config import configuration as skeleton_config
+from tests.kit.config import skeleton
+from tests.kit.memory import NOW as START
+from tests.kit.memory import MemoryRepo
 
 HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"
-START = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
 
 
 # ---- what a scenario says ----
@@ -129,11 +129,6 @@ def scenarios() -> dict[str, Path]:
 # ---- the configuration ----
 
 
-@lru_cache(maxsize=1)
-def _skeleton() -> Mapping[str, str]:
-    return new_repo.files()
-
-
 def _laid_over(below: Any, above: Any) -> Any:
     if not (isinstance(below, dict) and isinstance(above, dict)):
         return above
@@ -144,7 +139,7 @@ def configuration(
     appdefs: Iterable[str] = (), config: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
     """Return the files of a state repo that people own."""
-    files = {p: text for p, text in _skeleton().items() if p.split("/")[0] in CONFIG_ROOTS}
+    files = skeleton_config()
     overlays: list[tuple[str, Any]] = []
     for name in appdefs:
         for path in sorted((_APPDEFS / name).rglob("*")):
@@ -188,12 +183,11 @@ class Clocks:
         self.now += timedelta(seconds=seconds)
 
 
-class World:
+class World(MemoryRepo):
     """A state repo in memory, and one generator at it."""
 
     def __init__(self, state: State, config: Mapping[str, str]) -> None:
-        self.state = state
-        self.files: dict[str, str] = {}
+        super().__init__(state=state)
         self.clocks = Clocks()
         self.configure(state, config)
         self._sent = 0
@@ -203,19 +197,19 @@ class World:
         """Take a configuration in, and write what follows of it."""
         self.state = replace(state, ledger=self.state.ledger)
         empty = replace(state, ledger=Ledger())
-        self._standing = {**_skeleton(), **config, **rendered_files(empty)}
+        self._initial = {**skeleton(), **config, **rendered_files(empty)}
         claims = {p: text for p, text in self.files.items() if claim_file.kind_of(p)}
-        self.files = {**self._standing, **claims, **rendered_files(self.state)}
+        self.files = {**self._initial, **claims, **rendered_files(self.state)}
 
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
         self._lease_clock = LeaseClock(self.clocks.wall, self.clocks.steady)
         self._throttle = RateLimit()
 
-    def decide(self, goal: object) -> Decision:
+    def decide(self, goal: object, now: datetime | None = None) -> Decision:
         """Decide a goal; nothing changes."""
         self._sent += 1
-        operation, now = f"hand-in-{self._sent}", self.clocks.now
+        operation, now = f"hand-in-{self._sent}", now or self.clocks.now
         return decide(
             self.state,
             goal,
@@ -223,23 +217,6 @@ class World:
             self.files.get,
             throttle=lambda request, config: self._throttle.faults(request, config, operation, now),
         )
-
-    def take(self, goal: object) -> Decision | Refused:
-        """Decide a goal and commit what comes of it, or return the refusal."""
-        before = dict(self.files)
-        try:
-            decision = self.decide(goal)
-        except Refused as refusal:
-            assert self.files == before, "a refused demand changed something"
-            return refusal
-        self.state = decision.state
-        for path, text in decision.files.items():
-            assert self.files.get(path) != text, f"a file that does not change is written: {path}"
-            if text is None:
-                del self.files[path]
-            else:
-                self.files[path] = text
-        return decision
 
     def look(self) -> list[str]:
         """Release what has expired, one commit for each demand; return the demands."""
@@ -252,11 +229,6 @@ class World:
             assert taken.files, f"nothing of '{demand}' was released at {now}"
             done.append(demand)
         return done
-
-    def books(self) -> dict[str, dict[str, Any]]:
-        """Return the bookkeeping as ``demandops bookkeeping`` prints it, without its commit."""
-        data = as_data(bookkeeping(self.state.ledger, self.state.config), "")
-        return {"services": data["services"], "connections": data["connections"]}
 
     def runs(self) -> dict[str, list[str]]:
         """Return who requests each service, which is told by what it is for."""
@@ -274,14 +246,6 @@ class World:
                     claim.lease.until, found.get(claim.demand, claim.lease.until)
                 )
         return found
-
-    def rendered(self) -> dict[str, str]:
-        """Return what stands below ``clusters/`` because it is demanded."""
-        return {
-            path: text
-            for path, text in self.files.items()
-            if path.startswith("clusters/") and path not in self._standing
-        }
 
     def assert_sound(self) -> None:
         """The files say what the books say, and nothing else is there."""

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -14,6 +11,7 @@ from demandops.cluster import access, reconcile_trigger
 from demandops.errors import InvalidInput
 
 from tests.golden.cases import start
+from tests.kit.http import Answer, Call, kubeconfig, serving
 
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 
@@ -63,22 +61,12 @@ def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
 def receiver() -> Iterator[tuple[str, list[str]]]:
     heard: list[str] = []
 
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            heard.append(self.path)
-            self.send_response(503 if "fail" in self.path and len(heard) == 1 else 200)
-            self.end_headers()
+    def answer(call: Call) -> Answer:
+        heard.append(call.path)
+        return Answer(503 if "fail" in call.path and len(heard) == 1 else 200)
 
-        def log_message(self, format: str, *args: object) -> None:
-            """Say nothing."""
-
-    server = HTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}/hook/abc", heard
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with serving(answer) as server:
+        yield f"{server.url}/hook/abc", heard
 
 
 def test_a_receiver_is_called_after_a_push(receiver: tuple[str, list[str]]) -> None:
@@ -97,35 +85,13 @@ def api(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, bytes]]]]:
     """A server that takes every patch, and a kubeconfig for it."""
     heard: list[tuple[str, bytes]] = []
 
-    class Handler(BaseHTTPRequestHandler):
-        def do_PATCH(self) -> None:
-            heard.append((self.path, self.rfile.read(int(self.headers["Content-Length"]))))
-            self.send_response(200)
-            self.send_header("Content-Type", "application/json")
-            self.end_headers()
-            self.wfile.write(b"{}")
+    def answer(call: Call) -> Answer:
+        assert call.method == "PATCH"
+        heard.append((call.path, call.body))
+        return Answer.json({})
 
-        def log_message(self, format: str, *args: object) -> None:
-            """Say nothing."""
-
-    server = HTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    cluster = {"server": f"http://127.0.0.1:{server.server_port}"}
-    config = {
-        "apiVersion": "v1",
-        "kind": "Config",
-        "current-context": "c",
-        "clusters": [{"name": "c", "cluster": cluster}],
-        "users": [{"name": "u", "user": {}}],
-        "contexts": [{"name": "c", "context": {"cluster": "c", "user": "u"}}],
-    }
-    kubeconfig = tmp_path / "kubeconfig"
-    kubeconfig.write_text(json.dumps(config))
-    yield kubeconfig, heard
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with serving(answer) as server:
+        yield kubeconfig(tmp_path, server.url), heard
 
 
 @pytest.mark.parametrize(

@@ -6,17 +6,16 @@ exist follows from the rows that have requesters (`examples/experiment/paper.py`
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-EXPERIMENT = Path(__file__).resolve().parents[3] / "examples" / "experiment"
-sys.path.insert(0, str(EXPERIMENT))
+from examples.experiment import paper
 
-import paper  # noqa: E402 - beside its example, which is no package
+EXPERIMENT = Path(__file__).resolve().parents[3] / "examples" / "experiment"
+
 
 STEPS = range(1, len(paper.STEPS) + 1)
 VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")

@@ -9,21 +9,15 @@ from __future__ import annotations
 import ssl
 import stat
 from collections.abc import Callable, Iterator
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.config.config import CONFIG_ROOTS
-from demandops.config.load import load
-from demandops.decision import State
-from demandops.ledger.ledger import Ledger
-from demandops.staterepo import new_repo
 
-from tests import demanding
 from tests.integration.mqtt.conftest import PASSWORD, USER, Broker, Client, Pod
+from tests.kit.carriers import routes
+from tests.kit.memory import MemoryRepo
 
-NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
 DEMAND: dict[str, Any] = {
     "connections": [
         {
@@ -45,9 +39,8 @@ Ends = dict[str, Pod]
 @pytest.fixture
 def manifests(broker: Broker) -> dict[str, str]:
     """Return the manifests of both ends by side."""
-    files = new_repo.files() | {"inventory/brokers.yaml": broker.inventory()}
-    config = load({p: text for p, text in files.items() if p.split("/")[0] in CONFIG_ROOTS})
-    _, made = demanding.decide(State.of(config, Ledger()), DEMAND, NOW, files.get)
+    repo = MemoryRepo({"inventory/brokers.yaml": broker.inventory()})
+    made = repo.decide(routes(DEMAND))
     return {
         side: text
         for path, text in made.files.items()

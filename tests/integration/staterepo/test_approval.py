@@ -12,14 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import staterepo_rig as rig
 import yaml
-from approving import Petra, Proposed, branches
 from demandops.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
 from demandops.service import Ticket
 from demandops.service.approvals import approvals
-from git_over_http import serving
-from staterepo_rig import git, goal, leave
+
+from tests.kit import rig
+from tests.kit.generator import Proposed
+from tests.kit.git_over_http import serving
+from tests.kit.repo import Person as Petra
+from tests.kit.repo import branches
+from tests.kit.rig import git, goal, leave
 
 
 @pytest.fixture(autouse=True)

@@ -5,22 +5,23 @@ The forge is a small one on the loopback that keeps pull requests as GitHub's AP
 
 from __future__ import annotations
 
-import json
 import logging
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlparse
 
 import pytest
-import staterepo_rig as rig
-from approving import Petra, Proposed, branches
 from demandops.errors import TurnedDown, Withdrawn
 from demandops.service.approvals import approvals, forge_worker
-from staterepo_rig import git, goal
+
+from tests.kit import rig
+from tests.kit.generator import Proposed
+from tests.kit.http import Answer, Call, serving
+from tests.kit.repo import Person as Petra
+from tests.kit.repo import branches
+from tests.kit.rig import git, goal
 
 TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
 
@@ -32,9 +33,13 @@ class Hub:
     url: str = ""
     pulls: list[dict[str, Any]] = field(default_factory=list)
     away: bool = False
-    lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def answer(self, method: str, path: str, body: dict[str, Any] | None) -> tuple[int, Any]:
+    def answer(self, call: Call) -> Answer:
+        assert call.headers["Authorization"] == f"Bearer {TOKEN}"
+        status, found = self._found(call.method, call.path, call.json())
+        return Answer.json(found, status)
+
+    def _found(self, method: str, path: str, body: dict[str, Any] | None) -> tuple[int, Any]:
         url = urlparse(path)
         if self.away:
             return 503, {"message": "Service unavailable"}
@@ -57,32 +62,9 @@ class Hub:
 def hub() -> Iterator[Hub]:
     made = Hub()
 
-    class Handler(BaseHTTPRequestHandler):
-        def _serve(self) -> None:
-            length = int(self.headers.get("Content-Length") or 0)
-            body = json.loads(self.rfile.read(length)) if length else None
-            assert self.headers["Authorization"] == f"Bearer {TOKEN}"
-            with made.lock:
-                status, answer = made.answer(self.command, self.path, body)
-            data = json.dumps(answer).encode()
-            self.send_response(status)
-            self.send_header("Content-Length", str(len(data)))
-            self.end_headers()
-            self.wfile.write(data)
-
-        do_GET = do_POST = do_PATCH = _serve
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Keep quiet."""
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    made.url = f"http://127.0.0.1:{server.server_port}"
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
-    thread.start()
-    yield made
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with serving(made.answer) as server:
+        made.url = server.url
+        yield made
 
 
 @pytest.fixture
@@ -122,8 +104,7 @@ def test_a_closed_pull_request_turns_the_demand_down(hub: Hub, bare: Path, petra
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1))
         assert [proposed.branch] == branches(bare)
-        with hub.lock:
-            hub.pulls[0]["state"] = "closed"
+        hub.pulls[0]["state"] = "closed"
         with pytest.raises(TurnedDown) as error:
             rig.receipt(proposed.ticket)
         assert str(error.value) == "was turned down: https://github.com/its/state/pull/1 was closed"

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
-from staterepo_rig import Gate, goal, leave
+
+from tests.kit import rig
+from tests.kit.rig import Gate, goal, leave
 
 
 @pytest.fixture

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import staterepo_rig as rig
 import yaml
-from staterepo_rig import Person, goal, leave
+
+from tests.kit import rig
+from tests.kit.repo import read as text
+from tests.kit.rig import Person, goal, leave
 
 NODES, IMAGES = "inventory/nodes.yaml", "registry/images.yaml"
 DETECTION = "clusters/c-its/perception/edge/od-edge-station00.yaml"
@@ -25,15 +27,6 @@ select: [{services: [object-detection], nodes: [edge]}]
 replicas: 2
 """
 BROKEN = TWO.replace("replicas: 2", "replicas: many").replace("object-detection", "object-fusion")
-
-
-@pytest.fixture
-def person(bare: Path, tmp_path: Path) -> Person:
-    return Person(bare, tmp_path / "person")
-
-
-def text(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}", check=False)
 
 
 def replicas(bare: Path) -> Any:

@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pytest
-import staterepo_rig as rig
 from demandops.cli.main import run
 from demandops.service import Generator
-from staterepo_rig import Person, goal, leave
+
+from tests.kit import rig
+from tests.kit.cli import Run
+from tests.kit.rig import Person, goal, leave
 
 NODES = "inventory/nodes.yaml"
-
-Command = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def demandops(capsys: pytest.CaptureFixture[str]) -> Command:
-    def call(*args: str | Path) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = run([str(arg) for arg in args])
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
 
 
 def of(generator: Generator, subject: str) -> list[str]:
@@ -36,7 +23,7 @@ def of(generator: Generator, subject: str) -> list[str]:
 
 
 def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
-    address: str, bare: Path, tmp_path: Path, demandops: Command
+    address: str, bare: Path, tmp_path: Path, demandops: Run
 ) -> None:
     """With a generator running, whose look takes both in."""
     person = Person(bare, tmp_path / "person")
@@ -79,7 +66,7 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
     rig.assert_sound(bare)
 
 
-def test_applications_at_a_node_go_in_whosever_name(bare: Path, demandops: Command) -> None:
+def test_applications_at_a_node_go_in_whosever_name(bare: Path, demandops: Run) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1), goal(2))
     assert demandops("decommission", "edge", "--node", "--state-repo", bare)[0] == 0
@@ -95,9 +82,7 @@ def _by_the_edges_broker(target: str) -> rig.Goal:
     return made
 
 
-def test_of_a_broker_that_was_asked_for_another_takes_the_place(
-    bare: Path, demandops: Command
-) -> None:
+def test_of_a_broker_that_was_asked_for_another_takes_the_place(bare: Path, demandops: Run) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, _by_the_edges_broker("cloud"))
     code, out, err = demandops("decommission", "edge", "--state-repo", bare)
@@ -108,7 +93,7 @@ def test_of_a_broker_that_was_asked_for_another_takes_the_place(
     rig.assert_sound(bare)
 
 
-def test_where_no_other_broker_would_do_it_is_refused_whole(bare: Path, demandops: Command) -> None:
+def test_where_no_other_broker_would_do_it_is_refused_whole(bare: Path, demandops: Run) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, _by_the_edges_broker("station00"), goal(2))
     tip = rig.tip(bare)
@@ -121,9 +106,7 @@ def test_where_no_other_broker_would_do_it_is_refused_whole(bare: Path, demandop
     assert rig.tip(bare) == tip
 
 
-def test_with_a_requester_goes_all_that_is_claimed_in_its_name(
-    bare: Path, demandops: Command
-) -> None:
+def test_with_a_requester_goes_all_that_is_claimed_in_its_name(bare: Path, demandops: Run) -> None:
     alone = goal(2)
     for subject in (alone["apps"][0]["object_detection_fusion_app"], alone["connections"][0]):
         subject["requester_ids"] = ["user1"]
@@ -154,7 +137,7 @@ def test_with_a_requester_goes_all_that_is_claimed_in_its_name(
     rig.assert_sound(bare)
 
 
-def test_as_a_requester_only_a_node_keeps_what_is_at_it(bare: Path, demandops: Command) -> None:
+def test_as_a_requester_only_a_node_keeps_what_is_at_it(bare: Path, demandops: Run) -> None:
     others = goal(2)
     for subject in (others["apps"][0]["object_detection_fusion_app"], others["connections"][0]):
         subject["requester_ids"] = ["user2"]
@@ -171,7 +154,7 @@ def test_as_a_requester_only_a_node_keeps_what_is_at_it(bare: Path, demandops: C
     assert "/stations/station00/pointcloud" in topics
 
 
-def test_dry_run_shows_the_consequence_and_releases_nothing(bare: Path, demandops: Command) -> None:
+def test_dry_run_shows_the_consequence_and_releases_nothing(bare: Path, demandops: Run) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
     tip = rig.tip(bare)
@@ -182,7 +165,7 @@ def test_dry_run_shows_the_consequence_and_releases_nothing(bare: Path, demandop
     assert rig.tip(bare) == tip
 
 
-def test_what_holds_nothing_is_told_and_a_typo_shows(bare: Path, demandops: Command) -> None:
+def test_what_holds_nothing_is_told_and_a_typo_shows(bare: Path, demandops: Run) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
     tip = rig.tip(bare)
@@ -205,7 +188,7 @@ def test_what_holds_nothing_is_told_and_a_typo_shows(bare: Path, demandops: Comm
 
 
 def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
-    url: str, bare: Path, demandops: Command
+    url: str, bare: Path, demandops: Run
 ) -> None:
     """As for any demand: it is in the outbox, and the next start carries it out."""
     from demandops.demand import decommission_goal

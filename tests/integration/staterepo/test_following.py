@@ -14,7 +14,6 @@ from concurrent.futures import TimeoutError as NotAnswered
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 import yaml
 from demandops import settings
 from demandops.cli.main import run
@@ -22,18 +21,16 @@ from demandops.errors import QueueFull, Withdrawn
 from demandops.service import Generator
 from demandops.staterepo.load import problem_report
 from demandops.staterepo.write.journal import Journal
-from git_over_http import Server, serving
-from staterepo_rig import Person, Stages, goal, leave
+
+from tests.kit import rig
+from tests.kit.git_over_http import Server, serving
+from tests.kit.repo import read as file_of
+from tests.kit.rig import Person, Stages, goal, leave
 
 NODES, CLUSTERS = "inventory/nodes.yaml", "inventory/clusters.yaml"
 BROKERS, CHARTS = "inventory/brokers.yaml", "registry/charts.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 SOON_S = 0.1
-
-
-@pytest.fixture
-def person(bare: Path, tmp_path: Path) -> Person:
-    return Person(bare, tmp_path / "person")
 
 
 @pytest.fixture
@@ -53,10 +50,6 @@ def place(request: pytest.FixtureRequest, bare: Path) -> str:
     if request.param == "embedded":
         return str(bare)
     return bare.as_uri() if request.param == "file-url" else request.getfixturevalue("http")
-
-
-def file_of(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}") + "\n"
 
 
 def without_vehicle01(bare: Path) -> dict[str, str | None]:
@@ -264,7 +257,7 @@ def test_several_peoples_commits_are_all_named_and_a_readme_is_not(
         rig.book(generator, goal(1))
         first = person.change(_move_broker(bare), "Elsewhere")
         person.change({"README.md": "Ours\n"}, "Say whose it is")
-        rig.git(person._folder, "config", "user.name", "-")
+        rig.git(person.folder, "config", "user.name", "-")
         second = person.edit(BROKERS, "elsewhere", "somewhere")
         rig.book(generator, goal(2))
     (commit,) = [c for c in rig.commits(bare) if c.one("Operation") == "follow"]

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 from demandops.staterepo import reader
 from demandops.staterepo.git import connect
-from staterepo_rig import Person
+
+from tests.kit import rig
+from tests.kit.rig import Person
 
 CHART = "appdefs/object-detection-fusion/charts/object-fusion"
 

@@ -9,9 +9,12 @@ from pathlib import Path
 from random import Random
 
 import pytest
-import staterepo_rig as rig
 from demandops.service import Generator
-from staterepo_rig import Drivers, Run, Told, demand, goal, leave
+
+from tests.kit import rig
+from tests.kit.rig import Drivers, Run, Told, demand, goal, leave
+
+pytestmark = pytest.mark.synced
 
 KILLS = 15
 LANES = 4

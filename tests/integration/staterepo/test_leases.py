@@ -8,21 +8,19 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
-import pygit2
 import pytest
-import staterepo_rig as rig
 from demandops import settings
 from demandops.demand.claim import Claim
 from demandops.errors import Refused
 from demandops.service import Generator, worker
-from demandops.staterepo.git import tree as trees
 from demandops.staterepo.write import journal
-from staterepo_rig import Person
+
+from tests.kit import rig
+from tests.kit.repo import GitRepo, Person
 
 DOMAINS = "policy/access-domains.yaml"
 POLICY = """\
@@ -39,28 +37,15 @@ def _now() -> datetime:
 
 def _with_policy(repo: Path, more: str = "") -> Path:
     """Commit a policy as a person would."""
-    git = pygit2.Repository(str(repo))
-    tip = git[git.references["refs/heads/main"].target]
-    who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
-    tree = trees.write(git, tip.peel(pygit2.Tree), {DOMAINS: POLICY % more})
-    git.create_commit("refs/heads/main", who, who, "Short leases\n", tree, [tip.id])
+    GitRepo(repo).commit({DOMAINS: POLICY % more}, "Short leases\n")
     return repo
 
 
 @pytest.fixture(scope="session")
-def _leased_template(_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bare state repo whose leases have no slack."""
     folder = tmp_path_factory.mktemp("leased") / "state.git"
-    return _with_policy(Path(shutil.copytree(_template, folder)))
-
-
-@pytest.fixture
-def new_repo(_leased_template: Path, tmp_path: Path) -> Callable[[str], Path]:
-    """Make further bare state repos, whose leases have no slack."""
-
-    def make(name: str) -> Path:
-        return Path(shutil.copytree(_leased_template, tmp_path / name))
-
-    return make
+    return _with_policy(Path(shutil.copytree(bare_template, folder)))
 
 
 def put(demand: str, lease: str | int | None = 1, who: str = "vehicle00", **more: Any) -> rig.Goal:

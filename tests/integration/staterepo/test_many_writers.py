@@ -13,10 +13,12 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import git_over_http
 import pytest
-import staterepo_rig as rig
-from staterepo_rig import Drivers, Goal
+
+from tests.kit import git_over_http, rig
+from tests.kit.rig import Drivers, Goal
+
+pytestmark = pytest.mark.synced
 
 GENERATORS = 4
 DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "64"))

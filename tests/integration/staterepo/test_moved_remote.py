@@ -9,19 +9,15 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 from demandops.errors import InvalidInput, Refused
 from demandops.service import Generator
-from staterepo_rig import Person, goal, leave
+
+from tests.kit import rig
+from tests.kit.rig import Person, goal, leave
 
 NODES = "inventory/nodes.yaml"
 BROKERS = "inventory/brokers.yaml"
 BROKEN = "nodes: [}\n"
-
-
-@pytest.fixture
-def person(bare: Path, tmp_path: Path) -> Person:
-    return Person(bare, tmp_path / "person")
 
 
 def _edit_readme(person: Person) -> str:

@@ -12,32 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import staterepo_rig as rig
 import yaml
 from demandops.errors import InvalidInput, Refused
-from demandops.service import Generator
-from staterepo_rig import Person
+from demandops.service import Generator, Receipt
+
+from tests.kit import rig
+from tests.kit.config import override
+from tests.kit.repo import read as file
+from tests.kit.rig import Person
 
 EDGE = "clusters/c-its/perception/edge"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"
 WATCHED: dict[str, Any] = {"services": ["object-detection"], "nodes": ["edge"]}
-
-
-def override(*select: dict[str, Any], **fields: Any) -> str:
-    head = {"apiVersion": "demandops/v1", "kind": "Override"}
-    told = {"reason": "a field test", "owner": "petra", "select": list(select)}
-    return yaml.safe_dump(head | told | fields, sort_keys=False)
-
-
-@pytest.fixture
-def person(bare: Path, tmp_path: Path) -> Person:
-    return Person(bare, tmp_path / "person")
-
-
-@pytest.fixture
-def generator(bare: Path) -> Iterator[Generator]:
-    with rig.running(bare) as running:
-        yield running
 
 
 @pytest.fixture
@@ -45,10 +31,6 @@ def anywhere(address: str) -> Iterator[Generator]:
     """A generator on the state repo in place, and one on a remote."""
     with rig.running(address) as running:
         yield running
-
-
-def file(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}", check=False)
 
 
 def parsed(bare: Path, path: str) -> Any:
@@ -69,7 +51,7 @@ def merge(person: Person, **overrides: str | None) -> str:
     return person.change({f"overrides/{name}.yaml": text for name, text in overrides.items()})
 
 
-def next_demand(generator: Generator, number: int = 100) -> rig.Receipt:
+def next_demand(generator: Generator, number: int = 100) -> Receipt:
     """A demand that has nothing to do with the matter."""
     (receipt,) = rig.book(generator, rig.goal(number))
     return receipt

@@ -12,11 +12,12 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 import yaml
 from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.errors import DemandOpsError
-from staterepo_rig import Person
+
+from tests.kit import rig
+from tests.kit.rig import Person
 
 STEPS = 25
 

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import staterepo_rig as rig
 import yaml
 from demandops.service import Generator
-from staterepo_rig import Person
+
+from tests.kit import rig
+from tests.kit.repo import read as text
+from tests.kit.rig import Person
 
 FURTHER = int(os.environ.get("DEMANDOPS_LOAD_FURTHER", "60"))
 INTERVAL_S = 0.5
@@ -35,10 +37,6 @@ replicas: 2
 """
 BROKEN = OVERRIDE.replace("replicas: 2", "replicas: many").replace("detection]", "fusion]")
 REPORT = ".demandops/reports/problems.yaml"
-
-
-def text(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}", check=False)
 
 
 def values(bare: Path, path: str) -> Any:

@@ -7,10 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 from demandops.errors import QueueFull, Refused, ShuttingDown, StateRepoError, Withdrawn
 from demandops.service import Generator
-from staterepo_rig import Gate, Stages, goal, leave
+
+from tests.kit import rig
+from tests.kit.rig import Gate, Stages, goal, leave
 
 
 @contextmanager

@@ -6,9 +6,10 @@ import threading
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 from demandops.errors import Refused
 from demandops.service import Generator, rollback_goal
+
+from tests.kit import rig
 
 
 def goal_of(to: str, *, drop_newer: bool) -> dict[str, object]:

@@ -7,9 +7,12 @@ import threading
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 from demandops.service import Generator, Receipt, Ticket
-from staterepo_rig import Drivers, demand, goal, leave
+
+from tests.kit import rig
+from tests.kit.rig import Drivers, demand, goal, leave
+
+pytestmark = pytest.mark.synced
 
 EACH = 32
 

@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 from demandops.errors import StateRepoError
 from demandops.service import Generator
-from git_over_http import Server, serving
-from staterepo_rig import Gate, goal, leave
+
+from tests.kit import rig
+from tests.kit.git_over_http import Server, serving
+from tests.kit.rig import Gate, goal, leave
 
 
 @pytest.fixture

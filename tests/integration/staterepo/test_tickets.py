@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import staterepo_rig as rig
 from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
 from demandops.service import Generator, Ticket
-from staterepo_rig import Drivers, Gate, Stages, demand, goal
+
+from tests.kit import rig
+from tests.kit.rig import Drivers, Gate, Stages, demand, goal
 
 # ---- taking back ----
 
@@ -291,6 +292,7 @@ def test_a_journal_that_cannot_be_written_fails_the_demand_and_works_again_later
 # ---- what was promised holds after a crash ----
 
 
+@pytest.mark.synced
 def test_what_was_taken_back_stays_so_after_a_crash(
     drivers: Drivers, address: str, bare: Path
 ) -> None:

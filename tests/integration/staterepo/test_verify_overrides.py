@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import staterepo_rig as rig
 import yaml
 from demandops.service import Generator, rollback_goal
 from demandops.staterepo import reader
 from demandops.staterepo.audit.verification import Verdict
-from staterepo_rig import Person
+
+from tests.kit import rig
+from tests.kit.repo import read as file
+from tests.kit.rig import Person
 
 FORGED = "Forged\n\nOperation: {}\nDemand-Id: none\n{}Render-Version: 1"
 EDGE = "clusters/c-its/perception/edge"
-
-
-@pytest.fixture
-def person(bare: Path, tmp_path: Path) -> Person:
-    return Person(bare, tmp_path / "person")
-
-
-@pytest.fixture
-def generator(bare: Path) -> Iterator[Generator]:
-    with rig.running(bare) as running:
-        yield running
 
 
 def override(**fields: object) -> str:
@@ -35,10 +26,6 @@ def override(**fields: object) -> str:
 
 def merge(person: Person, **overrides: str | None) -> None:
     person.change({f"overrides/{name}.yaml": text for name, text in overrides.items()})
-
-
-def file(bare: Path, path: str) -> str:
-    return rig.git(bare, "show", f"main:{path}") + "\n"
 
 
 def verdicts(bare: Path) -> dict[str, Verdict]:

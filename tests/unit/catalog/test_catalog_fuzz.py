@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import FAST, configuration, skeleton
 from demandops.config.load import load
 from demandops.decision import State, try_configuration
 from demandops.errors import InvalidInput
 from demandops.ledger.ledger import Ledger
+
+from tests.kit.config import FAST, configuration, skeleton
 
 FILES = sorted(
     path

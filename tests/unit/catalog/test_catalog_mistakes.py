@@ -10,10 +10,11 @@ import json
 from collections.abc import Mapping
 
 import pytest
-from asking import brokers, configuration, edited, skeleton
 from demandops.config.load import load
 from demandops.errors import InvalidInput
 from demandops.staterepo import new_repo
+
+from tests.kit.config import brokers, configuration, edited, skeleton
 
 ROOT = "demandops.yaml"
 CLUSTERS = "inventory/clusters.yaml"

@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from asking import Books, configuration, perception, skeleton
 from demandops.config.load import load
 from demandops.decision import State, try_configuration
 from demandops.errors import InvalidInput
 from demandops.ledger.ledger import Ledger
+
+from tests.kit.config import configuration, skeleton
+from tests.kit.goals import perception
+from tests.kit.memory import MemoryRepo as Books
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"

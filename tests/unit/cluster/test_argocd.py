@@ -14,8 +14,7 @@ from demandops.cluster.health import (
     health_reader,
 )
 
-from tests.unit.cluster.commits import Letters
-from tests.unit.cluster.test_flux import condition, deployment
+from tests.kit.cluster import Letters, condition, deployment
 
 URL = "https://git.example/fleet.git"
 COMMITS = Letters()

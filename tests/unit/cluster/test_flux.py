@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from demandops.cluster.health import ClusterDomain, Health, Target, health_reader, worst
 
-from tests.unit.cluster.commits import Letters
+from tests.kit.cluster import Letters, condition, deployment
 
 COMMITS = Letters()
 PLACE = ClusterDomain("c-its", "perception", "ns")
@@ -15,11 +15,6 @@ SERVICE = Target(PLACE, "od-edge", by_helm=True)
 CLIENT = Target(PLACE, "mqtt-a", by_helm=False)
 GONE = Target(PLACE, "od-edge", by_helm=True, wanted=False)
 FLUX = health_reader(PLACE)
-
-
-def condition(kind: str, status: str, message: str = "") -> dict[str, str]:
-    at = "2026-05-04T12:00:00Z"
-    return {"type": kind, "status": status, "message": message, "lastTransitionTime": at}
 
 
 def kustomization(applied: str = "", attempted: str = "", *conditions: Any) -> dict[str, Any]:
@@ -32,14 +27,6 @@ def kustomization(applied: str = "", attempted: str = "", *conditions: Any) -> d
 def release(*conditions: Any, generation: int = 2, observed: int = 2) -> dict[str, Any]:
     status = {"observedGeneration": observed, "conditions": list(conditions)}
     return {"metadata": {"generation": generation}, "status": status}
-
-
-def deployment(name: str, *conditions: Any, of: str = "", **status: Any) -> dict[str, Any]:
-    labels = {"helm.toolkit.fluxcd.io/name": of} if of else {}
-    metadata = {"name": name, "namespace": "ns", "generation": 3, "labels": labels}
-    whole = {"observedGeneration": 3, "updatedReplicas": 2, "availableReplicas": 2}
-    found = whole | status | {"conditions": list(conditions)}
-    return {"metadata": metadata, "spec": {"replicas": 2}, "status": found}
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from demandops.cluster.access import ClusterAccess
 from demandops.cluster.health import ClusterDomain, Target
 from demandops.cluster.rollout_watcher import RolloutWatcher
 
-from tests.unit.cluster.commits import Letters
+from tests.kit.cluster import Letters
 
 KUBECONFIG = """
 apiVersion: v1

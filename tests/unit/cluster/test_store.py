@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 from demandops.cluster.access import ClusterAccess
 from demandops.cluster.health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
+
+from tests.kit.http import Answer, Call, kubeconfig, serving
 
 OVER = ObjectSelector("Application", "argocd", "demandops-perception")
 CHILDREN = ObjectSelector("Application", "perception")
@@ -30,42 +29,15 @@ class Api:
 
 @pytest.fixture
 def api(tmp_path: Path) -> Iterator[Api]:
-    found: list[Api] = []
+    def answer(call: Call) -> Answer:
+        api.asked.append(call.path)
+        item = {"metadata": {"name": "one", "resourceVersion": "1"}}
+        listed = {"metadata": {"resourceVersion": "1"}, "items": [item]}
+        return Answer.json(listed, 403 if api.refused in call.path else 200)
 
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            (api,) = found
-            api.asked.append(self.path)
-            self.send_response(403 if api.refused in self.path else 200)
-            self.send_header("Content-Type", "application/json")
-            self.end_headers()
-            item = {"metadata": {"name": "one", "resourceVersion": "1"}}
-            listed = {"metadata": {"resourceVersion": "1"}, "items": [item]}
-            self.wfile.write(json.dumps(listed).encode())
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Say nothing."""
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    config = {
-        "apiVersion": "v1",
-        "kind": "Config",
-        "current-context": "c",
-        "clusters": [
-            {"name": "c", "cluster": {"server": f"http://127.0.0.1:{server.server_port}"}}
-        ],
-        "users": [{"name": "u", "user": {}}],
-        "contexts": [{"name": "c", "context": {"cluster": "c", "user": "u"}}],
-    }
-    kubeconfig = tmp_path / "kubeconfig"
-    kubeconfig.write_text(json.dumps(config))
-    found.append(Api(ClusterAccess(kubeconfig=kubeconfig)))
-    yield found[0]
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with serving(answer) as server:
+        api = Api(ClusterAccess(kubeconfig=kubeconfig(tmp_path, server.url)))
+        yield api
 
 
 def store(api: Api) -> ObjectCache:

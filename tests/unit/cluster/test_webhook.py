@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import subprocess
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from email.message import Message
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -18,6 +16,7 @@ from demandops.cluster.reconcile_trigger import ReconcileTrigger
 from demandops.errors import InvalidInput
 
 from tests.golden.cases import start
+from tests.kit.http import Answer, Call, serving
 
 SECRET = "It's a Secret to Everybody"  # noqa: S105 - of an example
 
@@ -30,31 +29,17 @@ class Heard:
     calls: list[tuple[Message, bytes]] = field(default_factory=list)
     status: int = 200
 
+    def answer(self, call: Call) -> Answer:
+        self.calls.append((call.headers, call.body))
+        return Answer(self.status, headers={"Location": "/elsewhere"})
+
 
 @pytest.fixture
 def hook() -> Iterator[Heard]:
     heard = Heard()
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            heard.calls.append((self.headers, self.rfile.read(int(self.headers["Content-Length"]))))
-            self.send_response(heard.status)
-            self.send_header("Location", "/elsewhere")
-            self.end_headers()
-
-        do_GET = do_POST
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Say nothing."""
-
-    server = HTTPServer(("127.0.0.1", 0), Handler)
-    heard.url = f"http://127.0.0.1:{server.server_port}/hook"
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield heard
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with serving(heard.answer) as server:
+        heard.url = f"{server.url}/hook"
+        yield heard
 
 
 @pytest.fixture

@@ -2,64 +2,37 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import Any
 
 import pytest
-import yaml
-from asking import NOW, Books, configuration, connection, goal, skeleton
-from demandops.config.load import load
 from demandops.decision import State
 from demandops.demand.demand_request import ConnectionType
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 
-from tests import demanding
-
-IMAGES = "registry/images.yaml"
-ZENOH_IMAGE = "  zenoh-bridge: {repository: docker.io/eclipse/zenoh-bridge-ros2dds, tag: 1.10.0}\n"
-ROS_IMAGE = "  dds-router: {repository: registry.example/dds-router, tag: v3.5.0}\n"
-NO_BROKERS = yaml.safe_dump({"apiVersion": "demandops/v1", "kind": "Brokers", "brokers": []})
-
-
-def state(
-    images: str = ZENOH_IMAGE + ROS_IMAGE, *, brokers: bool = True, **nodes: dict[str, Any]
-) -> State:
-    """Return a state repo in which some nodes of the skeleton have more to say."""
-    inventory = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
-    for node in inventory["nodes"]:
-        node.update(deepcopy(nodes.get(node["id"], {})))
-    changed = {
-        "inventory/nodes.yaml": yaml.safe_dump(inventory),
-        IMAGES: skeleton()[IMAGES] + images,
-    }
-    if not brokers:
-        changed["inventory/brokers.yaml"] = NO_BROKERS
-    return State.of(load(configuration(changed)), Ledger())
-
-
-def demand(kind: str = "auto", topics: Any = None, **more: Any) -> dict[str, Any]:
-    topics = {"/a": "/a"} if topics is None else topics
-    item = {"id": "c", "type": kind, "source": "vehicle00", "target": "edge", "topics": topics}
-    return {"connections": [item | more]}
+from tests.kit.carriers import (
+    REACHABLE,
+    SPEAKS,
+    TYPED,
+    WAN,
+    decided,
+    demand,
+    state,
+)
+from tests.kit.goals import connection, goal
+from tests.kit.memory import MemoryRepo as Books
 
 
 def carried(before: State, asked: dict[str, Any]) -> ConnectionType:
-    after, _ = demanding.decide(before, asked, NOW, lambda path: None)
+    after = decided(before, asked)
     (claim,) = after.ledger.connection_claims("c")
     return claim.type
 
 
 def faults(before: State, asked: dict[str, Any]) -> list[str]:
     with pytest.raises(Refused) as refused:
-        demanding.decide(before, asked, NOW, lambda path: None)
+        decided(before, asked)
     return [f"{one.field}: {one.message}" for one in refused.value.faults]
-
-
-REACHABLE = {"zenoh": {"endpoint": "tcp/edge:7447"}}
-SPEAKS: dict[str, Any] = {"zenoh": {}}
-WAN = {"wan": {"host": "192.0.2.1"}}
-TYPED: dict[str, Any] = {"types": {"/a": "std_msgs/msg/String"}}
 
 
 class TestAutomaticChoice:
@@ -104,17 +77,17 @@ class TestAutomaticChoice:
 
     def test_what_stands_keeps_its_type(self) -> None:
         before = state(vehicle00=SPEAKS, edge=REACHABLE)
-        after, _ = demanding.decide(before, demand("mqtt"), NOW, lambda path: None)
+        after = decided(before, demand("mqtt"))
         again = demand(requesters=["vehicle01"])
-        after, _ = demanding.decide(after, again, NOW, lambda path: None)
+        after = decided(after, again)
         assert {claim.type for claim in after.ledger.connection_claims("c")} == {
             ConnectionType.MQTT
         }
 
     def test_a_shutdown_without_a_type_means_what_stands(self) -> None:
         before = state(vehicle00=SPEAKS, edge=REACHABLE)
-        after, _ = demanding.decide(before, demand("mqtt"), NOW, lambda path: None)
-        after, _ = demanding.decide(after, demand() | {"shutdown": True}, NOW, lambda path: None)
+        after = decided(before, demand("mqtt"))
+        after = decided(after, demand() | {"shutdown": True})
         assert after.ledger == Ledger()
 
     def test_the_wire_cannot_ask_for_it(self) -> None:
@@ -195,7 +168,7 @@ class TestZenoh:
     def test_one_topic_has_one_rate_on_a_node(self) -> None:
         before = state(vehicle00=SPEAKS, edge=REACHABLE, cloud={"zenoh": {"endpoint": "tcp/c:1"}})
         asked = demand("zenoh", {"/a": {"rate": 5}})
-        before, _ = demanding.decide(before, asked, NOW, lambda path: None)
+        before = decided(before, asked)
         other = demand("zenoh", {"/a": {"rate": 2}}, id="d", target="cloud")
         assert faults(before, other) == [
             "connections: rate 2.0 of '/a' in 'd' contradicts an existing claim: 'c' carries it "
@@ -236,7 +209,7 @@ class TestRos:
     def test_two_connections_on_one_port(self) -> None:
         narrow = {"wan": {"host": "192.0.2.1", "firstPort": 20000, "lastPort": 20000}}
         before = state(vehicle00=TYPED, edge=narrow)
-        before, _ = demanding.decide(before, demand("ros"), NOW, lambda path: None)
+        before = decided(before, demand("ros"))
         assert faults(before, demand("ros", id="d")) == [
             "connections: connection 'd' would listen on port 20000 of 'edge', as 'c' does; use "
             "another connection id, or widen firstPort and lastPort of its wan"

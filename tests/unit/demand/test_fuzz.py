@@ -7,13 +7,17 @@ from typing import Any
 from unicodedata import category
 
 import yaml
-from asking import APP, CLOUD, FAST, NOW, Books, application, connection, goal
 from demandops.decision import Decision, decide
 from demandops.demand import deployment_request_goal
 from demandops.errors import Fault, InvalidInput, Refused
 from demandops.staterepo.history import commit_message
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
+
+from tests.kit.config import FAST
+from tests.kit.goals import APP, CLOUD, application, connection, goal
+from tests.kit.memory import NOW
+from tests.kit.memory import MemoryRepo as Books
 
 FEW = settings(
     max_examples=100,

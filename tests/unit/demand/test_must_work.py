@@ -8,18 +8,10 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import (
-    CLOUD,
-    EGO,
-    FAST,
-    STATION_CLOUD,
-    Books,
-    application,
-    brokers,
-    connection,
-    goal,
-    perception,
-)
+
+from tests.kit.config import FAST, brokers
+from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal, perception
+from tests.kit.memory import MemoryRepo as Books
 
 LABEL = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
 ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")

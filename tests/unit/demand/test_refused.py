@@ -5,20 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from asking import (
+
+from tests.kit.config import brokers
+from tests.kit.goals import (
     APP,
     BODY,
     CLOUD,
     EGO,
     ROS_NAMES,
-    Books,
     Goal,
     application,
-    brokers,
     connection,
     goal,
     perception,
 )
+from tests.kit.memory import MemoryRepo as Books
 
 NODES = "cloud, edge, station00, vehicle00, vehicle01, vehicle02, vehicle03"
 TYPES = "known: 0 (ROS), 1 (MQTT), 2 (ZENOH)"

@@ -6,8 +6,11 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import APP, Books, application, connection, edited, goal, perception, skeleton
 from demandops.demand.lease import UNSTARTED
+
+from tests.kit.config import edited, skeleton
+from tests.kit.goals import APP, application, connection, goal, perception
+from tests.kit.memory import MemoryRepo as Books
 
 POLICY = "policy/access-domains.yaml"
 DOMAIN = "access domain 'perception'"
@@ -116,10 +119,11 @@ def test_dropping_renewing_and_releasing_need_none() -> None:
 
 
 def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
-    from asking import NOW
     from demandops.decision import decide
     from demandops.demand.approval_rule import with_leases_from_approval
     from demandops.ledger import claim_file
+
+    from tests.kit.memory import NOW
 
     books = Books(policy(approval="required"))
     decision = decide(books.state, put(lease=60), NOW, books.files.get)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from asking import BODY, Books, application, connection, goal, perception
+
+from tests.kit.goals import BODY, application, connection, goal, perception
+from tests.kit.memory import MemoryRepo as Books
 
 WRONG: dict[str, tuple[object, list[str]]] = {
     "no mapping": ([], [": a request is a mapping with id, apps, connections and shutdown"]),

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from threading import Thread
 
 import pytest
 from demandops.config.load import load
 from demandops.config.repo_settings import Proposals
 from demandops.errors import InvalidInput
 from demandops.forge import Forge, ForgeError, PullRequest, forge_for
-from replaying import TOKEN, Replay, replaying
+
+from tests.kit.http import serving
+from tests.unit.forge.replaying import TOKEN, Replay, replaying
 
 BRANCH = "demand/one-0123456789ab"
 LINKS = {
@@ -92,31 +92,14 @@ def test_a_refusal_is_told_in_the_forges_words_without_the_token(kind: str, toke
     assert TOKEN not in str(error.value)
 
 
-class _Elsewhere(BaseHTTPRequestHandler):
-    came: list[str] = []  # noqa: RUF012 - shared on purpose
-
-    def do_GET(self) -> None:
-        self.came.append(str(self.headers))
-        self.send_response(200)
-        self.end_headers()
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Keep quiet."""
-
-
 def test_the_token_follows_no_redirect(kind: str, token: Path) -> None:
-    server = HTTPServer(("127.0.0.1", 0), _Elsewhere)
-    thread = Thread(target=server.serve_forever, args=(0.02,), daemon=True)
-    thread.start()
-    try:
-        there = f"http://127.0.0.1:{server.server_port}"
-        with forge(kind, "moved", token, elsewhere=there) as (made, _), pytest.raises(ForgeError):
-            made.find(BRANCH, "main")
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
-    assert _Elsewhere.came == []
+    with (
+        serving() as there,
+        forge(kind, "moved", token, elsewhere=there.url) as (made, _),
+        pytest.raises(ForgeError),
+    ):
+        made.find(BRANCH, "main")
+    assert there.calls == []
 
 
 def test_a_forge_that_is_away_is_told(kind: str, token: Path) -> None:

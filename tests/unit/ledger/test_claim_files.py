@@ -20,7 +20,8 @@ from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from hypothesis import given
 from hypothesis import strategies as st
-from trying import examples
+
+from tests.kit.chance import examples
 
 TRICKY = [
     *("null", "~", "yes", "on", "1", "1e3", "0x1f", "1_000", "12:30:45", "2026-01-31", ".inf"),

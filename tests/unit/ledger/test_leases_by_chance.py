@@ -22,9 +22,9 @@ from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from hypothesis import given, note
 from hypothesis import strategies as st
-from model.leases import BY_MESSAGE, Goal, Promises, Subject
-from trying import chances, examples
 
+from tests.kit.chance import chances, examples
+from tests.model.leases import BY_MESSAGE, Goal, Promises, Subject
 from tests.scenarios import running
 
 SLACK_S = 30

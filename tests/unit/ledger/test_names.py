@@ -14,9 +14,10 @@ from demandops.demand.demand_request import id_problem
 from demandops.plan import naming
 from hypothesis import given
 from hypothesis import strategies as st
-from inmemory import Repo
-from model.goals import goal
-from trying import examples, told
+
+from tests.kit.chance import examples, told
+from tests.kit.memory import MemoryRepo as Repo
+from tests.model.goals import goal
 
 DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
 ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")

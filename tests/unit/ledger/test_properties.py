@@ -17,9 +17,12 @@ from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from hypothesis import assume, given, note
 from hypothesis import strategies as st
-from inmemory import NOW, Repo, outcome
-from model.books import Books, Demand, Goal
-from model.goals import (
+
+from tests.kit.chance import TIMES, chances, examples, told
+from tests.kit.memory import NOW, outcome
+from tests.kit.memory import MemoryRepo as Repo
+from tests.model.books import Books, Demand, Goal
+from tests.model.goals import (
     SKELETON,
     STATION_CLOUD,
     VEHICLE_CLOUD,
@@ -31,7 +34,6 @@ from model.goals import (
     shutdown_of,
     summary,
 )
-from trying import TIMES, chances, examples, told
 
 
 def demand_in(claim: Claim) -> tuple[str, str, Demand]:

@@ -17,8 +17,10 @@ from demandops.demand.lease import Lease
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.restoration import Restoration
-from inmemory import NOW, Repo
-from model.goals import Maker
+
+from tests.kit.memory import NOW
+from tests.kit.memory import MemoryRepo as Repo
+from tests.model.goals import Maker
 
 LATER = NOW + timedelta(hours=3)
 

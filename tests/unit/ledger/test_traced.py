@@ -14,9 +14,10 @@ from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys
 from hypothesis import given
 from hypothesis import strategies as st
-from inmemory import Repo
-from model.goals import Maker
-from trying import TIMES, chances, examples, told
+
+from tests.kit.chance import TIMES, chances, examples, told
+from tests.kit.memory import MemoryRepo as Repo
+from tests.model.goals import Maker
 
 
 def afresh(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release]:

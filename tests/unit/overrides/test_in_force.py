@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import CLOUD, EGO, NOW, STATION_CLOUD, Books, application, connection, goal
 from demandops.decision import decide, rendered_files
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest, Operation
@@ -20,6 +19,10 @@ from demandops.errors import InvalidInput, Refused
 from demandops.plan.views.bookkeeping import bookkeeping
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal
+from tests.kit.memory import NOW
+from tests.kit.memory import MemoryRepo as Books
 
 HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
 

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import configuration
 from demandops.config.load import load
 from demandops.errors import InvalidInput
+
+from tests.kit.config import configuration
 
 SOUND: dict[str, Any] = {
     "apiVersion": "demandops/v1",

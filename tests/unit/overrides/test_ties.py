@@ -9,7 +9,6 @@ from functools import lru_cache
 from itertools import product
 from typing import Any
 
-from asking import configuration
 from demandops.config.config import Config
 from demandops.config.load import load
 from demandops.config.override import Override, OverrideFile, Selector, merge_patch
@@ -26,6 +25,8 @@ from demandops.plan.overrides.selectors import Traits, fits
 from demandops.plan.release import ServiceRelease
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+
+from tests.kit.config import configuration
 
 TEXTS = ["".join(chars) for size in range(6) for chars in product("ab", repeat=size)]
 pattern = st.text("ab*?", min_size=1, max_size=4)

@@ -5,19 +5,14 @@ from __future__ import annotations
 import json
 import random
 import re
-import sys
 from dataclasses import replace
-from pathlib import Path
+from datetime import datetime
 from typing import Any, ClassVar
 
 import pytest
 import yaml
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "demand"))
-
-from asking import NOW, skeleton
 from demandops.config.load import load
-from demandops.decision import State, rendered_files
+from demandops.decision import Decision, State, rendered_files
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.route import Route
 from demandops.errors import InvalidInput, Refused
@@ -26,27 +21,23 @@ from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connections import client_schema
 from demandops.render.connections.ros import dds_type
-from test_carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, state
 
-from tests import demanding
+from tests.kit.carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
+from tests.kit.config import skeleton
+from tests.kit.memory import MemoryRepo
 
 
-class World:
+class World(MemoryRepo):
     """A state repo in memory that demands with options are sent to."""
 
     def __init__(self, before: State) -> None:
-        self.state = before
-        self.files: dict[str, str] = dict(rendered_files(before))
+        super().__init__(state=before)
         self.releases: tuple[ReleaseChange, ...] = ()
 
-    def send(self, asked: dict[str, Any]) -> None:
-        self.state, made = demanding.decide(self.state, asked, NOW, self.files.get)
-        self.releases = made.releases
-        for path, text in made.files.items():
-            if text is None:
-                del self.files[path]
-            else:
-                self.files[path] = text
+    def send(self, asked: Any, now: datetime | None = None) -> Decision:
+        decision = super().send(routes(asked), now)
+        self.releases = decision.releases
+        return decision
 
     def clients(self) -> dict[str, Any]:
         """Return the configuration of each client by its name."""

@@ -9,21 +9,13 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
-from asking import (
-    CLOUD,
-    EGO,
-    FAST,
-    STATION_CLOUD,
-    Books,
-    application,
-    connection,
-    edited,
-    goal,
-    perception,
-)
 from demandops.decision import rendered_files
 from demandops.errors import InvalidInput
 from demandops.render.output_check import check_files
+
+from tests.kit.config import FAST, edited
+from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal, perception
+from tests.kit.memory import MemoryRepo as Books
 
 EXPERIMENT = sorted((Path(__file__).parents[3] / "examples" / "experiment").glob("*.yaml"))
 BUILT_IN = {"v1", "apps/v1", "rbac.authorization.k8s.io/v1"}

@@ -7,9 +7,11 @@ import re
 from pathlib import Path
 
 import yaml
-from asking import Books, skeleton
 from demandops.demand import transport_choice
 from demandops.demand.route import RouteOptions
+
+from tests.kit.config import skeleton
+from tests.kit.memory import MemoryRepo as Books
 
 PAGE = (Path(__file__).parents[3] / "docs" / "connections.md").read_text()
 

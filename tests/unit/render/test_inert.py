@@ -12,8 +12,11 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import Books, application, connection, goal, skeleton
 from demandops import strict_yaml
+
+from tests.kit.config import skeleton
+from tests.kit.goals import application, connection, goal
+from tests.kit.memory import MemoryRepo as Books
 
 NODES = "inventory/nodes.yaml"
 

@@ -7,7 +7,10 @@ from typing import Any
 
 import pytest
 import yaml
-from asking import Books, brokers, connection, goal
+
+from tests.kit.config import brokers
+from tests.kit.goals import connection, goal
+from tests.kit.memory import MemoryRepo as Books
 
 TOPIC_KEYS = {
     "ros2mqtt": {"mqtt_topic", "primitive", "json", "ros_type", "inject_timestamp", "advanced"},

@@ -8,7 +8,8 @@ from demandops.cluster.health import ObjectName
 from demandops.decision import decide
 from demandops.service import rollout_targets
 
-from tests.golden.cases import NOW, requests_of, start
+from tests.golden.cases import requests_of, start
+from tests.kit.memory import NOW
 
 
 @pytest.mark.parametrize(

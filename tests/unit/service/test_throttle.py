@@ -5,22 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 
-from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.config import Config
 from demandops.config.load import load
 from demandops.demand.demand_request import ApplicationDemand, DemandRequest, Operation
 from demandops.service.timing.rate_limit import RateLimit
-from demandops.staterepo import new_repo
+
+from tests.kit.config import configuration, edited
 
 START = datetime(2026, 3, 1, 12, 0, tzinfo=timezone.utc)
 
 
 def limited(most: int) -> Config:
-    files = {p: t for p, t in new_repo.files().items() if p.split("/")[0] in CONFIG_ROOTS}
-    domains = files["policy/access-domains.yaml"]
-    files["policy/access-domains.yaml"] = domains.replace(
-        "    namespace:", f"    quotas: {{demandsPerMinute: {most}}}\n    namespace:", 1
-    )
-    return load(files)
+    quotas = f"    quotas: {{demandsPerMinute: {most}}}\n    namespace:"
+    return load(configuration(edited("policy/access-domains.yaml", "    namespace:", quotas)))
 
 
 def request(requester: str) -> DemandRequest:

@@ -54,7 +54,7 @@ def test_a_join_says_what_starts_for_whom_and_what_is_missing(desk: Any) -> None
 
 def test_a_further_requester_changes_nothing_that_runs(desk: Any) -> None:
     desk.join("vehicle00")
-    desk.decide({"id": "link", "connections": [CONNECTION]})
+    desk.send({"id": "link", "connections": [CONNECTION]})
     text = commit_message.of_decision(desk.join("vehicle01"), "op-2", desk.now)
     assert text == (
         "Join edge/fusion\n"
@@ -103,7 +103,7 @@ def test_a_release_says_what_stops_and_what_was_not_held(desk: Any) -> None:
         ],
         "connections": [CONNECTION],
     }
-    text = commit_message.of_decision(desk.decide(goal), "op-3", desk.now)
+    text = commit_message.of_decision(desk.send(goal), "op-3", desk.now)
     assert text == (
         "Release edge/fusion\n"
         "\n"

@@ -62,11 +62,7 @@ def changed(files: Files, change: Mapping[str, str | None]) -> Files:
 @contextmanager
 def scratch() -> Iterator[pygit2.Repository]:
     with tempfile.TemporaryDirectory() as folder:
-        pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)
-        try:
-            yield pygit2.init_repository(folder, bare=True)
-        finally:
-            pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
+        yield pygit2.init_repository(folder, bare=True)
 
 
 def read(repo: pygit2.Repository, tree: pygit2.Oid) -> Files:

@@ -12,8 +12,9 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+
+from tests.kit.http import Handler, listening
 
 _LOCK = threading.Lock()
 
@@ -55,39 +56,23 @@ class Server:
 @contextmanager
 def serving(root: Path, prefix: str = "") -> Iterator[Server]:
     """Serve the bare repositories below ``root`` at ``<url>/<name>``."""
-    http = ThreadingHTTPServer(("127.0.0.1", 0), _Handler)
-    http.daemon_threads = True
-    server = Server(f"http://127.0.0.1:{http.server_port}{prefix}")
-    _Handler.servers[http.server_port] = (server, root, prefix)
-    thread = threading.Thread(target=http.serve_forever, args=(0.05,), daemon=True)
-    thread.start()
-    try:
+    server = Server("")
+
+    class Serving(_Handler):
+        context = server, root, prefix
+
+    with listening(Serving) as url:
+        server.url = f"{url}{prefix}"
         yield server
-    finally:
-        http.shutdown()
-        http.server_close()
-        thread.join()
-        del _Handler.servers[http.server_port]
 
 
-class _Handler(BaseHTTPRequestHandler):
-    servers: dict[int, tuple[Server, Path, str]] = {}  # noqa: RUF012 - shared on purpose
+class _Handler(Handler):
+    context: tuple[Server, Path, str]
     protocol_version = "HTTP/1.1"
-
-    def do_GET(self) -> None:
-        self._serve()
-
-    def do_POST(self) -> None:
-        self._serve()
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Keep quiet."""
 
     def _serve(self) -> None:
         self.close_connection = True
-        assert isinstance(self.server, ThreadingHTTPServer)
-        port = self.server.server_port
-        server, root, prefix = self.servers[port]
+        server, root, prefix = self.context
         faults = server.faults
         if faults.hang is not None:
             faults.hang.wait(60)
@@ -117,6 +102,8 @@ class _Handler(BaseHTTPRequestHandler):
                 return
         if not self._cut(server):
             self._relay(answer)
+
+    do_GET = do_POST = _serve
 
     def _cut(self, server: Server) -> bool:
         with _LOCK:

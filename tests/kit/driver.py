@@ -26,6 +26,8 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 from demandops.staterepo.write.journal import Journal
 from demandops.staterepo.write.proposal_branch import ProposalBranches
 
+from tests.kit import sync
+
 Demand = dict[str, Any]
 
 
@@ -161,6 +163,7 @@ def tell_answer(name: str, future: Future[Receipt]) -> None:
 
 
 def run(plan: dict[str, Any]) -> None:
+    sync.force(plan["synced"])
     arm(plan["die_at"])
     generator = Generator(plan["address"])
     tell(ready=os.getpid())

@@ -1,4 +1,4 @@
-"""How Hypothesis tries examples here: the same ones every time, so that no build fails by chance.
+"""Settings of Hypothesis: the same examples every time, so that no build fails by chance.
 
 ``DEMANDOPS_EXAMPLES=20`` tries twenty times as many, and others each time.
 """
@@ -12,8 +12,9 @@ from typing import Any
 
 from hypothesis import HealthCheck, Phase, note, settings
 from hypothesis import strategies as st
-from model.books import Goal
-from model.goals import summary
+
+from tests.model.books import Goal
+from tests.model.goals import summary
 
 TIMES = int(os.environ.get("DEMANDOPS_EXAMPLES", "1"))
 

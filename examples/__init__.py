@@ -1,0 +1,1 @@
+"""What people can run to see DemandOps work."""

@@ -1,0 +1,189 @@
+"""Fixtures of general use. No test touches the data folder or the Git set-up of its user."""
+
+from __future__ import annotations
+
+import faulthandler
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+
+import pytest
+import yaml
+from demandops.service import Generator
+
+from tests.kit import repo, sync
+from tests.kit.cli import Ran, Run, runner
+from tests.kit.generator import running
+from tests.kit.processes import Drivers
+from tests.kit.repo import GitRepo, Person
+
+_LIMIT_S = 30.0
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers", f"limit(seconds): fail the test when it takes longer (default {_LIMIT_S:.0f})"
+    )
+    config.addinivalue_line("markers", "synced: force writes to disk, as the program does")
+    sync.force(False)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep journals, clones and git away from the set-up of this machine's user."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path_factory.mktemp("home")))
+        patch.delenv("DEMANDOPS_STATE_REPO", raising=False)
+        for name, value in repo.NO_GIT_CONFIG.items():
+            patch.setenv(name, value)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keep the journals and clones of a test in a folder of its own."""
+    home = tmp_path / "home"
+    monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(home))
+    return home
+
+
+@pytest.fixture(autouse=True)
+def synced(request: pytest.FixtureRequest) -> bool:
+    """Force writes to disk in tests marked so, and in no others; tell which this is."""
+    on = request.node.get_closest_marker("synced") is not None
+    sync.force(on)
+    return on
+
+
+@pytest.fixture
+def git_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commit as Petra."""
+    for name, value in repo.GIT_ENVIRONMENT.items():
+        monkeypatch.setenv(name, value)
+
+
+@pytest.fixture
+def limited(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Turn a deadlock into a failure, with the stack of every thread."""
+    marker = request.node.get_closest_marker("limit")
+    seconds = float(marker.args[0]) if marker else _LIMIT_S
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        faulthandler.dump_traceback(file=2)
+        raise TimeoutError(f"the test has not ended after {seconds:.0f} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+# ---- state repos ----
+
+
+@pytest.fixture(scope="session")
+def bare_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bare state repo as ``demandops init`` makes it; copy it, never write to it."""
+    return repo.init(tmp_path_factory.mktemp("template") / "state.git")
+
+
+@pytest.fixture
+def new_repo(bare_template: Path, tmp_path: Path, synced: bool) -> Callable[[str], Path]:
+    """Make bare state repos by name."""
+
+    def make(name: str) -> Path:
+        made = Path(shutil.copytree(bare_template, tmp_path / name))
+        sync.force_in(made, synced)
+        return made
+
+    return make
+
+
+@pytest.fixture
+def bare(new_repo: Callable[[str], Path]) -> Path:
+    """A bare state repo."""
+    return new_repo("state.git")
+
+
+@pytest.fixture
+def state(bare: Path) -> GitRepo:
+    """The same state repo, to look into."""
+    return GitRepo(bare)
+
+
+@pytest.fixture(params=["embedded", "file-url"])
+def address(request: pytest.FixtureRequest, bare: Path) -> str:
+    """The same state repo, used in place and as a remote."""
+    return str(bare) if request.param == "embedded" else bare.as_uri()
+
+
+@pytest.fixture
+def url(bare: Path) -> str:
+    """The same state repo as a remote that is cloned, fetched and pushed to."""
+    return bare.as_uri()
+
+
+@pytest.fixture
+def person(bare: Path, tmp_path: Path) -> Person:
+    """A person with a clone of the same state repo."""
+    return Person(bare, tmp_path / "person")
+
+
+@pytest.fixture(scope="session")
+def _checkout_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return repo.init(tmp_path_factory.mktemp("template") / "state-repo", bare=False)
+
+
+@pytest.fixture
+def checkout(_checkout_template: Path, tmp_path: Path) -> Path:
+    """A state repo with a working tree."""
+    return Path(shutil.copytree(_checkout_template, tmp_path / "state-repo"))
+
+
+# ---- the program ----
+
+
+@pytest.fixture
+def generator(bare: Path) -> Iterator[Generator]:
+    """A generator that uses the state repo in place."""
+    with running(bare) as started:
+        yield started
+
+
+@pytest.fixture
+def demandops(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run a command in this process."""
+    return runner(capsys, monkeypatch)
+
+
+@pytest.fixture
+def request_json(demandops: Run, state: GitRepo) -> Callable[..., Ran]:
+    """Send goals through ``demandops request --output json``."""
+
+    def send(*goals: object, more: tuple[str, ...] = ()) -> Ran:
+        text = yaml.safe_dump_all(goals, sort_keys=False, allow_unicode=True)
+        return demandops(
+            "request", "-", "--state-repo", state.path, "--output", "json", *more, stdin=text
+        )
+
+    return send
+
+
+@pytest.fixture(scope="session")
+def _all_drivers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drivers]:
+    drivers = Drivers(tmp_path_factory.mktemp("drivers"))
+    yield drivers
+    drivers.close()
+
+
+@pytest.fixture
+def drivers(_all_drivers: Drivers, git_environment: None, synced: bool) -> Iterator[Drivers]:
+    """Start generators in processes of their own; those left running are killed at the end."""
+    _all_drivers.synced = synced
+    yield _all_drivers
+    _all_drivers.kill_runs()

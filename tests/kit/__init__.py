@@ -1,0 +1,1 @@
+"""What all tests share: goals, configuration, repos, the command line, generators, HTTP, ROS."""

@@ -1,0 +1,49 @@
+"""Configuration of a state repo: the skeleton's files, whole or with some of them changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import yaml
+from demandops.config.config import CONFIG_ROOTS
+from demandops.staterepo import new_repo
+
+FAST: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@lru_cache(maxsize=1)
+def skeleton() -> Mapping[str, str]:
+    """Return every file of a new state repo."""
+    return new_repo.files()
+
+
+def configuration(changed: Mapping[str, str | None] | None = None) -> dict[str, str]:
+    """Return the skeleton's configuration, with files replaced or, for ``None``, left out."""
+    files: dict[str, str | None] = {
+        path: text for path, text in skeleton().items() if path.split("/")[0] in CONFIG_ROOTS
+    }
+    files |= changed or {}
+    return {path: text for path, text in files.items() if text is not None}
+
+
+def edited(path: str, old: str, new: str) -> dict[str, str]:
+    """Return one file of the skeleton with the first ``old`` in it replaced by ``new``."""
+    text = skeleton()[path]
+    assert old in text, f"{path} does not contain {old!r}"
+    return {path: text.replace(old, new, 1)}
+
+
+def brokers(*nodes: str) -> dict[str, str]:
+    """Return an ``inventory/brokers.yaml`` with a broker on each of ``nodes``."""
+    entries = [{"node": node, "host": f"broker-{node}"} for node in nodes]
+    head = {"apiVersion": "demandops/v1", "kind": "Brokers"}
+    return {"inventory/brokers.yaml": yaml.safe_dump(head | {"brokers": entries})}
+
+
+def override(*select: Mapping[str, Any], **fields: Any) -> str:
+    """Return the text of an override."""
+    head = {"apiVersion": "demandops/v1", "kind": "Override"}
+    why = {"reason": "a field test", "owner": "petra"}
+    return yaml.safe_dump(head | why | {"select": list(select)} | fields, sort_keys=False)

@@ -1,0 +1,102 @@
+"""A generator in this process, and what a client sees of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from demandops.service import Generator, Receipt, Ticket
+
+from tests.kit.goals import Goal
+
+PATIENCE_S = 15.0
+"""How long an answer that has to come may take."""
+
+
+@contextmanager
+def running(address: str | Path, **options: Any) -> Iterator[Generator]:
+    """A generator for the length of a block."""
+    generator = Generator(str(address), **options)
+    try:
+        yield generator
+    finally:
+        generator.close(timeout=5)
+
+
+def restart(address: str | Path) -> bool:
+    """Start a generator that takes up what others left, and stop it; tell whether all is out."""
+    return Generator(str(address)).close(timeout=PATIENCE_S)
+
+
+def receipt(ticket: Ticket, timeout: float = PATIENCE_S) -> Receipt:
+    return ticket.future.result(timeout)
+
+
+def book(generator: Generator, *goals: Goal) -> list[Receipt]:
+    """Book demands one after another."""
+    return [receipt(generator.submit(made)) for made in goals]
+
+
+class Gate:
+    """Holds the worker at a stage of one demand, so that what comes next comes while it is busy."""
+
+    def __init__(self, stage: str = "admitted") -> None:
+        self._stage = stage
+        self.reached = threading.Event()
+        self.open = threading.Event()
+
+    def __call__(self, stage: str, text: str) -> None:
+        if stage == self._stage:
+            self.reached.set()
+            self.open.wait(PATIENCE_S)
+
+
+@dataclass
+class Stages:
+    """A listener that remembers what it was told."""
+
+    told: list[tuple[str, str]] = field(default_factory=list)
+
+    def __call__(self, stage: str, text: str) -> None:
+        self.told.append((stage, text))
+
+    @property
+    def names(self) -> list[str]:
+        return [stage for stage, _ in self.told]
+
+
+def wait_until(true: Callable[[], object], what: str, timeout: float = PATIENCE_S) -> None:
+    end = time.monotonic() + timeout
+    while not true():
+        assert time.monotonic() < end, f"after {timeout:.0f} s still not so: {what}"
+        time.sleep(0.01)
+
+
+class Proposed:
+    """A demand handed in, and the branch that it waits on."""
+
+    def __init__(self, generator: Generator, made: Any, operation: str | None = None) -> None:
+        self.told: list[tuple[str, str]] = []
+        self._seen = threading.Event()
+        self.ticket: Ticket = generator.submit(made, operation, self._listen)
+
+    def _listen(self, stage: str, text: str) -> None:
+        self.told.append((stage, text))
+        if stage == "proposed":
+            self._seen.set()
+
+    @property
+    def branch(self) -> str:
+        if not self._seen.wait(PATIENCE_S):
+            raise AssertionError(f"never proposed: {self.told} {self.ticket.future}")
+        text = [text for stage, text in self.told if stage == "proposed"][-1]
+        assert text.startswith("awaiting approval: demand/")
+        return text.split()[2]
+
+    def outcome(self) -> str:
+        return receipt(self.ticket).outcome

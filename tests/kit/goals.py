@@ -1,0 +1,133 @@
+"""Goals of the reference's action and demands in their own format, as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+Goal = dict[str, Any]
+Item = dict[str, Any]
+
+Topic = tuple[str, str]
+"""Topic name and the node that publishes it."""
+
+APP = "edge/object_detection_fusion"
+CLOUD: Topic = ("/vehicles/vehicle00/drivers/lidar/pointcloud", "vehicle00")
+"""The usual point cloud of vehicle00 in the skeleton's inventory."""
+EGO: Topic = ("/vehicles/vehicle00/ego_data", "vehicle00")
+STATION_CLOUD: Topic = ("/stations/station00/pointcloud", "station00")
+
+BODY = "apps[0].object_detection_fusion_app"
+ROS_NAMES = (
+    "is not a topic name that ROS 2 allows; use letters, digits and '_' between single '/', no "
+    "part starting with a digit"
+)
+
+EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("*.yaml"))
+"""The files of the paper's eight demands, in order."""
+
+
+def application(
+    id: str = APP,
+    *,
+    node: str = "edge",
+    who: Sequence[str] = ("vehicle00",),
+    ego: Iterable[Topic] = (),
+    clouds: Iterable[Topic] = (CLOUD,),
+    type: int = 1,
+) -> Item:
+    """Return one application of a goal."""
+    return {
+        "header": {"id": id, "node_id": node},
+        "type": type,
+        "object_detection_fusion_app": {
+            "requester_ids": list(who),
+            "ego_data_topics": [_topic(topic) for topic in ego],
+            "pointcloud_topics": [_topic(topic) for topic in clouds],
+        },
+    }
+
+
+def _topic(topic: Topic) -> dict[str, str]:
+    return {"topic_name": topic[0], "source_node_id": topic[1]}
+
+
+def connection(
+    id: str = "vehicle00/edge",
+    *,
+    who: Sequence[str] = ("vehicle00",),
+    ends: tuple[str, str] = ("vehicle00", "edge"),
+    topics: Sequence[str] = (CLOUD[0],),
+    targets: Sequence[str] | None = None,
+    broker: str = "edge",
+    type: int = 1,
+) -> Item:
+    """Return one connection of a goal; target topics equal source topics unless given."""
+    return {
+        "id": id,
+        "broker_node_id": broker,
+        "requester_ids": list(who),
+        "source_node_id": ends[0],
+        "source_topics": list(topics),
+        "target_node_id": ends[1],
+        "target_topics": list(topics if targets is None else targets),
+        "type": type,
+    }
+
+
+def goal(
+    apps: Iterable[Item] = (),
+    connections: Iterable[Item] = (),
+    *,
+    id: str = "request",
+    shutdown: bool = False,
+) -> Goal:
+    """Return a goal."""
+    return {
+        "id": id,
+        "apps": list(apps),
+        "connections": list(connections),
+        "shutdown": shutdown,
+    }
+
+
+def perception(**changed: Any) -> Goal:
+    """Return a goal that is always accepted: perception on the edge, and its point cloud."""
+    return goal([application()], [connection()]) | changed
+
+
+def numbered(number: int, *, shutdown: bool = False, vehicle: int | None = None) -> Goal:
+    """Return demand ``number``: its own claims on a shared application and connection."""
+    name = f"vehicle{(number if vehicle is None else vehicle) % 4:02}"
+    who = [f"user{number}", "station00"]
+    ego = (f"/vehicles/{name}/ego_data", name)
+    app = application(f"edge/fusion-{number % 5}", who=who, ego=[ego], clouds=[STATION_CLOUD])
+    link = connection(f"{name}/edge", who=who, ends=(name, "edge"), topics=[ego[0]])
+    return goal([app], [link], id=f"demand-{number}", shutdown=shutdown)
+
+
+def leave(number: int) -> Goal:
+    """Return the shutdown of demand ``number``."""
+    return numbered(number, shutdown=True)
+
+
+def impossible() -> Goal:
+    """Return a demand that is always refused."""
+    made = numbered(0)
+    made["apps"][0]["header"]["node_id"] = "nowhere"
+    return made
+
+
+def link(number: int, **more: Any) -> Goal:
+    """Return a goal of one connection, all named by a number."""
+    item = connection(f"c{number}", who=[f"r{number}"], topics=[f"/t{number}"], broker="")
+    return goal([], [item | more], id=f"request{number}")
+
+
+def experiment(step: int) -> Goal:
+    """Return the demand of a step of the paper's experiment; the first step is 1."""
+    made: Goal = yaml.safe_load(EXPERIMENT[step - 1].read_text())
+    return made

@@ -1,0 +1,117 @@
+"""HTTP servers on the loopback."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from email.message import Message
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Call:
+    """A request that a server got."""
+
+    method: str
+    path: str
+    headers: Message
+    body: bytes
+
+    def json(self) -> Any:
+        return json.loads(self.body) if self.body else None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a server answers."""
+
+    status: int = 200
+    body: bytes = b""
+    headers: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def json(cls, data: object, status: int = 200, **headers: str) -> Answer:
+        return cls(
+            status, json.dumps(data).encode(), {"Content-Type": "application/json"} | headers
+        )
+
+
+@dataclass
+class Server:
+    """A running server: its URL, the calls so far, and how it answers the next ones."""
+
+    answer: Callable[[Call], Answer] = lambda call: Answer()
+    url: str = ""
+    calls: list[Call] = field(default_factory=list)
+
+    @property
+    def paths(self) -> list[str]:
+        return [call.path for call in self.calls]
+
+
+@contextmanager
+def listening(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
+    """Serve with a handler for the length of a block; gives the URL."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class Handler(BaseHTTPRequestHandler):
+    """A handler that logs nothing."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Log nothing."""
+
+
+@contextmanager
+def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
+    """Record calls and answer them, one at a time, for the length of a block."""
+    served = Server() if answer is None else Server(answer)
+    lock = threading.Lock()
+
+    class Recorder(Handler):
+        def _serve(self) -> None:
+            length = int(self.headers.get("Content-Length") or 0)
+            call = Call(self.command, self.path, self.headers, self.rfile.read(length))
+            with lock:
+                served.calls.append(call)
+                given = served.answer(call)
+            self.send_response(given.status)
+            for name, value in given.headers.items():
+                self.send_header(name, value)
+            self.send_header("Content-Length", str(len(given.body)))
+            self.end_headers()
+            self.wfile.write(given.body)
+
+        do_GET = do_POST = do_PUT = do_PATCH = do_DELETE = _serve
+
+    with listening(Recorder) as served.url:
+        yield served
+
+
+def kubeconfig(folder: Path, url: str) -> Path:
+    """Write a kubeconfig for an API server."""
+    config = {
+        "apiVersion": "v1",
+        "kind": "Config",
+        "current-context": "c",
+        "clusters": [{"name": "c", "cluster": {"server": url}}],
+        "users": [{"name": "u", "user": {}}],
+        "contexts": [{"name": "c", "context": {"cluster": "c", "user": "u"}}],
+    }
+    file = folder / "kubeconfig"
+    file.write_text(json.dumps(config))
+    return file

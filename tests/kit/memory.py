@@ -1,0 +1,154 @@
+"""A state repo in memory: goals are decided on it one after another, without Git."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping
+from datetime import datetime, timedelta, timezone
+from functools import lru_cache
+from typing import Any
+
+import yaml
+from demandops.config.config import Config
+from demandops.config.load import load
+from demandops.decision import Decision, State, decide, rendered_files
+from demandops.errors import Refused
+from demandops.ledger.ledger import Ledger
+from demandops.plan.views.bookkeeping import as_data, bookkeeping
+
+from tests.kit.config import FAST, configuration, skeleton
+from tests.kit.goals import Goal
+from tests.model.books import in_model_words, object_lists
+
+NOW = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
+
+
+@lru_cache(maxsize=1)
+def _unchanged() -> State:
+    return State.of(load(configuration()), Ledger())
+
+
+class MemoryRepo:
+    """A state repo in memory; each decision changes what the next one finds."""
+
+    def __init__(
+        self,
+        changed: Mapping[str, str | None] | None = None,
+        *,
+        state: State | None = None,
+        now: datetime = NOW,
+    ) -> None:
+        """Start from the skeleton with some files changed, or from a state."""
+        self.now = now
+        if state is not None:
+            self.state, self._initial = state, rendered_files(state)
+        elif not changed:
+            self.state, self._initial = _unchanged(), dict(skeleton())
+        else:
+            files = configuration(changed)
+            self.state = State.of(load(files), Ledger())
+            self._initial = files | rendered_files(self.state)
+        self.files = dict(self._initial)
+
+    def copy(self) -> MemoryRepo:
+        """Return a second repo with the same content."""
+        twin = copy.copy(self)
+        twin.files = dict(self.files)
+        return twin
+
+    @property
+    def config(self) -> Config:
+        """The configuration in effect."""
+        return self.state.config
+
+    def decide(self, goal: object, now: datetime | None = None) -> Decision:
+        """Decide a goal without changing the repo; raises :class:`Refused`."""
+        return decide(self.state, goal, now or self.now, self.files.get)
+
+    def send(self, goal: object, now: datetime | None = None) -> Decision:
+        """Decide a goal and commit the decision; raises :class:`Refused`."""
+        decision = self.decide(goal, now)
+        self.state = decision.state
+        for path, text in decision.files.items():
+            assert self.files.get(path) != text, f"written or removed without need: {path}"
+            if text is None:
+                del self.files[path]
+            else:
+                self.files[path] = text
+        return decision
+
+    def take(self, goal: object, now: datetime | None = None) -> Decision | Refused:
+        """Decide a goal and commit the decision, or return the refusal."""
+        before = dict(self.files), self.state
+        try:
+            return self.send(goal, now)
+        except Refused as refusal:
+            assert (self.files, self.state) == before, "a refused demand changed something"
+            return refusal
+
+    def take_all(self, goals: Iterable[Goal]) -> list[str]:
+        """Take goals a minute apart, and return the outcomes."""
+        return [
+            outcome(self.take(goal, self.now + timedelta(minutes=minute)))
+            for minute, goal in enumerate(goals)
+        ]
+
+    def faults(self, goal: object) -> list[str]:
+        """Return the faults of a goal that must be refused, each as ``field: message``."""
+        refusal = self.take(goal)
+        assert isinstance(refusal, Refused), f"not refused, but {refusal.outcome}"
+        return [f"{fault.field}: {fault.message}" for fault in refusal.faults]
+
+    def bookkeeping(self) -> dict[str, Any]:
+        """Return the bookkeeping as plain data, with an empty commit."""
+        return as_data(bookkeeping(self.state.ledger, self.state.config), "")
+
+    def books(self) -> dict[str, Any]:
+        """Return the services and connections of the bookkeeping."""
+        data = self.bookkeeping()
+        return {"services": data["services"], "connections": data["connections"]}
+
+    def view(self) -> dict[str, Any]:
+        """Return the bookkeeping in the words of ``tests/model``."""
+        return in_model_words(self.bookkeeping(), object_lists(self.below("clusters").values()))
+
+    def below(self, *roots: str) -> dict[str, str]:
+        """Return the files of some top folders, without READMEs."""
+        return {
+            path: text
+            for path, text in self.files.items()
+            if path.split("/")[0] in roots and not path.endswith("/README.md")
+        }
+
+    def rendered(self) -> dict[str, str]:
+        """Return the files below ``clusters/`` that demands brought."""
+        return {
+            path: text
+            for path, text in self.files.items()
+            if path.startswith("clusters/") and path not in self._initial
+        }
+
+    def objects(self, kind: str) -> dict[str, dict[str, Any]]:
+        """Return the objects of a kind that demands brought, by name."""
+        documents = [
+            document
+            for text in self.rendered().values()
+            for document in yaml.load_all(text, Loader=FAST)
+            if document["kind"] == kind
+        ]
+        named = {document["metadata"]["name"]: document for document in documents}
+        assert len(named) == len(documents), "two objects have one name"
+        return named
+
+
+def outcome(taken: Decision | Refused) -> str:
+    """Return the outcome of a goal in one word."""
+    return "refused" if isinstance(taken, Refused) else taken.outcome
+
+
+def books_after(goals: Iterable[Goal]) -> dict[str, Any]:
+    """Return the bookkeeping after ``goals`` are decided one by one."""
+    repo = MemoryRepo()
+    for goal in goals:
+        repo.send(goal)
+    return repo.bookkeeping()

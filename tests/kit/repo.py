@@ -1,0 +1,271 @@
+"""Real state repos: a bare one, a person with a clone, and what history says.
+
+History is read by git itself, so that no test trusts the generator's own reading of it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pygit2
+import yaml
+from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.staterepo import new_repo, reader
+from demandops.staterepo.load import snapshot as snapshots
+
+from tests.kit.memory import NOW
+
+NO_GIT_CONFIG = {
+    "GIT_CONFIG_GLOBAL": os.devnull,
+    "GIT_CONFIG_NOSYSTEM": "1",
+    "GIT_TERMINAL_PROMPT": "0",
+    "LC_ALL": "C.UTF-8",
+}
+GIT_ENVIRONMENT = NO_GIT_CONFIG | {
+    "GIT_AUTHOR_NAME": "Petra Platform",
+    "GIT_AUTHOR_EMAIL": "petra@example.org",
+    "GIT_COMMITTER_NAME": "Petra Platform",
+    "GIT_COMMITTER_EMAIL": "petra@example.org",
+}
+
+POLICY = "policy/access-domains.yaml"
+
+
+def init(path: Path, *, bare: bool = True) -> Path:
+    """Make a state repo, as ``demandops init`` does."""
+    new_repo.init(path, NOW, bare=bare, gitops="flux")
+    return path
+
+
+def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
+    """Run git in a folder and return its output without the last line break."""
+    done = subprocess.run(
+        ["git", "-C", os.fspath(folder).removeprefix("file://"), *args],
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+        env={**os.environ, **GIT_ENVIRONMENT},
+    )
+    assert not check or done.returncode == 0, f"git {' '.join(args)}: {done.stdout}{done.stderr}"
+    return done.stdout.removesuffix("\n")
+
+
+def _index(path: Path, revision: str) -> tuple[pygit2.Repository, pygit2.Index]:
+    repo, index = pygit2.Repository(str(path)), pygit2.Index()
+    index.read_tree(repo.revparse_single(revision).peel(pygit2.Tree))
+    return repo, index
+
+
+class GitRepo:
+    """A bare state repo of one test, read with pygit2 and not with the program."""
+
+    def __init__(self, path: Path) -> None:
+        """Open it."""
+        self.path = path
+
+    @property
+    def tip(self) -> str:
+        """The newest commit."""
+        return tip(self.path)
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def commits(self) -> list[str]:
+        """Return the messages of all commits, newest first."""
+        repo = pygit2.Repository(str(self.path))
+        return [commit.message for commit in repo.walk(self.tip)]
+
+    def files(self, under: str = "", revision: str = "main") -> dict[str, str]:
+        """Return path → text of every file at a commit, below one folder or all."""
+        repo, index = _index(self.path, revision)
+        return {e.path: repo[e.id].data.decode() for e in index if e.path.startswith(under)}
+
+    def manifests(self) -> dict[str, str]:
+        """Return what a GitOps controller reads."""
+        return {p: text for p, text in self.files("clusters/").items() if p.endswith(".yaml")}
+
+    def commit(self, changed: dict[str, str | None], text: str = "By hand\n") -> str:
+        """Commit as a person would, and return the commit."""
+        repo, index = _index(self.path, "main")
+        for path, new in changed.items():
+            if new is None:
+                index.remove(path)
+            else:
+                blob = repo.create_blob(new.encode())
+                index.add(pygit2.IndexEntry(path, blob, pygit2.enums.FileMode.BLOB))
+        who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
+        tree = index.write_tree(repo)
+        return str(repo.create_commit("refs/heads/main", who, who, text, tree, [self.tip]))
+
+
+class Person:
+    """A person who changes the state repo in a clone and pushes it."""
+
+    def __init__(self, remote: Path, folder: Path) -> None:
+        self.bare, self.folder = remote, folder
+        git(folder.parent, "clone", "--quiet", str(remote), str(folder))
+
+    def _git(self, *args: str) -> str:
+        return git(self.folder, *args)
+
+    def fetch(self) -> None:
+        self._git("fetch", "--quiet", "--prune", "origin")
+        self._git("reset", "--quiet", "--hard", "origin/main")
+
+    def read(self, path: str) -> str:
+        """Return a file of the newest main."""
+        self.fetch()
+        return (self.folder / path).read_text()
+
+    def change(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
+        """Commit ``files`` (``None``: remove) on the newest main and push it; return the commit."""
+        self.fetch()
+        for path, text in files.items():
+            target = self.folder / path
+            if text is None:
+                target.unlink()
+            else:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_text(text)
+        self._git("add", "--all")
+        self._git("commit", "--quiet", "--message", message)
+        self._push()
+        return self._git("rev-parse", "HEAD")
+
+    def edit(self, path: str, old: str, new: str) -> str:
+        """Replace text in a file; return the commit."""
+        text = self.read(path)
+        assert old in text, f"{path} does not hold {old!r}"
+        return self.change({path: text.replace(old, new)})
+
+    def policy(self, **changed: Any) -> None:
+        """Change every access domain."""
+        data = yaml.safe_load(self.read(POLICY))
+        for domain in data["domains"]:
+            domain.update(changed)
+        self.change({POLICY: yaml.safe_dump(data)}, "Demands need approval")
+
+    def merge(self, branch: str, *options: str) -> None:
+        self.fetch()
+        self._git("merge", "--quiet", *options, f"origin/{branch}")
+        self._push()
+
+    def squash(self, branch: str, message: str) -> None:
+        self.fetch()
+        self._git("merge", "--quiet", "--squash", f"origin/{branch}")
+        self._git("commit", "--quiet", "--message", message)
+        self._push()
+
+    def rebase(self, branch: str, *options: str) -> None:
+        self.fetch()
+        self._git("checkout", "--quiet", "-B", "work", f"origin/{branch}")
+        self._git("rebase", "--quiet", *options, "origin/main")
+        self._push()
+        self._git("checkout", "--quiet", "-")
+
+    def delete(self, branch: str) -> None:
+        self._git("push", "--quiet", "origin", f":{branch}")
+
+    def _push(self) -> None:
+        self._git("push", "--quiet", "origin", "HEAD:main")
+
+
+@dataclass(frozen=True)
+class Commit:
+    """A commit as git itself tells it."""
+
+    id: str
+    parents: tuple[str, ...]
+    summary: str
+    trailers: tuple[tuple[str, str], ...]
+
+    def one(self, key: str) -> str:
+        return next((value for known, value in self.trailers if known == key), "")
+
+
+_FORMAT = "%H%x1f%P%x1f%s%x1f%(trailers:only,unfold,separator=%x1e)%x1d"
+
+
+def commits(repo: Path, revisions: str = "main") -> list[Commit]:
+    """The commits behind the first one, oldest first."""
+    text = git(repo, "log", "--reverse", f"--format={_FORMAT}", revisions)
+    found = []
+    for record in text.split("\x1d"):
+        if not record.strip("\n"):
+            continue
+        commit, parents, summary, trailers = record.strip("\n").split("\x1f")
+        pairs = [tuple(line.split(": ", 1)) for line in trailers.split("\x1e") if ": " in line]
+        found.append(Commit(commit, tuple(parents.split()), summary, tuple(pairs)))  # type: ignore[arg-type]
+    return [commit for commit in found if commit.parents]
+
+
+def tip(repo: Path) -> str:
+    """Return the newest commit of main."""
+    return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)
+
+
+def read(repo: Path, path: str) -> str:
+    """Return a file of main, empty when it is not there."""
+    return GitRepo(repo).files(path).get(path, "")
+
+
+def operations(repo: Path) -> list[str]:
+    """The operation ids of all demands' commits, oldest first."""
+    return [found for commit in commits(repo) if (found := commit.one("Operation-Id"))]
+
+
+def branches(repo: Path) -> list[str]:
+    """Return the branches of demands that await approval."""
+    refs = git(repo, "for-each-ref", "--format=%(refname:short)", "refs/heads/demand")
+    return refs.splitlines()
+
+
+def books(repo: Path, revision: str = "main") -> dict[str, Any]:
+    state = snapshots.load(pygit2.Repository(str(repo)), revision).state
+    return as_data(bookkeeping(state.ledger, state.config), "")
+
+
+def claims(repo: Path, needle: str = "") -> list[str]:
+    """The paths of claim files whose text holds ``needle``."""
+    paths = git(repo, "ls-tree", "-r", "--name-only", "main", "ledger/").splitlines()
+    paths = [path for path in paths if path.endswith(".yaml")]
+    return [path for path in paths if needle in git(repo, "show", f"main:{path}")]
+
+
+def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
+    """What `demandops verify` finds fault with, in all of history or behind a commit."""
+    with reader.opened(str(repo)) as opened:
+        commits = opened.revisions(f"{since or root(repo)}..")
+        verdicts = opened.verify(commits)
+    return {verdict.summary: verdict.differing for verdict in verdicts if not verdict.holds}
+
+
+def root(repo: Path) -> str:
+    return git(repo, "rev-list", "--max-parents=0", "main")
+
+
+def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
+    """Objects are whole, history is one line, no demand counts twice, every commit verifies.
+
+    Args:
+        verify_last: verify so many commits only, for verifying one takes a tenth of a second.
+    """
+    fsck = subprocess.run(
+        ["git", "-C", str(repo), "fsck", "--strict", "--no-dangling", "--no-progress"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (fsck.returncode, fsck.stdout, fsck.stderr) == (0, "", "")
+    made = commits(repo)
+    assert [commit.id for commit in made if len(commit.parents) != 1] == []
+    ids = operations(repo)
+    assert sorted(ids) == sorted(set(ids))
+    assert differing(repo, made[-verify_last - 1].id if verify_last else None) == {}

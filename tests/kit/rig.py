@@ -1,0 +1,34 @@
+"""What tests of generators on real state repos use, under one name."""
+# ruff: noqa: F401
+
+from tests.kit.generator import (
+    PATIENCE_S,
+    Gate,
+    Proposed,
+    Stages,
+    book,
+    receipt,
+    restart,
+    running,
+    wait_until,
+)
+from tests.kit.goals import Goal, impossible, leave
+from tests.kit.goals import numbered as goal
+from tests.kit.memory import NOW, books_after
+from tests.kit.processes import Drivers, Run, Told, demand, listen_to_all
+from tests.kit.repo import (
+    GIT_ENVIRONMENT,
+    Commit,
+    Person,
+    assert_sound,
+    books,
+    branches,
+    claims,
+    commits,
+    differing,
+    git,
+    init,
+    operations,
+    root,
+    tip,
+)

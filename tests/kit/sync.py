@@ -1,0 +1,28 @@
+"""Forced writes to disk: off in tests, unless a test is marked ``synced``.
+
+A killed process loses nothing without them; only a power cut does. The program has no switch for
+this, so the tests replace what it calls.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import pygit2
+from demandops.staterepo.git import tree as _  # noqa: F401 - switches libgit2's on when imported
+
+_CALLS: Mapping[str, object] = {name: getattr(os, name) for name in ("fsync", "fdatasync")}
+
+
+def force(on: bool) -> None:
+    """Switch forced writes of this process on or off."""
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, int(on))
+    for name, call in _CALLS.items():
+        setattr(os, name, call if on else lambda file: None)
+
+
+def force_in(repo: Path, on: bool) -> None:
+    """Switch forced writes of git on or off in a repository."""
+    pygit2.Repository(str(repo)).config["core.fsync"] = "committed" if on else "none"
