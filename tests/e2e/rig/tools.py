@@ -87,10 +87,18 @@ def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> 
     go = gobuild.Go.find()
     entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], go)}" for name in wanted}
     missing = [name for name in wanted if not entries[name].is_dir()]
+    workspace = gobuild.Workspace(cache_root() / ".go")
     for place, name in enumerate(missing, start=1):
         with _turn(cache_root(), say):
             if not entries[name].is_dir():  # another run may have built it while we waited
-                _build(TOOLS[name], go, entries[name], _prefixed(say, place, len(missing), name))
+                report_step = _prefixed(say, place, len(missing), name)
+                _build(TOOLS[name], go, entries[name], workspace, report_step)
+                later = [TOOLS[other].wrapper for other in missing[place:]]
+                if TOOLS[name].wrapper not in later:
+                    workspace.trim()
+    if missing:
+        with _turn(cache_root(), say):
+            workspace.remove()
     return {name: entries[name] / name for name in wanted}
 
 
@@ -170,15 +178,19 @@ def _turn(root: Path, say: Report) -> Iterator[None]:
         yield
 
 
-def _build(tool: Tool, go: gobuild.Go, entry: Path, say: Report) -> None:
+def _build(
+    tool: Tool, go: gobuild.Go, entry: Path, workspace: gobuild.Workspace, say: Report
+) -> None:
     staging = Path(tempfile.mkdtemp(prefix=f".building-{tool.name}-", dir=entry.parent))
     try:
         start = time.monotonic()
         wrapper = WRAPPERS / tool.wrapper
         binary = staging / tool.name
-        gobuild.build(go, wrapper, tool.package, _flags(tool), binary, say)
+        gobuild.build(go, wrapper, tool.package, _flags(tool), binary, workspace, say)
         if tool.crds_of:
-            _copy_crds(Path(gobuild.module_folder(go, wrapper, tool.crds_of)), staging / "crds")
+            _copy_crds(
+                Path(gobuild.module_folder(go, wrapper, workspace, tool.crds_of)), staging / "crds"
+            )
         seconds = round(time.monotonic() - start, 1)
         (staging / "build.json").write_text(json.dumps({"tool": tool.name, "seconds": seconds}))
         with binary.open("rb") as written:
