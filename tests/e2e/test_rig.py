@@ -20,7 +20,7 @@ from tests.e2e.rig.capture import uncaptured
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig, start_all
 from tests.e2e.rig.errors import RigError
-from tests.e2e.rig.kube import handled
+from tests.e2e.rig.kube import build_manifest, handled
 from tests.e2e.rig.kwok import HOLD_ANNOTATION
 from tests.e2e.rig.tools import Report
 
@@ -65,16 +65,16 @@ class Domain:
         self.clone.push({**always, **files}, "start")
         self.lap("first push")
         self.kube.apply(
-            object_("v1", "Namespace", self.name),
-            object_("v1", "ServiceAccount", ACCOUNT, self.name),
-            object_(
+            build_manifest("v1", "Namespace", self.name),
+            build_manifest("v1", "ServiceAccount", ACCOUNT, self.name),
+            build_manifest(
                 "rbac.authorization.k8s.io/v1",
                 "Role",
                 ACCOUNT,
                 self.name,
                 rules=[{"apiGroups": ["*"], "resources": ["*"], "verbs": ["*"]}],
             ),
-            object_(
+            build_manifest(
                 "rbac.authorization.k8s.io/v1",
                 "RoleBinding",
                 ACCOUNT,
@@ -86,7 +86,7 @@ class Domain:
                 },
                 subjects=[{"kind": "ServiceAccount", "name": ACCOUNT, "namespace": self.name}],
             ),
-            object_(
+            build_manifest(
                 "source.toolkit.fluxcd.io/v1",
                 "GitRepository",
                 "state",
@@ -98,7 +98,7 @@ class Domain:
                     "sparseCheckout": ["clusters/edge", "charts"],
                 },
             ),
-            object_(
+            build_manifest(
                 "kustomize.toolkit.fluxcd.io/v1",
                 "Kustomization",
                 "edge",
@@ -159,13 +159,8 @@ def domain(rig: Rig, tmp_path: Path, say: Report) -> Iterator[Domain]:
     made.remove()
 
 
-def object_(version: str, kind: str, name: str, namespace: str = "", **rest: Any) -> dict[str, Any]:
-    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
-    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}
-
-
 def config(value: str) -> str:
-    return json.dumps(object_("v1", "ConfigMap", "greeting", data={"value": value}))
+    return json.dumps(build_manifest("v1", "ConfigMap", "greeting", data={"value": value}))
 
 
 def deployment(node_id: str, name: str = "sleeper", **annotations: str) -> str:
@@ -176,7 +171,7 @@ def deployment(node_id: str, name: str = "sleeper", **annotations: str) -> str:
         "spec": {"nodeSelector": {"node_id": node_id}, "containers": [container]},
     }
     spec = {"replicas": 1, "selector": {"matchLabels": labels}, "template": template}
-    return json.dumps(object_("apps/v1", "Deployment", name, spec=spec))
+    return json.dumps(build_manifest("apps/v1", "Deployment", name, spec=spec))
 
 
 def running_on(pods: list[dict[str, Any]]) -> set[str]:
@@ -263,10 +258,10 @@ def release() -> dict[str, str]:
     }
     return {
         "clusters/edge/chart.yaml": json.dumps(
-            object_("source.toolkit.fluxcd.io/v1", "HelmChart", "sleeper", spec=chart_spec)
+            build_manifest("source.toolkit.fluxcd.io/v1", "HelmChart", "sleeper", spec=chart_spec)
         ),
         "clusters/edge/release.yaml": json.dumps(
-            object_("helm.toolkit.fluxcd.io/v2", "HelmRelease", "nap", spec=release_spec)
+            build_manifest("helm.toolkit.fluxcd.io/v2", "HelmRelease", "nap", spec=release_spec)
         ),
     }
 
@@ -338,8 +333,8 @@ def test_two_rigs_read_one_git_server_that_wants_a_password(say: Report, tmp_pat
         }
         login = {"username": "ops", "password": "s3cret"}
         for cluster in (first, second):
-            cluster.kube.apply(object_("v1", "Secret", "git", "default", stringData=login))
-            source = object_("source.toolkit.fluxcd.io/v1", "GitRepository", "s", "default")
+            cluster.kube.apply(build_manifest("v1", "Secret", "git", "default", stringData=login))
+            source = build_manifest("source.toolkit.fluxcd.io/v1", "GitRepository", "s", "default")
             cluster.kube.apply({**source, "spec": spec})
             cluster.kube.wait_ready("GitRepository", "s", "default")
         with pytest.raises(RigError, match="could not read Username"):

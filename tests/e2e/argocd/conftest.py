@@ -8,28 +8,23 @@ import pytest
 
 from tests.e2e.common.expected import NODES, STANDING
 from tests.e2e.common.ros import Client
+from tests.e2e.common.running import running
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
 from .world import World
 
 CLUSTER = "c-its"
-NAMESPACE = "perception"  # of the skeleton's access domain
 
 
 @pytest.fixture(scope="session")
 def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
     """A cluster with a node for each of the skeleton's inventory."""
-    failed = request.session.testsfailed
-    cluster = Rig(CLUSTER, gitops="argocd", nodes=NODES, report=say)
-    cluster.start()
-    say(f"\nrig started: {cluster.timings}")
-    try:
+    with running(
+        Rig(CLUSTER, gitops="argocd", nodes=NODES, report=say), request.session
+    ) as cluster:
+        say(f"\nrig started: {cluster.timings}")
         yield cluster
-    finally:
-        if cluster.existing:
-            cluster.kube.delete("Namespace", NAMESPACE)
-        cluster.stop(failed=request.session.testsfailed > failed)
 
 
 @pytest.fixture(scope="module")

@@ -7,21 +7,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 
 from tests.e2e.common import expected
+from tests.e2e.common.intrusion import FILE, NEIGHBOUR, binding
 from tests.e2e.rig.argocd import NAMESPACE as CONTROL
 from tests.e2e.rig.cluster import Rig
-from tests.e2e.rig.kube import Manifest
+from tests.e2e.rig.kube import Manifest, build_manifest
 
 from .world import World
 
-NEIGHBOUR = "neighbour"
-FILE = "clusters/c-its/perception/edge/foreign.yaml"
 IN_CLUSTER = "https://kubernetes.default.svc"
-_RBAC = "rbac.authorization.k8s.io"
 
 SlipIn = Callable[[Manifest], None]
 
@@ -41,7 +38,9 @@ def neighbour(rig: Rig) -> Iterator[None]:
         "destinationServiceAccounts": [account],
         "clusterResourceWhitelist": [{"group": "*", "kind": "*"}],
     }
-    rig.kube.apply(object_("argoproj.io/v1alpha1", "AppProject", "default", CONTROL, spec=spec))
+    rig.kube.apply(
+        build_manifest("argoproj.io/v1alpha1", "AppProject", "default", CONTROL, spec=spec)
+    )
     yield
     rig.kube.delete("AppProject", "default", CONTROL)
     rig.kube.delete("Namespace", NEIGHBOUR)
@@ -64,11 +63,6 @@ def slip_in(world: World) -> Iterator[SlipIn]:
     world.domain.wait_applied(world.tip())
 
 
-def object_(version: str, kind: str, name: str, namespace: str = "", **rest: Any) -> Manifest:
-    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
-    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}
-
-
 def application(world: World, *, project: str, into: str, namespace: str) -> Manifest:
     """A release of the detection's chart, of a project, into a namespace."""
     source = {
@@ -82,23 +76,16 @@ def application(world: World, *, project: str, into: str, namespace: str) -> Man
         "destination": {"server": IN_CLUSTER, "namespace": into},
         "syncPolicy": {"automated": {}},
     }
-    return object_("argoproj.io/v1alpha1", "Application", "foreign", namespace, spec=spec)
-
-
-def binding(kind: str, namespace: str = "") -> Manifest:
-    """Administrator's rights for the domain's account."""
-    account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
-    role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
-    return object_(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])
+    return build_manifest("argoproj.io/v1alpha1", "Application", "foreign", namespace, spec=spec)
 
 
 REFUSED = {
     "a foreign namespace": (
-        object_("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}),
+        build_manifest("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}),
         "namespace neighbour is not permitted in project 'demandops-perception'",
     ),
     "a kind of the whole cluster": (
-        object_("v1", "Namespace", "foreign"),
+        build_manifest("v1", "Namespace", "foreign"),
         "resource :Namespace is not permitted in project",
     ),
     "a binding for the whole cluster": (
@@ -110,11 +97,11 @@ REFUSED = {
         "attempting to grant RBAC permissions not currently held",
     ),
     "a kind that no release is made of": (
-        object_("v1", "Service", "foreign", "perception", spec={"ports": [{"port": 80}]}),
+        build_manifest("v1", "Service", "foreign", "perception", spec={"ports": [{"port": 80}]}),
         "resource :Service is not permitted in project",
     ),
     "a project": (
-        object_("argoproj.io/v1alpha1", "AppProject", "foreign", "perception", spec={}),
+        build_manifest("argoproj.io/v1alpha1", "AppProject", "foreign", "perception", spec={}),
         "AppProject is not permitted in project",
     ),
 }
@@ -175,5 +162,5 @@ def test_a_later_commit_is_applied_once_the_refused_manifest_is_gone(
 ) -> None:
     """With the next demand the generator takes the file out, and Argo CD tries that commit."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
-    slip_in(object_("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}))
+    slip_in(build_manifest("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}))
     world.step(2, expected.after(2))

@@ -46,42 +46,30 @@ def test_every_pod_stays_there_and_back(
         world.generator.start()
         flux.wait_lines(STANDING)
         world.step(1, expected.after(1))
-        flux.wait_releases_ready()
-        before = pods(flux)
+        flux.wait_releases()
+        before = flux.pods()
 
         from_flux(flux)
         argocd = to_argocd(world)
         argocd.wait_lines(expected.after(2))
         forget_flux(flux)
-        assert {name: pods(argocd)[name] for name in before} == before
+        assert {name: argocd.pods()[name] for name in before} == before
         sent = world.demand(expected.demand(3))
         argocd.wake()
         argocd.wait_applied(sent.commit)
         argocd.wait_lines(expected.after(3))
-        argocd.wait_releases_synced()
+        argocd.wait_releases()
 
-        before = pods(argocd)
+        before = argocd.pods()
         forget_argocd(argocd)
         to_flux(world)
         flux.wait_lines(expected.after(4))
-        flux.wait_releases_ready()
-        assert {name: pods(flux)[name] for name in before} == before
+        flux.wait_releases()
+        assert {name: flux.pods()[name] for name in before} == before
         for step in (5, 6, 7, 8):
             world.step(step, expected.after(step))
     finally:
         world.generator.stop()
-
-
-def pods(domain: Domain | flux_view.Domain) -> dict[str, tuple[object, ...]]:
-    """A Deployment and its pods, by its name.
-
-    Its generation does not count: to apply it as another may write out what was a default.
-    """
-    found = {}
-    for item in domain.find("Deployment"):
-        uid, _, *below = domain.identity(item["metadata"]["name"])
-        found[item["metadata"]["name"]] = (uid, *below)
-    return found
 
 
 def from_flux(domain: flux_view.Domain) -> None:
@@ -111,11 +99,11 @@ def to_argocd(world: FluxWorld) -> Domain:
     destination = folder["spec"]["destination"]["namespace"]
     domain = Domain(world.rig.kube, destination, folder["metadata"]["name"])
     domain.wait_applied(upgraded)
-    domain.wait_releases_synced()
+    domain.wait_releases()
     sent = world.demand(expected.demand(2))
     domain.wake()
     domain.wait_applied(sent.commit)
-    domain.wait_releases_synced()
+    domain.wait_releases()
     return domain
 
 

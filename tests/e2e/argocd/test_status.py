@@ -36,10 +36,6 @@ def world(
 class TestArgoCD(Answers):
     """What is particular to Argo CD."""
 
-    def all_applied(self, world: Any) -> None:
-        """Each Application is Synced."""
-        world.domain.wait_releases_synced()
-
     def mended(self, world: Any) -> None:
         """A chart in a folder is looked at every few minutes, or when somebody asks for it."""
         world.domain.refresh("od-edge-vehicle00")

@@ -17,7 +17,7 @@ PLAIN, OTHER = source_end("vehicle00"), target_end("station00")
 def running(world: World) -> World:
     """Step 1 runs, whatever ran before, and nothing changes any more."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
-    world.domain.wait_releases_synced()
+    world.domain.wait_releases()
     return world
 
 

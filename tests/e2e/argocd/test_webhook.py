@@ -56,12 +56,6 @@ def world(
 
 
 @pytest.fixture
-def asker(ros_domain: int) -> Iterator[DemandClient]:
-    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=2 * TIMEOUT_S) as made:
-        yield made
-
-
-@pytest.fixture
 def refreshed(rig: Rig) -> Callable[[], set[str]]:
     """The Applications that the server had looked at since the test began or it was asked last."""
     log, seen = rig.log(SERVER), rig.log(SERVER).stat().st_size
@@ -79,27 +73,27 @@ def refreshed(rig: Rig) -> Callable[[], set[str]]:
 
 
 def test_a_push_is_heard_of_and_only_what_changed_is_looked_at(
-    world: World, asker: DemandClient, refreshed: Callable[[], set[str]]
+    world: World, requester: DemandClient, refreshed: Callable[[], set[str]]
 ) -> None:
-    asker.put("d", [fusion("vehicle00")], answer="healthy")
+    requester.put("d", [fusion("vehicle00")], answer="healthy")
     refreshed()  # with the first call everything may be
-    answer = asker.put("e", [fusion("vehicle00")], answer="healthy")
+    answer = requester.put("e", [fusion("vehicle00")], answer="healthy")
     assert all(path.startswith("ledger/") for path in world.changed_by(answer.commit))
     assert refreshed() == {world.domain.name}
-    asker.release("e")
+    requester.release("e")
 
 
 def test_a_chart_edited_in_its_folder_is_what_healthy_is_of(
-    world: World, asker: DemandClient, refreshed: Callable[[], set[str]]
+    world: World, requester: DemandClient, refreshed: Callable[[], set[str]]
 ) -> None:
-    asker.put("d", [fusion("vehicle00")], answer="healthy")
+    requester.put("d", [fusion("vehicle00")], answer="healthy")
     whole = with_chart(world, OF_CHART)
-    asker.put("d", [fusion("vehicle00", "vehicle01")], answer="healthy")
+    requester.put("d", [fusion("vehicle00", "vehicle01")], answer="healthy")
     made = {name_of(item) for item in world.domain.find("ConfigMap")}
     assert "od-edge-vehicle00-new" in made
     assert "od-edge-vehicle00" in refreshed()
     world.push(dict(whole))
-    asker.send({"operation": "release", "demand": "d", "answer": "healthy"})
+    requester.send({"operation": "release", "demand": "d", "answer": "healthy"})
 
 
 @pytest.mark.parametrize("secret", [None, b"another"])

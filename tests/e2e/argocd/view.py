@@ -11,7 +11,7 @@ from typing import Any
 from tests.e2e.common.namespace import Namespace, name_of
 from tests.e2e.rig.argocd import NAMESPACE
 from tests.e2e.rig.errors import RigError
-from tests.e2e.rig.kube import Kube, Manifest
+from tests.e2e.rig.kube import Manifest
 
 _REFRESH = "argocd.argoproj.io/refresh"
 
@@ -20,10 +20,6 @@ class Domain(Namespace):
     """The domain's namespace on one cluster; the Application over its folder is called `name`."""
 
     RELEASE = "Application"
-
-    def __init__(self, kube: Kube, namespace: str, name: str) -> None:
-        super().__init__(kube, namespace)
-        self.name = name
 
     # --- looking ----------------------------------------------------------------------------
 
@@ -84,7 +80,7 @@ class Domain(Namespace):
         self._wait_for(f"{commit[:10]} to be applied", commit, fetched=False)
         return time.monotonic()
 
-    def wait_releases_synced(self) -> None:
+    def wait_releases(self) -> None:
         """Wait until every release is as its Application asks."""
 
         def synced() -> bool:

@@ -35,14 +35,17 @@ _OTHERS = ("Job", "Service")
 
 
 class Namespace:
-    """The namespace; a service's release is an object of the kind `RELEASE`."""
+    """The namespace; a service's release is an object of the kind `RELEASE`.
+
+    `name` is the controller's object that applies the domain's folder.
+    """
 
     RELEASE: ClassVar[str]
     OWN: ClassVar[tuple[str, ...]] = ()  # further kinds of the controller's own
     STEADY: ClassVar[tuple[str, ...]] = ()  # those that a commit about something else leaves alone
 
-    def __init__(self, kube: Kube, namespace: str) -> None:
-        self.kube, self.namespace = kube, namespace
+    def __init__(self, kube: Kube, namespace: str, name: str) -> None:
+        self.kube, self.namespace, self.name = kube, namespace, name
         self._node_ids: dict[str, str] = {}
 
     # --- looking ----------------------------------------------------------------------------
@@ -89,6 +92,35 @@ class Namespace:
         pods = sorted(pod["metadata"]["uid"] for pod in self.find("Pod", name))
         sets = sorted(item["metadata"]["uid"] for item in self.find("ReplicaSet", name))
         return metadata["uid"], metadata["generation"], *pods, *sets
+
+    def pods(self) -> dict[str, tuple[object, ...]]:
+        """The UIDs of each Deployment and its pods, by the Deployment's name.
+
+        Without its generation: another controller that applies it may write out a default.
+        """
+        found = {}
+        for item in self.find("Deployment"):
+            uid, _, *below = self.identity(name_of(item))
+            found[name_of(item)] = (uid, *below)
+        return found
+
+    # --- what the controller does -------------------------------------------------------------
+
+    def wake(self) -> None:
+        """Ask the controller to look at the remote now."""
+        raise NotImplementedError
+
+    def wait_fetched(self, commit: str) -> float:
+        """Wait until the controller has fetched a commit; return when that was seen."""
+        raise NotImplementedError
+
+    def wait_applied(self, commit: str) -> float:
+        """Wait until the controller has applied a commit; return when that was seen."""
+        raise NotImplementedError
+
+    def wait_releases(self) -> None:
+        """Wait until the controller has done everything for the releases except await pods."""
+        raise NotImplementedError
 
     # --- waiting ----------------------------------------------------------------------------
 

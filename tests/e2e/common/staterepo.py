@@ -13,14 +13,19 @@ import time
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from tests.e2e.rig import launch
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.errors import RigError
 
+from .expected import demand
+from .namespace import Namespace
 from .ros import Client, Sent
+from .timing import Times
+
+Domain = TypeVar("Domain", bound=Namespace)
 
 _READY = "taking demands on"
 _START_S = 60.0
@@ -75,8 +80,11 @@ class Generator:
         return self.log.read_bytes()[since:].decode(errors="replace")
 
 
-class StateRepo:
-    """A state repo in use, written for the controller of the rig that it is on."""
+class StateRepo(Generic[Domain]):
+    """A state repo in use, written for the controller of its rig.
+
+    `domains` are its access domain on each cluster that follows it, by cluster name.
+    """
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
         self.rig, self.client, self.folder = rig, client, folder
@@ -88,6 +96,13 @@ class StateRepo:
         _git(bare, "push", "--quiet", self.push_url, "main")
         self.person = Clone(self.push_url, folder / "person")
         self.generator = Generator(self.push_url, folder, ros_domain, client)
+        self.domains: dict[str, Domain] = {}
+
+    @property
+    def domain(self) -> Domain:
+        """The access domain, if only one cluster follows."""
+        (only,) = self.domains.values()
+        return only
 
     def file(self, path: str) -> str:
         """A file as the remote has it."""
@@ -119,6 +134,22 @@ class StateRepo:
         sent = self.client.call(goal)
         assert sent.status == "succeeded", sent.message
         return sent
+
+    def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> Times:
+        """Send the goal of a step and follow it to the pods of the only cluster."""
+        return self.follow(self.demand(demand(number)), wanted, wake=wake)
+
+    def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
+        """Follow a goal that succeeded until the cluster is exactly as wanted."""
+        domain = self.domain
+        if wake:
+            domain.wake()
+        fetched = domain.wait_fetched(sent.commit)
+        applied = domain.wait_applied(sent.commit)
+        ready = domain.wait_lines(wanted)
+        pushed = sent.stages["pushed"]
+        committed = sent.stages.get("committed", pushed)  # not sent if nothing changed
+        return Times(sent.at, committed, pushed, fetched, applied, ready)
 
     def _pull(self) -> None:
         self.person.git("fetch", "--quiet", "origin", "main")

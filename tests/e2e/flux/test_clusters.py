@@ -9,10 +9,11 @@ import yaml
 
 from tests.e2e.common import expected
 from tests.e2e.common.expected import NODES, STANDING, STEPS, VEHICLES
+from tests.e2e.common.running import NAMESPACE, running
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .conftest import CLUSTER, NAMESPACE, MakeWorld
+from .conftest import CLUSTER, MakeWorld
 from .relay import Relay
 from .view import SOURCE, Domain
 from .world import World
@@ -25,17 +26,11 @@ CLUSTERS, INVENTORY = "inventory/clusters.yaml", "inventory/nodes.yaml"
 @pytest.fixture(scope="module")
 def fleet(rig: Rig, request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
     """The vehicles' own cluster; it reads the same Git server."""
-    failed = request.session.testsfailed
     cluster = Rig(FLEET, nodes=VEHICLES, git_of=rig, report=say)
     if rig.existing and cluster.existing == rig.existing:
         pytest.skip(f"E2E_KUBECONFIG_{FLEET.upper()} names no second cluster")
-    cluster.start()
-    try:
+    with running(cluster, request.session):
         yield cluster
-    finally:
-        if cluster.existing:
-            cluster.kube.delete("Namespace", NAMESPACE)
-        cluster.stop(failed=request.session.testsfailed > failed)
 
 
 @pytest.fixture(scope="module")

@@ -13,16 +13,15 @@ from typing import Any
 import pytest
 
 from tests.e2e.common import expected
+from tests.e2e.common.intrusion import FILE, NEIGHBOUR, binding
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.kube import build_manifest
 
 from .view import Domain
 from .world import World
 
-NEIGHBOUR = "neighbour"
-FILE = "clusters/c-its/perception/edge/foreign.yaml"
 BASE = "clusters/c-its/perception/foreign/kustomization.yaml"
-_RBAC = "rbac.authorization.k8s.io"
 
 
 @pytest.fixture(scope="module")
@@ -77,29 +76,19 @@ def test_a_foreign_namespace_is_refused_and_nothing_else_of_the_commit_is_applie
 
 
 def config(name: str, namespace: str) -> dict[str, Any]:
-    return object_("v1", "ConfigMap", name, namespace, data={"made": "by hand"})
+    return build_manifest("v1", "ConfigMap", name, namespace, data={"made": "by hand"})
 
 
 def release(**spec: Any) -> dict[str, Any]:
     """A release of the detection's chart that wants to be in the neighbour's namespace."""
     chart = {"kind": "HelmChart", "name": "object-detection-0.1.0"}
     spec = {"interval": "10m", "chartRef": chart, "targetNamespace": NEIGHBOUR, **spec}
-    return object_("helm.toolkit.fluxcd.io/v2", "HelmRelease", "foreign", "perception", spec=spec)
+    return build_manifest(
+        "helm.toolkit.fluxcd.io/v2", "HelmRelease", "foreign", "perception", spec=spec
+    )
 
 
-def object_(version: str, kind: str, name: str, namespace: str = "", **rest: Any) -> dict[str, Any]:
-    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
-    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}
-
-
-def binding(kind: str, namespace: str = "") -> dict[str, Any]:
-    """Administrator's rights for the domain's account."""
-    account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
-    role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
-    return object_(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])
-
-
-KUSTOMIZATION = object_(
+KUSTOMIZATION = build_manifest(
     "kustomize.toolkit.fluxcd.io/v1",
     "Kustomization",
     "foreign",

@@ -21,7 +21,7 @@ def override(select: dict[str, list[str]], **effects: object) -> str:
 def test_overrides_arrive_stay_and_go(world: World) -> None:
     domain, goal = world.domain, expected.demand(1)
     world.follow(world.demand(goal), expected.after(1))
-    domain.wait_releases_ready()
+    domain.wait_releases()
     fusion = domain.identity(FUSION)
     client = source_end("vehicle00")
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
 from tests.e2e.common.access import access_file, documented_roles, limited
@@ -27,8 +25,4 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 
 class TestFlux(Answers):
-    """What is particular to Flux."""
-
-    def all_applied(self, world: Any) -> None:
-        """Each HelmRelease is ready, for it does not wait for pods."""
-        world.domain.wait_releases_ready()
+    """The tests with Flux."""

@@ -22,7 +22,7 @@ REGISTRY = "registry/charts.yaml"
 def running(world: World) -> World:
     """Step 1 runs, whatever ran before, and nothing changes any more."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
-    world.domain.wait_releases_ready()
+    world.domain.wait_releases()
     return world
 
 
@@ -90,7 +90,7 @@ def test_a_new_version_of_a_chart_restarts_no_pod_that_it_leaves_as_it_was(
     running.push({CHART: yaml.safe_dump(chart), REGISTRY: yaml.safe_dump(registry)})
     sent = running.demand(asked_by("vehicle02", expected.demand(1)))  # takes the change in
     running.follow(sent, expected.after(1))
-    domain.wait_releases_ready()
+    domain.wait_releases()
     assert domain.get("HelmRelease", FUSION)["status"]["history"][0]["chartVersion"][:4] == "99.0"
     assert names(domain.find("HelmChart")) == charts - {old} | {"object-fusion-99.0.0"}
     assert domain.identity(FUSION) == pods

@@ -12,7 +12,6 @@ from collections.abc import Callable
 
 from tests.e2e.common.namespace import Namespace, name_of
 from tests.e2e.rig.errors import RigError
-from tests.e2e.rig.kube import Kube
 
 SOURCE = "demandops"  # the GitRepository's name
 
@@ -23,10 +22,6 @@ class Domain(Namespace):
     RELEASE = "HelmRelease"
     STEADY = ("HelmRelease",)
     OWN = ("GitRepository", "HelmChart", "Kustomization")
-
-    def __init__(self, kube: Kube, namespace: str, name: str) -> None:
-        super().__init__(kube, namespace)
-        self.name = name
 
     # --- looking ----------------------------------------------------------------------------
 
@@ -78,7 +73,7 @@ class Domain(Namespace):
 
         self._wait_for(f"{commit[:10]} to be tried", attempted, timeout)
 
-    def wait_releases_ready(self) -> None:
+    def wait_releases(self) -> None:
         """Wait until Helm has done all that was asked of it."""
         for release in self.find("HelmRelease"):
             self.kube.wait_ready("HelmRelease", name_of(release), self.namespace)

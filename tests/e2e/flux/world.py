@@ -10,31 +10,20 @@ from typing import Any
 
 import yaml
 
-from tests.e2e.common.expected import demand
-from tests.e2e.common.ros import Client, Sent
+from tests.e2e.common.ros import Client
 from tests.e2e.common.staterepo import StateRepo
-from tests.e2e.common.timing import Times
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Kube, Manifest
 
 from .view import SOURCE, Domain
 
 
-class World(StateRepo):
-    """A state repo in use; `domains` are its access domain on each cluster, by cluster name."""
+class World(StateRepo[Domain]):
+    """A state repo that Flux follows."""
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
         super().__init__(rig, folder, ros_domain, client)
-        self.domains: dict[str, Domain] = {}
         self._wide: list[tuple[Kube, Manifest]] = []
-
-    @property
-    def domain(self) -> Domain:
-        """The access domain, where there is one cluster only."""
-        (only,) = self.domains.values()
-        return only
-
-    # --- the clusters -----------------------------------------------------------------------
 
     def bootstrap(self, cluster: str, rig: Rig, **source: Any) -> Domain:
         """Put `bootstrap/<cluster>.yaml` on a cluster and wait until its Flux follows.
@@ -76,21 +65,3 @@ class World(StateRepo):
             kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
         self.domains.clear()
         self._wide.clear()
-
-    # --- demands ----------------------------------------------------------------------------
-
-    def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Send the goal of a step and follow it to the pods of the only cluster."""
-        return self.follow(self.demand(demand(number)), wanted, wake=wake)
-
-    def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Follow a goal that succeeded until the cluster is exactly as wanted."""
-        domain = self.domain
-        if wake:
-            domain.wake()
-        fetched = domain.wait_fetched(sent.commit)
-        applied = domain.wait_applied(sent.commit)
-        ready = domain.wait_lines(wanted)
-        pushed = sent.stages["pushed"]
-        committed = sent.stages.get("committed", pushed)  # not told where nothing changed
-        return Times(sent.at, committed, pushed, fetched, applied, ready)

@@ -184,6 +184,14 @@ class Kube:
         return self._dynamic.resources.get(api_version=version, kind=kind)
 
 
+def build_manifest(
+    version: str, kind: str, name: str, namespace: str = "", **fields: Any
+) -> Manifest:
+    """Return an object; one without a namespace belongs to the whole cluster."""
+    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
+    return {"apiVersion": version, "kind": kind, "metadata": metadata, **fields}
+
+
 def handled(manifest: Manifest, token: str) -> bool:
     """Whether a Flux controller has finished the reconcile asked for with `token`."""
     return bool(manifest.get("status", {}).get("lastHandledReconcileAt") == token)
