@@ -1,4 +1,4 @@
-"""What the tests of every controller share: a ROS domain, a client in it, and progress."""
+"""Fixtures that both controllers share: a ROS domain, clients in it, and progress messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def say(request: pytest.FixtureRequest) -> Report:
 
 @pytest.fixture(scope="session")
 def ros_domain() -> Iterator[int]:
-    """A ROS domain for this process, so that nothing else answers."""
+    """A ROS domain that only this process uses."""
     with reserved() as domain:
         yield domain
 

@@ -1,6 +1,6 @@
-"""An access domain reaches its own namespace and nothing else, whatever is committed to its folder.
+"""A commit to an access domain's folder changes only the domain's own namespace.
 
-Each case is what a mistake or somebody with write access there might commit.
+Each case is what a mistake or an attacker might commit there.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ SlipIn = Callable[[Manifest], None]
 
 @pytest.fixture(scope="module", autouse=True)
 def neighbour(rig: Rig) -> Iterator[None]:
-    """A namespace that is nobody's, and a project that may do everything, in Argo CD's namespace.
+    """A namespace of no access domain, and a project without limits in Argo CD's namespace.
 
-    The project is what an installation has by the name `default`.
+    Each installation has such a project, named `default`.
     """
     rig.kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NEIGHBOUR}})
     anywhere = {"server": "*", "namespace": "*"}
@@ -48,7 +48,7 @@ def neighbour(rig: Rig) -> Iterator[None]:
 
 @pytest.fixture
 def slip_in(world: World) -> Iterator[SlipIn]:
-    """Commit a manifest to the domain's folder; it goes again at the end."""
+    """Commit a manifest to the domain's folder; the end of the test removes it."""
 
     def push(manifest: Manifest) -> None:
         commit = world.push({FILE: json.dumps(manifest)})
@@ -56,7 +56,7 @@ def slip_in(world: World) -> Iterator[SlipIn]:
         world.domain.wait_fetched(commit)
 
     yield push
-    world.tip()  # the clone is as the remote has it
+    world.tip()  # updates the clone
     if FILE in world.person.git("ls-files").split():
         world.push({FILE: None})
     world.domain.wake()
@@ -64,7 +64,7 @@ def slip_in(world: World) -> Iterator[SlipIn]:
 
 
 def application(world: World, *, project: str, into: str, namespace: str) -> Manifest:
-    """A release of the detection's chart, of a project, into a namespace."""
+    """Return a release of the detection's chart in a project, for the namespace `into`."""
     source = {
         "repoURL": world.rig.git_url(world.name),
         "path": "appdefs/object-detection-fusion/charts/object-detection",
@@ -96,7 +96,7 @@ REFUSED = {
         binding("RoleBinding", "perception"),
         "attempting to grant RBAC permissions not currently held",
     ),
-    "a kind that no release is made of": (
+    "a kind that no release contains": (
         build_manifest("v1", "Service", "foreign", "perception", spec={"ports": [{"port": 80}]}),
         "resource :Service is not permitted in project",
     ),
@@ -108,7 +108,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_it_is_refused_and_what_runs_goes_on(world: World, slip_in: SlipIn, name: str) -> None:
+def test_it_is_refused_and_services_run_on(world: World, slip_in: SlipIn, name: str) -> None:
     manifest, reason = REFUSED[name]
     domain = world.domain
     world.follow(world.demand(expected.demand(1)), expected.after(1))
@@ -160,7 +160,7 @@ def test_no_application_in_argo_cds_own_namespace(world: World, slip_in: SlipIn)
 def test_a_later_commit_is_applied_once_the_refused_manifest_is_gone(
     world: World, slip_in: SlipIn
 ) -> None:
-    """With the next demand the generator takes the file out, and Argo CD tries that commit."""
+    """With the next demand the generator removes the file, and Argo CD applies that commit."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
     slip_in(build_manifest("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}))
     world.step(2, expected.after(2))

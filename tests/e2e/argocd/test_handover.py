@@ -1,4 +1,4 @@
-"""A state repo goes over from Flux to Argo CD and back as docs/argocd.md says; every pod stays."""
+"""A state repo moves from Flux to Argo CD and back as docs/argocd.md says; every pod stays."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from tests.e2e.common import expected
-from tests.e2e.common.expected import NODES, STANDING
+from tests.e2e.common.expected import NODES, WITHOUT_DEMANDS
 from tests.e2e.common.ros import Client
 from tests.e2e.common.staterepo import demandops
 from tests.e2e.flux import view as flux_view
@@ -21,7 +21,7 @@ from tests.e2e.rig.tools import Report
 from .conftest import CLUSTER
 from .view import Domain
 
-FLUXS = ("HelmRelease", "Kustomization", "HelmChart", "GitRepository")
+FLUX_KINDS = ("HelmRelease", "Kustomization", "HelmChart", "GitRepository")
 SUSPENDED = {"spec": {"suspend": True}}
 
 
@@ -44,7 +44,7 @@ def test_every_pod_stays_there_and_back(
     try:
         flux = world.bootstrap(CLUSTER, both)
         world.generator.start()
-        flux.wait_lines(STANDING)
+        flux.wait_lines(WITHOUT_DEMANDS)
         world.step(1, expected.after(1))
         flux.wait_releases()
         before = flux.pods()
@@ -73,25 +73,25 @@ def test_every_pod_stays_there_and_back(
 
 
 def from_flux(domain: flux_view.Domain) -> None:
-    """Suspend what would remove the releases."""
+    """Suspend everything that would remove the releases."""
     for kind in ("Kustomization", "HelmRelease"):
         for item in domain.find(kind):
             domain.kube.patch(kind, item["metadata"]["name"], SUSPENDED, domain.namespace)
 
 
 def upgrade(world: FluxWorld, gitops: str) -> str:
-    """Go over to a controller in one commit, while the generator runs; return the commit."""
+    """Move to a controller in one commit while the generator runs; return the commit."""
     before = world.tip()
     options = ("--gitops", gitops, "--output", "json")
-    said = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)
+    output = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)
     assert world.commits_since(before) == 1
-    commit = json.loads(said)["commit"]
+    commit = json.loads(output)["commit"]
     assert commit == world.tip()
     return str(commit)
 
 
 def to_argocd(world: FluxWorld) -> Domain:
-    """Have everything rendered for Argo CD, let it follow, and demand the next step."""
+    """Render everything for Argo CD, let it follow, and demand the next step."""
     upgraded = upgrade(world, "argocd")
     manifests = list(yaml.safe_load_all(world.file(f"bootstrap/{CLUSTER}.yaml")))
     world.rig.kube.apply(*manifests)
@@ -108,8 +108,8 @@ def to_argocd(world: FluxWorld) -> Domain:
 
 
 def forget_flux(domain: flux_view.Domain) -> None:
-    """Delete Flux's objects, which remove nothing while suspended, and Helm's notes."""
-    for kind in FLUXS:
+    """Delete Flux's objects, which remove nothing while suspended, and Helm's records."""
+    for kind in FLUX_KINDS:
         for item in domain.find(kind):
             name = item["metadata"]["name"]
             domain.kube.delete(kind, name, domain.namespace)
@@ -120,9 +120,12 @@ def forget_flux(domain: flux_view.Domain) -> None:
 
 
 def forget_argocd(domain: Domain) -> None:
-    """Delete the Applications without what they hold: the folder's first, or it restores them."""
-    found = [(domain.name, CONTROL), *((name, domain.namespace) for name in domain.releases())]
-    for name, namespace in found:
+    """Delete the Applications but not their objects. The folder's goes first: it restores others."""
+    apps = [
+        (domain.name, CONTROL),
+        *((name, domain.namespace) for name in domain.releases()),
+    ]
+    for name, namespace in apps:
         domain.kube.patch("Application", name, {"metadata": {"finalizers": None}}, namespace)
         domain.kube.delete("Application", name, namespace)
         domain.kube.wait_gone("Application", name, namespace)
@@ -130,7 +133,7 @@ def forget_argocd(domain: Domain) -> None:
 
 
 def to_flux(world: FluxWorld) -> None:
-    """Have everything rendered for Flux, and let it follow while demands go on."""
+    """Render everything for Flux, and let it follow while demands continue."""
     upgrade(world, "flux")
     world.demand(expected.demand(4))
     world.bootstrap(CLUSTER, world.rig)

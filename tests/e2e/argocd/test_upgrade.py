@@ -1,6 +1,6 @@
-"""The state repo goes over to Flux while this cluster's Argo CD was not taken off: all runs on.
+"""The state repo moves to Flux, but this cluster's Argo CD was not removed: all services run on.
 
-`demandops upgrade` prints what to do before; a cluster that was out of reach could not be told.
+`demandops upgrade` prints what to do before, which is impossible on an unreachable cluster.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from tests.e2e.rig.argocd import NAMESPACE
 from .world import World
 
 
-def test_an_argo_cd_that_was_not_taken_off_fails_and_leaves_alone_what_runs(world: World) -> None:
+def test_an_argo_cd_that_was_not_removed_fails_and_changes_no_pod(world: World) -> None:
     domain = world.domain
     world.step(1, expected.after(1))
     domain.wait_releases()
@@ -23,8 +23,8 @@ def test_an_argo_cd_that_was_not_taken_off_fails_and_leaves_alone_what_runs(worl
     demandops(world.folder, "upgrade", "--state-repo", world.push_url, "--gitops", "flux")
     domain.wake()
     domain.wait_fetched(world.tip())
-    domain.kube.wait(  # a trouble that is tried again is none for a moment
-        "Argo CD to fail at the HelmReleases",
+    domain.kube.wait(  # a retry clears the error for a moment
+        "Argo CD to fail on the HelmReleases",
         lambda: "HelmRelease" in domain.trouble(domain.name, NAMESPACE),
     )
     assert domain.pods() == before

@@ -1,6 +1,6 @@
 """A state repo, its generator, and the cluster whose Argo CD follows it.
 
-The cluster is told by nothing but the manifests that `demandops init` laid down for it.
+The cluster gets only the manifests that `demandops init` wrote for it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ class World(StateRepo[Domain]):
     """A state repo that Argo CD follows."""
 
     def bootstrap(self, cluster: str) -> None:
-        """Put `bootstrap/<cluster>.yaml` on the cluster and wait until its Argo CD follows."""
+        """Apply `bootstrap/<cluster>.yaml` to the cluster and wait until its Argo CD follows."""
         manifests = list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
         (project,) = [item for item in manifests if item["kind"] == "AppProject"]
         (folder,) = [item for item in manifests if item["kind"] == "Application"]
@@ -28,7 +28,7 @@ class World(StateRepo[Domain]):
         self.domain.wait_applied(self.tip())
 
     def remove(self) -> None:
-        """Take the state repo off the cluster. The namespace stays."""
+        """Remove the state repo from the cluster. The namespace stays."""
         self.generator.stop()
         for domain in self.domains.values():
             domain.kube.delete("Application", domain.name, NAMESPACE)

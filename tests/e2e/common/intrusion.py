@@ -10,7 +10,7 @@ _RBAC = "rbac.authorization.k8s.io"
 
 
 def binding(kind: str, namespace: str = "") -> Manifest:
-    """Return administrator's rights for the domain's account."""
+    """Return a binding that makes the domain's account an administrator."""
     account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
     role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
     return build_manifest(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])

@@ -8,7 +8,7 @@ from __future__ import annotations
 from tests.e2e.rig.tools import Report
 
 from . import expected
-from .expected import FUSION, STANDING, STEPS, unscheduled
+from .expected import FUSION, STEPS, WITHOUT_DEMANDS, unscheduled
 from .namespace import Namespace
 from .staterepo import StateRepo
 from .timing import Table
@@ -47,4 +47,4 @@ def test_a_service_that_cannot_start_is_reconfigured_and_removed(
         sent = world.demand(expected.demand(step) | {"shutdown": True})
     domain.wake()
     domain.wait_applied(sent.commit)
-    domain.wait_lines(STANDING)
+    domain.wait_lines(WITHOUT_DEMANDS)

@@ -1,6 +1,6 @@
 """A state repo, its generator, and the clusters whose Flux follows it.
 
-The clusters are told by nothing but the manifests that `demandops init` laid down for them.
+The clusters get only the manifests that `demandops init` wrote for them.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class World(StateRepo[Domain]):
         self._wide: list[tuple[Kube, Manifest]] = []
 
     def bootstrap(self, cluster: str, rig: Rig, **source: Any) -> Domain:
-        """Put `bootstrap/<cluster>.yaml` on a cluster and wait until its Flux follows.
+        """Apply `bootstrap/<cluster>.yaml` to a cluster and wait until its Flux follows.
 
-        `source` changes fields of the GitRepository, as a person may with an overlay.
+        `source` changes fields of the GitRepository, as a person may do with an overlay.
         """
         manifests = list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
         (git,) = [item for item in manifests if item["kind"] == "GitRepository"]
@@ -49,17 +49,14 @@ class World(StateRepo[Domain]):
         return domain
 
     def remove(self) -> None:
-        """Take the state repo off its clusters. The namespace, and what is in it, stays."""
+        """Remove the state repo from its clusters. The namespace and its other objects stay."""
         self.generator.stop()
         for domain in self.domains.values():
             kube, namespace = domain.kube, domain.namespace
             for kind, name in (("Kustomization", domain.name), ("GitRepository", SOURCE)):
                 kube.delete(kind, name, namespace)
                 kube.wait_gone(kind, name, namespace)
-            for kind in (
-                "HelmRelease",
-                "HelmChart",
-            ):  # what is going would take its successor along
+            for kind in ("HelmRelease", "HelmChart"):  # a late deletion would hit the next world's
                 kube.wait(f"each {kind} to go", lambda d=domain, k=kind: d.find(k) == [])
         for kube, item in self._wide:
             kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
