@@ -1,4 +1,4 @@
-"""The rig does what the other end-to-end tests rely on: it starts, reconciles, prunes and stops."""
+"""The rig starts, reconciles, prunes and stops, as the other end-to-end tests need."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
 
 
 class Domain:
-    """One access domain of a state repo: a namespace, its service account, a source."""
+    """An access domain of a state repo: a namespace, its service account, a source."""
 
     def __init__(self, rig: Rig, folder: Path, say: Report) -> None:
         self.rig, self.kube, self.say = rig, rig.kube, say
@@ -60,7 +60,7 @@ class Domain:
         self._at = time.monotonic()
 
     def create(self, files: dict[str, str]) -> None:
-        # Flux refuses a sparse checkout of a folder that is not there.
+        # Flux refuses a sparse checkout of a missing folder.
         always = {"clusters/edge/placeholder.yaml": PLACEHOLDER, "charts/.gitkeep": ""}
         self.clone.push({**always, **files}, "start")
         self.lap("first push")
@@ -120,7 +120,7 @@ class Domain:
         self.lap("Kustomization ready")
 
     def push(self, files: dict[str, str | None]) -> None:
-        """Push and ask the source to look; the Kustomization follows its new artifact."""
+        """Push and trigger the source; its new artifact triggers the Kustomization."""
         commit = self.clone.push(files)
         token = self.kube.reconcile("GitRepository", "state", self.name)
 
@@ -133,7 +133,7 @@ class Domain:
             revision = kustomization.get("status", {}).get("lastAppliedRevision", "")
             return bool(revision.endswith(commit))
 
-        self.kube.wait("the source to look", seen)
+        self.kube.wait("the source to fetch", seen)
         self.kube.wait(f"{commit} to be applied", applied)
         self.lap("pushed change applied")
 
@@ -175,7 +175,7 @@ def deployment(node_id: str, name: str = "sleeper", **annotations: str) -> str:
 
 
 def running_on(pods: list[dict[str, Any]]) -> set[str]:
-    """Names of the nodes on which ready pods run."""
+    """Return the names of the nodes with ready pods."""
     ready = [
         pod
         for pod in pods
@@ -206,7 +206,7 @@ def test_a_push_becomes_a_pod_changes_and_goes(domain: Domain) -> None:
     assert domain.kube.get("ConfigMap", "placeholder", domain.name) is not None
 
 
-def test_a_pod_waits_for_its_node_and_a_held_one_for_ever(rig: Rig, domain: Domain) -> None:
+def test_a_pod_waits_for_its_node_and_a_held_one_forever(rig: Rig, domain: Domain) -> None:
     late = f"vehicle_{uuid.uuid4().hex[:6]}"
     held = deployment("edge", "held", **{HOLD_ANNOTATION: "yes"})
     files = {"clusters/edge/late.yaml": deployment(late), "clusters/edge/held.yaml": held}
@@ -284,7 +284,7 @@ def test_a_release_runs_as_its_account_and_is_uninstalled(rig: Rig, domain: Doma
 
 def test_parts_can_be_killed_paused_and_started_again(rig: Rig, domain: Domain) -> None:
     if rig.existing:
-        pytest.skip("the parts of an existing cluster are not ours to kill")
+        pytest.skip("the tests may not kill parts of an existing cluster")
     domain.create({"clusters/edge/config.yaml": config("one")})
     for part in ("git", "source-controller", "kustomize-controller", "kube-apiserver", "etcd"):
         before = rig.pids()[part]
@@ -305,10 +305,10 @@ def test_parts_can_be_killed_paused_and_started_again(rig: Rig, domain: Domain) 
 
 def test_a_part_that_dies_is_named_with_its_log(rig: Rig) -> None:
     if rig.existing:
-        pytest.skip("the parts of an existing cluster are not ours to kill")
+        pytest.skip("the tests may not kill parts of an existing cluster")
     os.kill(rig.pids()["kwok"], signal.SIGKILL)
     with pytest.raises(RigError) as caught:
-        rig.kube.wait("what never comes", lambda: None)
+        rig.kube.wait("an event that never happens", lambda: None)
     assert str(caught.value).startswith("kwok: ended with -9 after ")
     assert f"{rig.log('kwok')} ends with:\n" in str(caught.value)
     rig.restart("kwok")
@@ -318,7 +318,7 @@ def test_a_part_that_dies_is_named_with_its_log(rig: Rig) -> None:
 def test_two_rigs_read_one_git_server_that_wants_a_password(say: Report, tmp_path: Path) -> None:
     first = Rig("first", nodes=["edge"], credentials=("ops", "s3cret"), report=say)
     if first.existing:
-        pytest.skip("two clusters are started here only where none is given")
+        pytest.skip("the test starts two clusters only if no cluster is given")
     first.start()
     second = Rig("second", nodes=["vehicle00"], git_of=first, report=say)
     try:
@@ -349,7 +349,7 @@ def test_two_rigs_read_one_git_server_that_wants_a_password(say: Report, tmp_pat
 def test_nothing_outlives_a_stop(say: Report) -> None:
     rig = Rig("brief", report=say)
     if rig.existing:
-        pytest.skip("nothing is started where a cluster is given")
+        pytest.skip("the test starts nothing if a cluster is given")
     start_all(rig)
     pids, folder = rig.pids(), rig.kubeconfig.parent
     assert sorted(pids) == sorted(rig.components())
@@ -361,7 +361,7 @@ def test_nothing_outlives_a_stop(say: Report) -> None:
 
 def test_nothing_outlives_a_killed_test_run(tmp_path: Path) -> None:
     if Rig("probe").existing:
-        pytest.skip("nothing is started where a cluster is given")
+        pytest.skip("the test starts nothing if a cluster is given")
     program = "import json, time; from tests.e2e.rig.cluster import Rig; r = Rig('orphan')\n"
     program += "r.start(); print(json.dumps(r.pids()), flush=True); time.sleep(300)"
     environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT)}

@@ -120,7 +120,7 @@ def forget_flux(domain: flux_view.Domain) -> None:
 
 
 def forget_argocd(domain: Domain) -> None:
-    """Delete the Applications but not their objects. The folder's goes first: it restores others."""
+    """Delete the Applications, not their objects. The folder's is first: it restores others."""
     apps = [
         (domain.name, CONTROL),
         *((name, domain.namespace) for name in domain.releases()),

@@ -15,8 +15,8 @@ from tests.e2e.rig.tools import Report
 
 from .world import World
 
+__all__ = ["NAMESPACE"]  # for test_charts
 CLUSTER = "c-its"
-__all__ = ["NAMESPACE"]
 
 MakeWorld = Callable[[], World]
 
