@@ -106,7 +106,7 @@ class Namespace:
     # --- what the controller does -------------------------------------------------------------
 
     def wake(self) -> None:
-        """Ask the controller to look at the remote now."""
+        """Make the controller look at the remote now."""
         raise NotImplementedError
 
     def wait_fetched(self, commit: str) -> float:
