@@ -1,10 +1,11 @@
-"""What the tests of every controller share: a ROS domain, a client in it, and progress."""
+"""Fixtures that both controllers share: a ROS domain, clients in it, and progress messages."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
+from demandops_ros import DemandClient
 
 from tests.e2e.common.ros import Client
 from tests.e2e.rig.capture import uncaptured
@@ -12,7 +13,7 @@ from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 from tests.kit.ros import reserved
 
-pytest.register_assert_rewrite("tests.e2e.common.answers")
+pytest.register_assert_rewrite("tests.e2e.common.answers", "tests.e2e.common.steps")
 
 
 @pytest.fixture(scope="session")
@@ -22,7 +23,7 @@ def say(request: pytest.FixtureRequest) -> Report:
 
 @pytest.fixture(scope="session")
 def ros_domain() -> Iterator[int]:
-    """A ROS domain for this process, so that nothing else answers."""
+    """A ROS domain that only this process uses."""
     with reserved() as domain:
         yield domain
 
@@ -35,11 +36,19 @@ def client(ros_domain: int) -> Iterator[Client]:
 
 
 @pytest.fixture
-def edge_is_full(rig: Rig) -> Iterator[None]:
-    """No pod is scheduled on the edge, as when an image cannot be pulled there."""
+def requester(ros_domain: int) -> Iterator[DemandClient]:
+    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=120) as made:
+        yield made
+
+
+@pytest.fixture
+def edge_is_full(rig: Rig) -> Iterator[Callable[[], None]]:
+    """Schedule no pod on the edge, until the returned function is called."""
     (edge,) = rig.kube.find("Node", selector="node_id=edge")
-    for state, whole in ((True, False), (False, True)):
-        if whole:
-            yield
-        name = edge["metadata"]["name"]
-        rig.kube.patch("Node", name, {"spec": {"unschedulable": state or None}})
+
+    def unschedulable(value: bool | None) -> None:
+        rig.kube.patch("Node", edge["metadata"]["name"], {"spec": {"unschedulable": value}})
+
+    unschedulable(True)
+    yield lambda: unschedulable(None)
+    unschedulable(None)

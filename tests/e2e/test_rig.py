@@ -1,4 +1,4 @@
-"""The rig does what the other end-to-end tests rely on: it starts, reconciles, prunes and stops."""
+"""The rig starts, reconciles, prunes and stops, as the other end-to-end tests need."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.e2e.rig.capture import uncaptured
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig, start_all
 from tests.e2e.rig.errors import RigError
-from tests.e2e.rig.kube import handled
+from tests.e2e.rig.kube import build_manifest, handled
 from tests.e2e.rig.kwok import HOLD_ANNOTATION
 from tests.e2e.rig.tools import Report
 
@@ -51,7 +51,7 @@ def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
 
 
 class Domain:
-    """One access domain of a state repo: a namespace, its service account, a source."""
+    """An access domain of a state repo: a namespace, its service account, a source."""
 
     def __init__(self, rig: Rig, folder: Path, say: Report) -> None:
         self.rig, self.kube, self.say = rig, rig.kube, say
@@ -60,21 +60,21 @@ class Domain:
         self._at = time.monotonic()
 
     def create(self, files: dict[str, str]) -> None:
-        # Flux refuses a sparse checkout of a folder that is not there.
+        # Flux refuses a sparse checkout of a missing folder.
         always = {"clusters/edge/placeholder.yaml": PLACEHOLDER, "charts/.gitkeep": ""}
         self.clone.push({**always, **files}, "start")
         self.lap("first push")
         self.kube.apply(
-            object_("v1", "Namespace", self.name),
-            object_("v1", "ServiceAccount", ACCOUNT, self.name),
-            object_(
+            build_manifest("v1", "Namespace", self.name),
+            build_manifest("v1", "ServiceAccount", ACCOUNT, self.name),
+            build_manifest(
                 "rbac.authorization.k8s.io/v1",
                 "Role",
                 ACCOUNT,
                 self.name,
                 rules=[{"apiGroups": ["*"], "resources": ["*"], "verbs": ["*"]}],
             ),
-            object_(
+            build_manifest(
                 "rbac.authorization.k8s.io/v1",
                 "RoleBinding",
                 ACCOUNT,
@@ -86,7 +86,7 @@ class Domain:
                 },
                 subjects=[{"kind": "ServiceAccount", "name": ACCOUNT, "namespace": self.name}],
             ),
-            object_(
+            build_manifest(
                 "source.toolkit.fluxcd.io/v1",
                 "GitRepository",
                 "state",
@@ -98,7 +98,7 @@ class Domain:
                     "sparseCheckout": ["clusters/edge", "charts"],
                 },
             ),
-            object_(
+            build_manifest(
                 "kustomize.toolkit.fluxcd.io/v1",
                 "Kustomization",
                 "edge",
@@ -120,7 +120,7 @@ class Domain:
         self.lap("Kustomization ready")
 
     def push(self, files: dict[str, str | None]) -> None:
-        """Push and ask the source to look; the Kustomization follows its new artifact."""
+        """Push and trigger the source; its new artifact triggers the Kustomization."""
         commit = self.clone.push(files)
         token = self.kube.reconcile("GitRepository", "state", self.name)
 
@@ -133,7 +133,7 @@ class Domain:
             revision = kustomization.get("status", {}).get("lastAppliedRevision", "")
             return bool(revision.endswith(commit))
 
-        self.kube.wait("the source to look", seen)
+        self.kube.wait("the source to fetch", seen)
         self.kube.wait(f"{commit} to be applied", applied)
         self.lap("pushed change applied")
 
@@ -159,13 +159,8 @@ def domain(rig: Rig, tmp_path: Path, say: Report) -> Iterator[Domain]:
     made.remove()
 
 
-def object_(version: str, kind: str, name: str, namespace: str = "", **rest: Any) -> dict[str, Any]:
-    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
-    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}
-
-
 def config(value: str) -> str:
-    return json.dumps(object_("v1", "ConfigMap", "greeting", data={"value": value}))
+    return json.dumps(build_manifest("v1", "ConfigMap", "greeting", data={"value": value}))
 
 
 def deployment(node_id: str, name: str = "sleeper", **annotations: str) -> str:
@@ -176,11 +171,11 @@ def deployment(node_id: str, name: str = "sleeper", **annotations: str) -> str:
         "spec": {"nodeSelector": {"node_id": node_id}, "containers": [container]},
     }
     spec = {"replicas": 1, "selector": {"matchLabels": labels}, "template": template}
-    return json.dumps(object_("apps/v1", "Deployment", name, spec=spec))
+    return json.dumps(build_manifest("apps/v1", "Deployment", name, spec=spec))
 
 
 def running_on(pods: list[dict[str, Any]]) -> set[str]:
-    """Names of the nodes on which ready pods run."""
+    """Return the names of the nodes with ready pods."""
     ready = [
         pod
         for pod in pods
@@ -211,7 +206,7 @@ def test_a_push_becomes_a_pod_changes_and_goes(domain: Domain) -> None:
     assert domain.kube.get("ConfigMap", "placeholder", domain.name) is not None
 
 
-def test_a_pod_waits_for_its_node_and_a_held_one_for_ever(rig: Rig, domain: Domain) -> None:
+def test_a_pod_waits_for_its_node_and_a_held_one_forever(rig: Rig, domain: Domain) -> None:
     late = f"vehicle_{uuid.uuid4().hex[:6]}"
     held = deployment("edge", "held", **{HOLD_ANNOTATION: "yes"})
     files = {"clusters/edge/late.yaml": deployment(late), "clusters/edge/held.yaml": held}
@@ -263,10 +258,10 @@ def release() -> dict[str, str]:
     }
     return {
         "clusters/edge/chart.yaml": json.dumps(
-            object_("source.toolkit.fluxcd.io/v1", "HelmChart", "sleeper", spec=chart_spec)
+            build_manifest("source.toolkit.fluxcd.io/v1", "HelmChart", "sleeper", spec=chart_spec)
         ),
         "clusters/edge/release.yaml": json.dumps(
-            object_("helm.toolkit.fluxcd.io/v2", "HelmRelease", "nap", spec=release_spec)
+            build_manifest("helm.toolkit.fluxcd.io/v2", "HelmRelease", "nap", spec=release_spec)
         ),
     }
 
@@ -289,7 +284,7 @@ def test_a_release_runs_as_its_account_and_is_uninstalled(rig: Rig, domain: Doma
 
 def test_parts_can_be_killed_paused_and_started_again(rig: Rig, domain: Domain) -> None:
     if rig.existing:
-        pytest.skip("the parts of an existing cluster are not ours to kill")
+        pytest.skip("the tests may not kill parts of an existing cluster")
     domain.create({"clusters/edge/config.yaml": config("one")})
     for part in ("git", "source-controller", "kustomize-controller", "kube-apiserver", "etcd"):
         before = rig.pids()[part]
@@ -310,10 +305,10 @@ def test_parts_can_be_killed_paused_and_started_again(rig: Rig, domain: Domain) 
 
 def test_a_part_that_dies_is_named_with_its_log(rig: Rig) -> None:
     if rig.existing:
-        pytest.skip("the parts of an existing cluster are not ours to kill")
+        pytest.skip("the tests may not kill parts of an existing cluster")
     os.kill(rig.pids()["kwok"], signal.SIGKILL)
     with pytest.raises(RigError) as caught:
-        rig.kube.wait("what never comes", lambda: None)
+        rig.kube.wait("an event that never happens", lambda: None)
     assert str(caught.value).startswith("kwok: ended with -9 after ")
     assert f"{rig.log('kwok')} ends with:\n" in str(caught.value)
     rig.restart("kwok")
@@ -323,7 +318,7 @@ def test_a_part_that_dies_is_named_with_its_log(rig: Rig) -> None:
 def test_two_rigs_read_one_git_server_that_wants_a_password(say: Report, tmp_path: Path) -> None:
     first = Rig("first", nodes=["edge"], credentials=("ops", "s3cret"), report=say)
     if first.existing:
-        pytest.skip("two clusters are started here only where none is given")
+        pytest.skip("the test starts two clusters only if no cluster is given")
     first.start()
     second = Rig("second", nodes=["vehicle00"], git_of=first, report=say)
     try:
@@ -338,8 +333,8 @@ def test_two_rigs_read_one_git_server_that_wants_a_password(say: Report, tmp_pat
         }
         login = {"username": "ops", "password": "s3cret"}
         for cluster in (first, second):
-            cluster.kube.apply(object_("v1", "Secret", "git", "default", stringData=login))
-            source = object_("source.toolkit.fluxcd.io/v1", "GitRepository", "s", "default")
+            cluster.kube.apply(build_manifest("v1", "Secret", "git", "default", stringData=login))
+            source = build_manifest("source.toolkit.fluxcd.io/v1", "GitRepository", "s", "default")
             cluster.kube.apply({**source, "spec": spec})
             cluster.kube.wait_ready("GitRepository", "s", "default")
         with pytest.raises(RigError, match="could not read Username"):
@@ -354,7 +349,7 @@ def test_two_rigs_read_one_git_server_that_wants_a_password(say: Report, tmp_pat
 def test_nothing_outlives_a_stop(say: Report) -> None:
     rig = Rig("brief", report=say)
     if rig.existing:
-        pytest.skip("nothing is started where a cluster is given")
+        pytest.skip("the test starts nothing if a cluster is given")
     start_all(rig)
     pids, folder = rig.pids(), rig.kubeconfig.parent
     assert sorted(pids) == sorted(rig.components())
@@ -366,7 +361,7 @@ def test_nothing_outlives_a_stop(say: Report) -> None:
 
 def test_nothing_outlives_a_killed_test_run(tmp_path: Path) -> None:
     if Rig("probe").existing:
-        pytest.skip("nothing is started where a cluster is given")
+        pytest.skip("the test starts nothing if a cluster is given")
     program = "import json, time; from tests.e2e.rig.cluster import Rig; r = Rig('orphan')\n"
     program += "r.start(); print(json.dumps(r.pids()), flush=True); time.sleep(300)"
     environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT)}

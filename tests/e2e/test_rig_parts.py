@@ -21,7 +21,7 @@ from tests.e2e.rig.workdir import Workdir
 
 FAKE_GO = """\
 #!/bin/sh
-# Plays the Go toolchain: `build` writes its target, slowly, and notes that it ran.
+# A fake Go toolchain: `build` writes its target slowly and records its run.
 case "$1" in
 env) printf 'go%s\\nlinux\\namd64\\n' "${FAKE_GO_VERSION:-1.26.8}" ;;
 list) if [ "$2" = -m ]; then echo "$FAKE_GO_MODULE"; else printf 'one\\ntwo\\n'; fi ;;
@@ -39,7 +39,7 @@ esac
 
 @pytest.fixture
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A fake Go on PATH and an empty cache; the file lists the builds."""
+    """A file that lists the builds of a fake Go on PATH, with an empty cache."""
     program = tmp_path / "bin" / "go"
     program.parent.mkdir()
     program.write_text(FAKE_GO)
@@ -106,7 +106,7 @@ def test_a_killed_build_leaves_nothing_that_looks_done(
     assert list(tools.cache_root().glob(".building-*")) == []
 
 
-def test_a_failed_build_shows_the_compilers_words(
+def test_a_failed_build_shows_the_compilers_message(
     runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FAKE_GO_FAULT", "main.go:1: syntax error")
@@ -172,7 +172,7 @@ def test_a_start_that_takes_too_long_shows_reason_and_log(processes: Processes) 
     assert str(caught.value).endswith("\n  waiting\n")
 
 
-def test_one_that_ignores_the_request_to_end_is_killed_with_its_children(
+def test_a_process_that_ignores_sigterm_is_killed_with_its_children(
     processes: Processes, tmp_path: Path
 ) -> None:
     note = tmp_path / "child"
@@ -187,10 +187,10 @@ def test_one_that_ignores_the_request_to_end_is_killed_with_its_children(
     assert not Path(f"/proc/{child}").exists()
 
 
-def test_a_process_outlives_the_thread_that_asked_for_it(
+def test_a_process_outlives_the_thread_that_started_it(
     processes: Processes, tmp_path: Path
 ) -> None:
-    note = tmp_path / "note"  # once it is there, the kernel knows whose death to wait for
+    note = tmp_path / "note"  # once it exists, the kernel watches the parent
     component = shell(
         "long", f"touch {note}; sleep 60", lambda: None if note.exists() else "not yet"
     )
@@ -233,7 +233,7 @@ def test_of_two_pushes_from_one_commit_the_second_is_refused(git_port: int, tmp_
         Clone(address, tmp_path / "two").push({"b": "1"})
 
 
-def test_reading_what_is_not_there_creates_nothing(git_port: int, tmp_path: Path) -> None:
+def test_reading_a_missing_repository_creates_nothing(git_port: int, tmp_path: Path) -> None:
     with pytest.raises(RigError, match="not found"):
         Clone(f"{net.url(git_port)}/none.git", tmp_path / "one").git("fetch", "origin")
     assert list((tmp_path / "served").glob("*")) == []

@@ -1,1 +1,1 @@
-"""The same chain with Argo CD in Flux's place."""
+"""The end-to-end tests with Argo CD."""

@@ -1,36 +1,33 @@
-"""An access domain reaches its own namespace and nothing else, whatever is committed to its folder.
+"""A commit to an access domain's folder changes only the domain's own namespace.
 
-Each case is what a mistake or somebody with write access there might commit.
+Each case is what a mistake or an attacker might commit there.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 
 from tests.e2e.common import expected
+from tests.e2e.common.intrusion import FILE, NEIGHBOUR, binding
 from tests.e2e.rig.argocd import NAMESPACE as CONTROL
 from tests.e2e.rig.cluster import Rig
-from tests.e2e.rig.kube import Manifest
+from tests.e2e.rig.kube import Manifest, build_manifest
 
 from .world import World
 
-NEIGHBOUR = "neighbour"
-FILE = "clusters/c-its/perception/edge/foreign.yaml"
 IN_CLUSTER = "https://kubernetes.default.svc"
-_RBAC = "rbac.authorization.k8s.io"
 
 SlipIn = Callable[[Manifest], None]
 
 
 @pytest.fixture(scope="module", autouse=True)
 def neighbour(rig: Rig) -> Iterator[None]:
-    """A namespace that is nobody's, and a project that may do everything, in Argo CD's namespace.
+    """A namespace of no access domain, and a project without limits in Argo CD's namespace.
 
-    The project is what an installation has by the name `default`.
+    Each installation has such a project, named `default`.
     """
     rig.kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NEIGHBOUR}})
     anywhere = {"server": "*", "namespace": "*"}
@@ -41,7 +38,9 @@ def neighbour(rig: Rig) -> Iterator[None]:
         "destinationServiceAccounts": [account],
         "clusterResourceWhitelist": [{"group": "*", "kind": "*"}],
     }
-    rig.kube.apply(object_("argoproj.io/v1alpha1", "AppProject", "default", CONTROL, spec=spec))
+    rig.kube.apply(
+        build_manifest("argoproj.io/v1alpha1", "AppProject", "default", CONTROL, spec=spec)
+    )
     yield
     rig.kube.delete("AppProject", "default", CONTROL)
     rig.kube.delete("Namespace", NEIGHBOUR)
@@ -49,7 +48,7 @@ def neighbour(rig: Rig) -> Iterator[None]:
 
 @pytest.fixture
 def slip_in(world: World) -> Iterator[SlipIn]:
-    """Commit a manifest to the domain's folder; it goes again at the end."""
+    """Commit a manifest to the domain's folder; the end of the test removes it."""
 
     def push(manifest: Manifest) -> None:
         commit = world.push({FILE: json.dumps(manifest)})
@@ -57,20 +56,15 @@ def slip_in(world: World) -> Iterator[SlipIn]:
         world.domain.wait_fetched(commit)
 
     yield push
-    world.tip()  # the clone is as the remote has it
+    world.tip()  # updates the clone
     if FILE in world.person.git("ls-files").split():
         world.push({FILE: None})
     world.domain.wake()
     world.domain.wait_applied(world.tip())
 
 
-def object_(version: str, kind: str, name: str, namespace: str = "", **rest: Any) -> Manifest:
-    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
-    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}
-
-
 def application(world: World, *, project: str, into: str, namespace: str) -> Manifest:
-    """A release of the detection's chart, of a project, into a namespace."""
+    """Return a release of the detection's chart in a project, for the namespace `into`."""
     source = {
         "repoURL": world.rig.git_url(world.name),
         "path": "appdefs/object-detection-fusion/charts/object-detection",
@@ -82,23 +76,16 @@ def application(world: World, *, project: str, into: str, namespace: str) -> Man
         "destination": {"server": IN_CLUSTER, "namespace": into},
         "syncPolicy": {"automated": {}},
     }
-    return object_("argoproj.io/v1alpha1", "Application", "foreign", namespace, spec=spec)
-
-
-def binding(kind: str, namespace: str = "") -> Manifest:
-    """Administrator's rights for the domain's account."""
-    account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
-    role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
-    return object_(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])
+    return build_manifest("argoproj.io/v1alpha1", "Application", "foreign", namespace, spec=spec)
 
 
 REFUSED = {
     "a foreign namespace": (
-        object_("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}),
+        build_manifest("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}),
         "namespace neighbour is not permitted in project 'demandops-perception'",
     ),
     "a kind of the whole cluster": (
-        object_("v1", "Namespace", "foreign"),
+        build_manifest("v1", "Namespace", "foreign"),
         "resource :Namespace is not permitted in project",
     ),
     "a binding for the whole cluster": (
@@ -109,19 +96,19 @@ REFUSED = {
         binding("RoleBinding", "perception"),
         "attempting to grant RBAC permissions not currently held",
     ),
-    "a kind that no release is made of": (
-        object_("v1", "Service", "foreign", "perception", spec={"ports": [{"port": 80}]}),
+    "a kind that no release contains": (
+        build_manifest("v1", "Service", "foreign", "perception", spec={"ports": [{"port": 80}]}),
         "resource :Service is not permitted in project",
     ),
     "a project": (
-        object_("argoproj.io/v1alpha1", "AppProject", "foreign", "perception", spec={}),
+        build_manifest("argoproj.io/v1alpha1", "AppProject", "foreign", "perception", spec={}),
         "AppProject is not permitted in project",
     ),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_it_is_refused_and_what_runs_goes_on(world: World, slip_in: SlipIn, name: str) -> None:
+def test_it_is_refused_and_services_run_on(world: World, slip_in: SlipIn, name: str) -> None:
     manifest, reason = REFUSED[name]
     domain = world.domain
     world.follow(world.demand(expected.demand(1)), expected.after(1))
@@ -173,7 +160,7 @@ def test_no_application_in_argo_cds_own_namespace(world: World, slip_in: SlipIn)
 def test_a_later_commit_is_applied_once_the_refused_manifest_is_gone(
     world: World, slip_in: SlipIn
 ) -> None:
-    """With the next demand the generator takes the file out, and Argo CD tries that commit."""
+    """With the next demand the generator removes the file, and Argo CD applies that commit."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
-    slip_in(object_("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}))
+    slip_in(build_manifest("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}))
     world.step(2, expected.after(2))

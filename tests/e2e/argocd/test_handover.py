@@ -1,4 +1,4 @@
-"""A state repo goes over from Flux to Argo CD and back as docs/argocd.md says; every pod stays."""
+"""A state repo moves from Flux to Argo CD and back as docs/argocd.md says; every pod stays."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from tests.e2e.common import expected
-from tests.e2e.common.expected import NODES, STANDING
+from tests.e2e.common.expected import NODES, WITHOUT_DEMANDS
 from tests.e2e.common.ros import Client
 from tests.e2e.common.staterepo import demandops
 from tests.e2e.flux import view as flux_view
@@ -21,7 +21,7 @@ from tests.e2e.rig.tools import Report
 from .conftest import CLUSTER
 from .view import Domain
 
-FLUXS = ("HelmRelease", "Kustomization", "HelmChart", "GitRepository")
+FLUX_KINDS = ("HelmRelease", "Kustomization", "HelmChart", "GitRepository")
 SUSPENDED = {"spec": {"suspend": True}}
 
 
@@ -44,66 +44,54 @@ def test_every_pod_stays_there_and_back(
     try:
         flux = world.bootstrap(CLUSTER, both)
         world.generator.start()
-        flux.wait_lines(STANDING)
+        flux.wait_lines(WITHOUT_DEMANDS)
         world.step(1, expected.after(1))
-        flux.wait_releases_ready()
-        before = pods(flux)
+        flux.wait_releases()
+        before = flux.pods()
 
         from_flux(flux)
         argocd = to_argocd(world)
         argocd.wait_lines(expected.after(2))
         forget_flux(flux)
-        assert {name: pods(argocd)[name] for name in before} == before
+        assert {name: argocd.pods()[name] for name in before} == before
         sent = world.demand(expected.demand(3))
         argocd.wake()
         argocd.wait_applied(sent.commit)
         argocd.wait_lines(expected.after(3))
-        argocd.wait_releases_synced()
+        argocd.wait_releases()
 
-        before = pods(argocd)
+        before = argocd.pods()
         forget_argocd(argocd)
         to_flux(world)
         flux.wait_lines(expected.after(4))
-        flux.wait_releases_ready()
-        assert {name: pods(flux)[name] for name in before} == before
+        flux.wait_releases()
+        assert {name: flux.pods()[name] for name in before} == before
         for step in (5, 6, 7, 8):
             world.step(step, expected.after(step))
     finally:
         world.generator.stop()
 
 
-def pods(domain: Domain | flux_view.Domain) -> dict[str, tuple[object, ...]]:
-    """A Deployment and its pods, by its name.
-
-    Its generation does not count: to apply it as another may write out what was a default.
-    """
-    found = {}
-    for item in domain.find("Deployment"):
-        uid, _, *below = domain.identity(item["metadata"]["name"])
-        found[item["metadata"]["name"]] = (uid, *below)
-    return found
-
-
 def from_flux(domain: flux_view.Domain) -> None:
-    """Suspend what would remove the releases."""
+    """Suspend everything that would remove the releases."""
     for kind in ("Kustomization", "HelmRelease"):
         for item in domain.find(kind):
             domain.kube.patch(kind, item["metadata"]["name"], SUSPENDED, domain.namespace)
 
 
 def upgrade(world: FluxWorld, gitops: str) -> str:
-    """Go over to a controller in one commit, while the generator runs; return the commit."""
+    """Move to a controller in one commit while the generator runs; return the commit."""
     before = world.tip()
     options = ("--gitops", gitops, "--output", "json")
-    said = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)
+    output = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)
     assert world.commits_since(before) == 1
-    commit = json.loads(said)["commit"]
+    commit = json.loads(output)["commit"]
     assert commit == world.tip()
     return str(commit)
 
 
 def to_argocd(world: FluxWorld) -> Domain:
-    """Have everything rendered for Argo CD, let it follow, and demand the next step."""
+    """Render everything for Argo CD, let it follow, and demand the next step."""
     upgraded = upgrade(world, "argocd")
     manifests = list(yaml.safe_load_all(world.file(f"bootstrap/{CLUSTER}.yaml")))
     world.rig.kube.apply(*manifests)
@@ -111,17 +99,17 @@ def to_argocd(world: FluxWorld) -> Domain:
     destination = folder["spec"]["destination"]["namespace"]
     domain = Domain(world.rig.kube, destination, folder["metadata"]["name"])
     domain.wait_applied(upgraded)
-    domain.wait_releases_synced()
+    domain.wait_releases()
     sent = world.demand(expected.demand(2))
     domain.wake()
     domain.wait_applied(sent.commit)
-    domain.wait_releases_synced()
+    domain.wait_releases()
     return domain
 
 
 def forget_flux(domain: flux_view.Domain) -> None:
-    """Delete Flux's objects, which remove nothing while suspended, and Helm's notes."""
-    for kind in FLUXS:
+    """Delete Flux's objects, which remove nothing while suspended, and Helm's records."""
+    for kind in FLUX_KINDS:
         for item in domain.find(kind):
             name = item["metadata"]["name"]
             domain.kube.delete(kind, name, domain.namespace)
@@ -132,9 +120,12 @@ def forget_flux(domain: flux_view.Domain) -> None:
 
 
 def forget_argocd(domain: Domain) -> None:
-    """Delete the Applications without what they hold: the folder's first, or it restores them."""
-    found = [(domain.name, CONTROL), *((name, domain.namespace) for name in domain.releases())]
-    for name, namespace in found:
+    """Delete the Applications, not their objects. The folder's is first: it restores others."""
+    apps = [
+        (domain.name, CONTROL),
+        *((name, domain.namespace) for name in domain.releases()),
+    ]
+    for name, namespace in apps:
         domain.kube.patch("Application", name, {"metadata": {"finalizers": None}}, namespace)
         domain.kube.delete("Application", name, namespace)
         domain.kube.wait_gone("Application", name, namespace)
@@ -142,7 +133,7 @@ def forget_argocd(domain: Domain) -> None:
 
 
 def to_flux(world: FluxWorld) -> None:
-    """Have everything rendered for Flux, and let it follow while demands go on."""
+    """Render everything for Flux, and let it follow while demands continue."""
     upgrade(world, "flux")
     world.demand(expected.demand(4))
     world.bootstrap(CLUSTER, world.rig)

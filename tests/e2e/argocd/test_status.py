@@ -1,4 +1,4 @@
-"""The requester hears what came of it with Argo CD."""
+"""The requester learns with Argo CD whether its services run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.common.access import access_file, documented_roles, limited
-from tests.e2e.common.answers import TIMEOUT_S, Answers, restarted
+from tests.e2e.common.answers import TIMEOUT_S, Answers, restart_generator
 from tests.e2e.common.ros import Client
 from tests.e2e.rig.cluster import Rig
 
@@ -20,26 +20,22 @@ from .world import World
 def world(
     rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[World]:
-    """With the rights that docs/status.md asks for."""
+    """A state repo whose generator has the rights that docs/status.md requires."""
     made = World(rig, tmp_path_factory.mktemp("world"), ros_domain, client)
     try:
         made.bootstrap(CLUSTER)
         rights = documented_roles("argo cd")
         kubeconfig = limited(rig.kube, rig.kubeconfig, made.folder, rights)
         access_file(made.folder, CLUSTER, kubeconfig=kubeconfig)
-        restarted(made, TIMEOUT_S)
+        restart_generator(made, TIMEOUT_S)
         yield made
     finally:
         made.remove()
 
 
 class TestArgoCD(Answers):
-    """What is particular to Argo CD."""
+    """The tests with Argo CD."""
 
-    def all_applied(self, world: Any) -> None:
-        """Each Application is Synced."""
-        world.domain.wait_releases_synced()
-
-    def mended(self, world: Any) -> None:
-        """A chart in a folder is looked at every few minutes, or when somebody asks for it."""
+    def read_repaired_chart(self, world: Any) -> None:
+        """Argo CD reads a chart folder only every few minutes, or on request."""
         world.domain.refresh("od-edge-vehicle00")

@@ -1,12 +1,18 @@
-"""What nobody demanded does not change: a further requester, and what is changed by hand."""
+"""Releases do not change without a demand: another requester, and manual changes."""
 
 from __future__ import annotations
 
 import pytest
 
 from tests.e2e.common import expected
-from tests.e2e.common.byhand import asked_by, change_image, empty, pod_template, wait_for
 from tests.e2e.common.expected import DETECTION, FUSION, source_end, target_end
+from tests.e2e.common.manual import (
+    change_image,
+    overwrite,
+    pod_template,
+    requested_by,
+    wait_restored,
+)
 
 from .world import World
 
@@ -15,27 +21,27 @@ PLAIN, OTHER = source_end("vehicle00"), target_end("station00")
 
 @pytest.fixture
 def running(world: World) -> World:
-    """Step 1 runs, whatever ran before, and nothing changes any more."""
+    """The state repo after step 1, with nothing left to reconcile."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
-    world.domain.wait_releases_synced()
+    world.domain.wait_releases()
     return world
 
 
-def test_a_further_requester_changes_no_object_of_a_release(running: World) -> None:
+def test_another_requester_changes_no_object_of_a_release(running: World) -> None:
     domain = running.domain
-    before, asked = domain.wait_quiet(), domain.releases()
-    sent = running.demand(asked_by("vehicle03", expected.demand(1)))
+    before, releases = domain.wait_quiet(), domain.releases()
+    sent = running.demand(requested_by("vehicle03", expected.demand(1)))
     assert running.changed_by(sent.commit)
     assert all(path.startswith("ledger/") for path in running.changed_by(sent.commit))
     running.follow(sent, expected.after(1))
-    for release in asked:
+    for release in releases:
         domain.refresh(release)
     assert domain.wait_quiet(2.0) == before
-    assert domain.releases() == asked
-    goal = asked_by("vehicle03", expected.demand(1))
+    assert domain.releases() == releases
+    goal = requested_by("vehicle03", expected.demand(1))
     running.follow(running.demand(goal | {"shutdown": True}), expected.after(1))
     assert domain.wait_quiet() == before
-    assert domain.releases() == asked
+    assert domain.releases() == releases
 
 
 def test_what_a_release_holds_is_restored(running: World) -> None:
@@ -43,22 +49,22 @@ def test_what_a_release_holds_is_restored(running: World) -> None:
     detection, params = DETECTION["vehicle00"], f"{FUSION}-params"
     template, inputs = pod_template(domain, detection), domain.get("ConfigMap", params)["data"]
     change_image(domain, detection)
-    empty(domain, params, "params.yml")
-    wait_for(domain, template, inputs, detection, params)
+    overwrite(domain, params, "params.yml")
+    wait_restored(domain, template, inputs, detection, params)
 
     domain.kube.delete("Deployment", detection, domain.namespace)
     domain.kube.delete("ConfigMap", params, domain.namespace)
     domain.wait_lines(expected.after(1))
-    wait_for(domain, template, inputs, detection, params)
+    wait_restored(domain, template, inputs, detection, params)
 
 
 def test_plain_manifests_and_releases_are_restored(running: World) -> None:
     domain = running.domain
     template, topics = pod_template(domain, PLAIN), domain.get("ConfigMap", PLAIN)["data"]
     change_image(domain, PLAIN)
-    empty(domain, PLAIN, "params.yaml")
+    overwrite(domain, PLAIN, "params.yaml")
     gone = [("Deployment", OTHER), ("ConfigMap", OTHER), ("Application", DETECTION["station00"])]
     for kind, name in gone:
         domain.kube.delete(kind, name, domain.namespace)
     domain.wait_lines(expected.after(1))
-    wait_for(domain, template, topics, PLAIN, PLAIN)
+    wait_restored(domain, template, topics, PLAIN, PLAIN)

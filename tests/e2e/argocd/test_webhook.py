@@ -1,4 +1,4 @@
-"""Argo CD's own server takes the generator's signed calls, and no others."""
+"""Argo CD's own server accepts only the generator's signed calls."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from demandops.cluster import controller_webhook
 from demandops_ros import DemandClient
 
 from tests.e2e.common.access import access_file, documented_roles, limited
-from tests.e2e.common.answers import TIMEOUT_S, fusion, restarted, with_chart
+from tests.e2e.common.answers import TIMEOUT_S, fusion, push_chart, restart_generator
 from tests.e2e.common.namespace import name_of
 from tests.e2e.common.ros import Client
 from tests.e2e.rig.argocd import SERVER, WEBHOOK_SECRET
@@ -26,9 +26,9 @@ OF_CHART = "\n---\napiVersion: v1\nkind: ConfigMap\nmetadata: {name: {{ .Release
 def world(
     rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[World]:
-    """Its generator calls the webhook, and may read the cluster and change nothing there."""
+    """A state repo whose generator calls the webhook and may only read the cluster."""
     if rig.existing:
-        pytest.skip("the secret of this Argo CD's webhook is not known here")
+        pytest.skip("the tests do not know the webhook secret of an existing Argo CD")
     made = World(rig, tmp_path_factory.mktemp("world"), ros_domain, client)
     try:
         made.bootstrap(CLUSTER)
@@ -49,21 +49,15 @@ def world(
             webhook=f"{rig.url(SERVER)}/api/webhook",
             secret_file=secret,
         )
-        restarted(made, TIMEOUT_S)
+        restart_generator(made, TIMEOUT_S)
         yield made
     finally:
         made.remove()
 
 
 @pytest.fixture
-def asker(ros_domain: int) -> Iterator[DemandClient]:
-    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=2 * TIMEOUT_S) as made:
-        yield made
-
-
-@pytest.fixture
 def refreshed(rig: Rig) -> Callable[[], set[str]]:
-    """The Applications that the server had looked at since the test began or it was asked last."""
+    """Return the Applications that the server refreshed since the last call."""
     log, seen = rig.log(SERVER), rig.log(SERVER).stat().st_size
 
     def names() -> set[str]:
@@ -72,34 +66,34 @@ def refreshed(rig: Rig) -> Callable[[], set[str]]:
             file.seek(seen)
             text = file.read().decode()
         seen += len(text.encode())
-        said = (line for line in text.splitlines() if "from webhook" in line)
-        return {line.split("refreshing app '")[1].split("'")[0] for line in said}
+        lines = (line for line in text.splitlines() if "from webhook" in line)
+        return {line.split("refreshing app '")[1].split("'")[0] for line in lines}
 
     return names
 
 
-def test_a_push_is_heard_of_and_only_what_changed_is_looked_at(
-    world: World, asker: DemandClient, refreshed: Callable[[], set[str]]
+def test_a_push_refreshes_only_what_changed(
+    world: World, requester: DemandClient, refreshed: Callable[[], set[str]]
 ) -> None:
-    asker.put("d", [fusion("vehicle00")], answer="healthy")
-    refreshed()  # with the first call everything may be
-    answer = asker.put("e", [fusion("vehicle00")], answer="healthy")
+    requester.put("d", [fusion("vehicle00")], answer="healthy")
+    refreshed()  # the first webhook call may refresh everything
+    answer = requester.put("e", [fusion("vehicle00")], answer="healthy")
     assert all(path.startswith("ledger/") for path in world.changed_by(answer.commit))
     assert refreshed() == {world.domain.name}
-    asker.release("e")
+    requester.release("e")
 
 
-def test_a_chart_edited_in_its_folder_is_what_healthy_is_of(
-    world: World, asker: DemandClient, refreshed: Callable[[], set[str]]
+def test_healthy_means_that_a_chart_edited_in_its_folder_runs(
+    world: World, requester: DemandClient, refreshed: Callable[[], set[str]]
 ) -> None:
-    asker.put("d", [fusion("vehicle00")], answer="healthy")
-    whole = with_chart(world, OF_CHART)
-    asker.put("d", [fusion("vehicle00", "vehicle01")], answer="healthy")
+    requester.put("d", [fusion("vehicle00")], answer="healthy")
+    old = push_chart(world, OF_CHART)
+    requester.put("d", [fusion("vehicle00", "vehicle01")], answer="healthy")
     made = {name_of(item) for item in world.domain.find("ConfigMap")}
     assert "od-edge-vehicle00-new" in made
     assert "od-edge-vehicle00" in refreshed()
-    world.push(dict(whole))
-    asker.send({"operation": "release", "demand": "d", "answer": "healthy"})
+    world.push(dict(old))
+    requester.send({"operation": "release", "demand": "d", "answer": "healthy"})
 
 
 @pytest.mark.parametrize("secret", [None, b"another"])

@@ -1,6 +1,6 @@
-"""One access domain on one cluster that Argo CD keeps: its folder's Application and its releases.
+"""An access domain on a cluster that Argo CD reconciles: its folder's Application and its releases.
 
-It reads the API and asks Argo CD to look; it changes nothing that Argo CD or a release owns.
+It reads the API and triggers Argo CD; it changes no object that Argo CD or a release owns.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 from tests.e2e.common.namespace import Namespace, name_of
 from tests.e2e.rig.argocd import NAMESPACE
 from tests.e2e.rig.errors import RigError
-from tests.e2e.rig.kube import Kube, Manifest
+from tests.e2e.rig.kube import Manifest
 
 _REFRESH = "argocd.argoproj.io/refresh"
 
@@ -21,71 +21,67 @@ class Domain(Namespace):
 
     RELEASE = "Application"
 
-    def __init__(self, kube: Kube, namespace: str, name: str) -> None:
-        super().__init__(kube, namespace)
-        self.name = name
-
-    # --- looking ----------------------------------------------------------------------------
+    # --- reading ----------------------------------------------------------------------------
 
     def releases(self) -> dict[str, Any]:
-        """What is asked for of every release, by its name: all but what Argo CD notes there."""
+        """Return the spec of every release's Application, by its name."""
         return {name_of(item): item["spec"] for item in self.find("Application")}
 
     def fetched(self) -> str:
-        """The commit that the folder was last compared with."""
+        """Return the commit that the folder was last compared with."""
         return str(self._sync().get("revision", ""))
 
     def applied(self) -> str:
-        """The commit that the folder was found to be applied from, once nothing is under way."""
+        """Return the commit that the folder is in sync with; empty during an operation."""
         found = self._folder()
         under_way = bool(found.get("operation"))
         return self.fetched() if self._sync().get("status") == "Synced" and not under_way else ""
 
     def trouble(self, name: str, namespace: str) -> str:
-        """What Argo CD says against an Application; empty where nothing."""
+        """Return what Argo CD reports against an Application; empty if it reports nothing."""
         status = (self.kube.get("Application", name, namespace) or {}).get("status") or {}
-        told = [condition["message"] for condition in status.get("conditions") or []]
+        messages = [condition["message"] for condition in status.get("conditions") or []]
         operation = status.get("operationState") or {}
         if operation.get("phase") not in (None, "Succeeded"):
-            told.append(f"{operation['phase']}: {operation.get('message', '')}")
+            messages.append(f"{operation['phase']}: {operation.get('message', '')}")
             results = (operation.get("syncResult") or {}).get("resources") or []
-            told += [
+            messages += [
                 f"{item['kind']} {item['name']}: {item['message']}"
                 for item in results
                 if item.get("status") not in ("Synced", "Pruned", None)
             ]
-        return "; ".join(told)
+        return "; ".join(messages)
 
     # --- waiting ----------------------------------------------------------------------------
 
     def wake(self) -> None:
-        """Ask for a look at the folder now; what changes there wakes its releases."""
+        """Refresh the folder now; its changes trigger its releases."""
         self.refresh(self.name, NAMESPACE)
 
     def refresh(self, name: str, namespace: str = "") -> None:
-        """Ask for a look at one Application now, and wait until it was taken."""
+        """Refresh one Application now, and wait until Argo CD has done so."""
         namespace = namespace or self.namespace
         body = {"metadata": {"annotations": {_REFRESH: "normal"}}}
         self.kube.patch("Application", name, body, namespace)
 
-        def taken() -> bool:
+        def refreshed() -> bool:
             found = self.kube.get("Application", name, namespace) or {"metadata": {}}
             return _REFRESH not in (found["metadata"].get("annotations") or {})
 
-        self.kube.wait(f"Application {namespace}/{name} to be looked at", taken)
+        self.kube.wait(f"Application {namespace}/{name} to be refreshed", refreshed)
 
     def wait_fetched(self, commit: str) -> float:
-        """Wait until the folder was compared with a commit; returns when it was seen."""
+        """Wait until the folder was compared with a commit; return when that was seen."""
         self._wait_for(f"{commit[:10]} to be fetched", commit, fetched=True)
         return time.monotonic()
 
     def wait_applied(self, commit: str) -> float:
-        """Wait until the folder is applied from a commit; returns when it was seen."""
+        """Wait until the folder is applied from a commit; return when that was seen."""
         self._wait_for(f"{commit[:10]} to be applied", commit, fetched=False)
         return time.monotonic()
 
-    def wait_releases_synced(self) -> None:
-        """Wait until every release is as its Application asks."""
+    def wait_releases(self) -> None:
+        """Wait until the Application of every release is Synced."""
 
         def synced() -> bool:
             states = [item.get("status", {}).get("sync", {}) for item in self.find("Application")]
@@ -106,6 +102,6 @@ class Domain(Namespace):
         try:
             self.kube.wait(what, lambda: look() == commit)
         except RigError as error:
-            told = [self.trouble(self.name, NAMESPACE)]
-            told += [self.trouble(name, self.namespace) for name in self.releases()]
-            raise AssertionError(f"{error}; {'; '.join(filter(None, told))}") from error
+            messages = [self.trouble(self.name, NAMESPACE)]
+            messages += [self.trouble(name, self.namespace) for name in self.releases()]
+            raise AssertionError(f"{error}; {'; '.join(filter(None, messages))}") from error

@@ -1,1 +1,1 @@
-"""The real chain: a ROS 2 goal becomes a commit, and Flux makes a cluster look like it."""
+"""What the tests of both controllers share, from a ROS 2 goal to the pods."""

@@ -1,4 +1,4 @@
-"""How the generator reaches a cluster: the operator's file, and a kubeconfig with few rights."""
+"""The access file of a cluster and a kubeconfig with few rights."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _ACCOUNT = "generator"
 _STATUS_PAGE = Path(__file__).parents[3] / "docs" / "status.md"
 
 
-def access_file(folder: Path, cluster: str, **reached: object) -> Path:
-    """What the operator of the generator writes."""
+def access_file(folder: Path, cluster: str, **connection: object) -> Path:
+    """Write the file in which the operator says how to reach a cluster."""
     file = folder / "clusters.yaml"
-    clusters = {cluster: {key: str(value) for key, value in reached.items()}}
+    clusters = {cluster: {key: str(value) for key, value in connection.items()}}
     content = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": clusters}
     file.write_text(yaml.safe_dump(content))
     return file
 
 
 def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
-    """The rights that docs/status.md asks for with a controller, by namespace."""
+    """Return the rights that docs/status.md requires with a controller, by namespace."""
     blocks = re.findall(r"```yaml\n(.*?)```", _STATUS_PAGE.read_text(), re.DOTALL)
     (block,) = [text for text in blocks if f"# with {gitops}\n" in text.lower()]
     roles = list(yaml.safe_load_all(block))
@@ -37,7 +37,7 @@ def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
 def limited(
     kube: Kube, administrator: Path, folder: Path, rights: Mapping[str, Sequence[Manifest]]
 ) -> Path:
-    """A kubeconfig that has these rights in these namespaces and no others."""
+    """Write a kubeconfig that has only these rights in these namespaces."""
     home, *_ = rights
     subject = {"kind": "ServiceAccount", "name": _ACCOUNT, "namespace": home}
     role = {"apiGroup": _RBAC, "kind": "Role", "name": _ACCOUNT}
@@ -54,9 +54,9 @@ def limited(
     def token() -> str:
         return str(((kube.get("Secret", _ACCOUNT, home) or {}).get("data") or {}).get("token", ""))
 
-    found = base64.b64decode(kube.wait("a token", token)).decode()
+    token_text = base64.b64decode(kube.wait("a token", token)).decode()
     config = yaml.safe_load(administrator.read_text())
-    config["users"] = [{"name": _ACCOUNT, "user": {"token": found}}]
+    config["users"] = [{"name": _ACCOUNT, "user": {"token": token_text}}]
     (context,) = [c for c in config["contexts"] if c["name"] == config["current-context"]]
     context["context"]["user"] = _ACCOUNT
     config["contexts"] = [context]
@@ -65,8 +65,8 @@ def limited(
     return file
 
 
-def _object(version: str, kind: str, namespace: str, **rest: Any) -> dict[str, Any]:
+def _object(version: str, kind: str, namespace: str, **fields: Any) -> dict[str, Any]:
     metadata: dict[str, Any] = {"name": _ACCOUNT, "namespace": namespace}
     if kind == "Secret":
         metadata["annotations"] = {"kubernetes.io/service-account.name": _ACCOUNT}
-    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}
+    return {"apiVersion": version, "kind": kind, "metadata": metadata, **fields}

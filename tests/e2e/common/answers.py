@@ -1,7 +1,6 @@
-"""When goals are answered, tried the same way with each controller.
+"""Tests of when goals are answered, the same with each controller.
 
-A module of tests takes :class:`Answers` as a base of its own class, and says in it how a world
-comes about (`world`) and what is particular to its controller.
+A test module derives its class from :class:`Answers` and defines the fixture `world`.
 """
 
 from __future__ import annotations
@@ -9,16 +8,15 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import pytest
 from demandops_ros import DemandClient, DemandError
 
 from tests.e2e.common.namespace import Namespace, fusion_inputs, name_of
-from tests.e2e.common.staterepo import Generator, demandops
+from tests.e2e.common.staterepo import StateRepo, demandops
 from tests.e2e.rig.cluster import Rig
 
 TIMEOUT_S = 60.0
@@ -33,47 +31,36 @@ _POINTS = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 
 
 def ego(vehicle: str) -> dict[str, str]:
-    """An input of the fusion."""
+    """Return an input of the fusion."""
     return {"topic": f"/vehicles/{vehicle}/ego_data", "source": vehicle}
 
 
 def fusion(*vehicles: str) -> dict[str, Any]:
-    """A fusion of what these vehicles tell of themselves, and of the first's point cloud."""
+    """Return a fusion of these vehicles' ego data and of the first vehicle's point cloud."""
     cloud = {"topic": _POINTS, "source": "vehicle00"}
     return {
         "id": "edge/fusion",
         "type": "object-detection-fusion",
         "node": "edge",
-        "inputs": {"ego_data": [ego(one) for one in vehicles], "point_cloud": [cloud]},
+        "inputs": {"ego_data": [ego(vehicle) for vehicle in vehicles], "point_cloud": [cloud]},
     }
 
 
 FUSION = fusion("vehicle00")
 
 
-class World(Protocol):
-    """What is asked of a state repo that a controller follows."""
-
-    folder: Path
-    push_url: str
-    generator: Generator
-
-    @property
-    def domain(self) -> Any: ...
-    def file(self, path: str) -> str: ...
-    def tip(self) -> str: ...
-    def push(self, files: Mapping[str, str | None], message: str = ...) -> str: ...
+World = StateRepo[Any]
 
 
-def restarted(world: World, timeout_s: float) -> None:
-    """Have the generator give up on its goals after so long."""
+def restart_generator(world: World, timeout_s: float) -> None:
+    """Restart the generator with a time-out for its answers."""
     world.generator.stop()
     file = str(world.folder / "clusters.yaml")
     world.generator.start("--clusters", file, "--ros-args", "-p", f"answer_timeout:={timeout_s}")
 
 
 def unavailable(domain: Namespace) -> list[str]:
-    """The Deployments that are not there whole at this moment."""
+    """Return the Deployments that lack available replicas now."""
     return [
         name_of(item)
         for item in domain.find("Deployment")
@@ -81,60 +68,39 @@ def unavailable(domain: Namespace) -> list[str]:
     ]
 
 
-def with_chart(world: World, added: str) -> dict[str, str]:
-    """Push a new version of the detection's chart with a text added; returns what was there."""
-    whole = {path: world.file(path) for path in (CHART, *_VERSIONS)}
+def push_chart(world: World, added: str) -> dict[str, str]:
+    """Push a new version of the detection's chart with added text; return the old files."""
+    old = {path: world.file(path) for path in (CHART, *_VERSIONS)}
     new = {
-        path: whole[path].replace(f"{before}0.1.0", f"{before}0.1.1")
+        path: old[path].replace(f"{before}0.1.0", f"{before}0.1.1")
         for path, before in _VERSIONS.items()
     }
-    world.push({**new, CHART: whole[CHART] + added})
-    return whole
+    world.push({**new, CHART: old[CHART] + added})
+    return old
 
 
 class Answers:
-    """The requester hears what came of it: goals answered at reconciled or healthy, or why not."""
+    """Goals are answered when they are reconciled or healthy, or with the reason why not."""
 
-    def all_applied(self, world: Any) -> None:
-        """Wait until the controller has nothing left to do but to wait for pods."""
-        raise NotImplementedError
+    def read_repaired_chart(self, world: World) -> None:
+        """Make the controller read a repaired chart, if it does not do so itself."""
 
-    def mended(self, world: World) -> None:
-        """Have the controller look at a chart that was mended, where it does not by itself."""
-
-    @pytest.fixture
-    def asker(self, ros_domain: int) -> Iterator[DemandClient]:
-        with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=2 * TIMEOUT_S) as made:
-            yield made
-
-    @pytest.fixture
-    def edge_is_full(self, rig: Rig) -> Iterator[Callable[[], None]]:
-        """No pod is scheduled on the edge until it is called."""
-        (edge,) = rig.kube.find("Node", selector="node_id=edge")
-
-        def unschedulable(value: bool | None) -> None:
-            rig.kube.patch("Node", name_of(edge), {"spec": {"unschedulable": value}})
-
-        unschedulable(True)
-        yield lambda: unschedulable(None)
-        unschedulable(None)
-
-    def test_answered_at_healthy_when_it_is_and_at_gone_when_it_is(
-        self, world: World, asker: DemandClient
+    def test_answered_when_it_is_healthy_and_when_it_is_gone(
+        self, world: World, requester: DemandClient
     ) -> None:
         domain = world.domain
-        told: list[str] = []
-        with asker.demand(
-            "d", [FUSION], answer="healthy", on_stage=lambda stage, _: told.append(stage)
+        stages: list[str] = []
+        with requester.demand(
+            "d", [FUSION], answer="healthy", on_stage=lambda stage, _: stages.append(stage)
         ) as held:
             names = {name_of(item) for item in domain.find("Deployment")}
             assert unavailable(domain) == []
             assert {"od-edge-vehicle00"} < names and len(names) == 4
             assert held.answer is not None and held.answer.reached == "healthy"
-            assert told[-2:] == ["reconciled", "healthy"]
+            assert stages[-2:] == ["reconciled", "healthy"]
             assert domain.applied() == held.commit
-        domain.wait_applied(world.tip())  # the release, which was answered at pushed
-        answer = asker.put("d", [FUSION], answer="healthy")
+        domain.wait_applied(world.tip())  # the release was answered when it was pushed
+        answer = requester.put("d", [FUSION], answer="healthy")
         assert answer.outcome == "booked"
         file = str(world.folder / "clusters.yaml")
         where = ("--state-repo", world.push_url, "--clusters", file, "--output", "json")
@@ -142,99 +108,99 @@ class Answers:
         assert {row["health"] for row in status["releases"]} == {"healthy"}
         assert {row["seen"] for row in status["releases"]} == {status["commit"]} == {answer.commit}
         assert all(row["since"] for row in status["releases"]) and len(status["releases"]) == 4
-        gone = asker.send({"operation": "release", "demand": "d", "answer": "healthy"})
+        gone = requester.send({"operation": "release", "demand": "d", "answer": "healthy"})
         assert gone.reached == "healthy"
         assert domain.find(domain.RELEASE) == [] and domain.find("Deployment") == []
 
-    def test_a_change_of_what_runs_is_healthy_when_it_runs_changed(
-        self, world: World, asker: DemandClient
+    def test_a_change_is_healthy_when_the_changed_service_runs(
+        self, world: World, requester: DemandClient
     ) -> None:
-        """What was healthy before the change does not count."""
+        """Health from before the change does not count."""
         domain = world.domain
-        asker.put("d", [FUSION], answer="healthy")
+        requester.put("d", [FUSION], answer="healthy")
         for vehicles in (("vehicle00", "vehicle01"), ("vehicle00",), ("vehicle00", "vehicle02")):
-            answer = asker.put("d", [fusion(*vehicles)], answer="healthy")
+            answer = requester.put("d", [fusion(*vehicles)], answer="healthy")
             (config,) = [
                 item
                 for item in domain.find("ConfigMap")
                 if name_of(item).startswith("of-edge-") and name_of(item).endswith("-params")
             ]
-            taken = {topic for topic in fusion_inputs(config) if topic.endswith("ego_data")}
-            assert {ego(one)["topic"] for one in vehicles} == taken, answer
+            inputs = {topic for topic in fusion_inputs(config) if topic.endswith("ego_data")}
+            assert {ego(vehicle)["topic"] for vehicle in vehicles} == inputs, answer
             assert unavailable(domain) == []
-        asker.send({"operation": "release", "demand": "d", "answer": "healthy"})
+        requester.send({"operation": "release", "demand": "d", "answer": "healthy"})
 
     def test_not_answered_before_it_is_healthy(
-        self, world: World, asker: DemandClient, edge_is_full: Callable[[], None], rig: Rig
+        self, world: World, requester: DemandClient, edge_is_full: Callable[[], None], rig: Rig
     ) -> None:
-        """Reconciled comes at once; healthy waits until the edge takes pods again."""
+        """Reconciled comes at once; healthy comes when the edge accepts pods again."""
         reconciled = threading.Event()
 
-        def told(stage: str, text: str) -> None:
+        def on_stage(stage: str, text: str) -> None:
             if stage == "reconciled":
                 reconciled.set()
 
         with ThreadPoolExecutor(1) as pool:
-            waiting = pool.submit(asker.put, "d", [FUSION], answer="healthy", on_stage=told)
+            waiting = pool.submit(requester.put, "d", [FUSION], answer="healthy", on_stage=on_stage)
             assert reconciled.wait(TIMEOUT_S)
             rig.kube.wait("all Deployments", lambda: len(world.domain.find("Deployment")) == 4)
-            self.all_applied(world)
+            world.domain.wait_releases()
             time.sleep(2)
             assert not waiting.done()
             assert unavailable(world.domain) != []
             edge_is_full()
             assert waiting.result(TIMEOUT_S).reached == "healthy"
         assert unavailable(world.domain) == []
-        asker.release("d")
+        requester.release("d")
 
-    def test_what_cannot_become_ready_is_told_with_the_reason_in_time(
-        self, world: World, asker: DemandClient, edge_is_full: Callable[[], None]
+    def test_what_cannot_become_ready_is_reported_in_time_with_the_reason(
+        self, world: World, requester: DemandClient, edge_is_full: Callable[[], None]
     ) -> None:
-        restarted(world, SHORT_S)
+        restart_generator(world, SHORT_S)
         start = time.monotonic()
         with pytest.raises(DemandError) as caught:
-            asker.put("d", [FUSION], answer="healthy")
+            requester.put("d", [FUSION], answer="healthy")
         assert caught.value.code == "not-healthy"
         assert time.monotonic() - start < 3 * SHORT_S
-        said = str(caught.value)
-        assert "Deployment perception/" in said and "not scheduled: " in said
-        assert f"it is booked in {world.tip()}" in said
-        # nothing was lost: the demand stands, and is healthy once the edge takes pods
+        message = str(caught.value)
+        assert "Deployment perception/" in message and "not scheduled: " in message
+        assert f"it is booked in {world.tip()}" in message
+        # the demand is still booked, and is healthy once the edge accepts pods
         edge_is_full()
-        restarted(world, TIMEOUT_S)
-        assert asker.put("d", [FUSION], answer="healthy").outcome == "unchanged"
-        asker.release("d")
+        restart_generator(world, TIMEOUT_S)
+        assert requester.put("d", [FUSION], answer="healthy").outcome == "unchanged"
+        requester.release("d")
 
-    def test_what_the_controller_refuses_is_told_in_its_words(
-        self, world: World, asker: DemandClient
+    def test_a_refusal_of_the_controller_is_reported_with_its_reason(
+        self, world: World, requester: DemandClient
     ) -> None:
-        """A chart that cannot be installed; the goal says which release, and what is said of it."""
-        restarted(world, SHORT_S)
-        whole = with_chart(world, '{{ fail "no lidar here" }}\n')
+        """The answer names the release that cannot be installed, and the controller's reason."""
+        restart_generator(world, SHORT_S)
+        old = push_chart(world, '{{ fail "no lidar here" }}\n')
         with pytest.raises(DemandError) as caught:
-            asker.put("d", [FUSION], answer="healthy")
+            requester.put("d", [FUSION], answer="healthy")
         assert caught.value.code == "not-healthy"
         assert f"{world.domain.RELEASE} perception/od-edge-vehicle00: " in str(caught.value)
         assert "no lidar here" in str(caught.value)
-        world.push(dict(whole))
-        restarted(world, TIMEOUT_S)
+        world.push(dict(old))
+        restart_generator(world, TIMEOUT_S)
         with ThreadPoolExecutor(1) as pool:
-            waiting = pool.submit(asker.put, "d", [FUSION], answer="healthy")
-            self.mended(world)
+            waiting = pool.submit(requester.put, "d", [FUSION], answer="healthy")
+            self.read_repaired_chart(world)
             assert waiting.result(2 * TIMEOUT_S).reached == "healthy"
-        asker.release("d")
+        requester.release("d")
 
     def test_an_api_server_that_is_killed_delays_the_answer_and_loses_nothing(
-        self, world: World, asker: DemandClient, rig: Rig
+        self, world: World, requester: DemandClient, rig: Rig
     ) -> None:
         if rig.existing:
-            pytest.skip("this cluster's API server is not ours to kill")
+            pytest.skip("the tests may not kill the API server of an existing cluster")
         rig.kill("kube-apiserver")
         try:
             with ThreadPoolExecutor(1) as pool:
                 pushed = threading.Event()
                 waiting = pool.submit(
-                    asker.put,
+                    requester.put,
                     "d",
                     [FUSION],
                     answer="healthy",
@@ -248,4 +214,4 @@ class Answers:
         finally:
             rig.restart("kube-apiserver")
         assert unavailable(world.domain) == []
-        asker.release("d")
+        requester.release("d")

@@ -1,7 +1,7 @@
-"""What must run after each step of the paper's experiment, as lines that a diff can show.
+"""The objects that must exist after each step of the paper's experiment, one per line.
 
-From the paper's table, not from the program: the names are written out here, and which of them
-exist follows from the rows that have requesters (`examples/experiment/paper.py`).
+They come from the paper's table, not from the program. The names are literals; a row of
+`examples/experiment/paper.py` with requesters decides which exist.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ _ENDS = {
     "vehicle03": ("f675fa2fc9b2", "b53be9798cf6"),
 }
 
-# What `_domain.yaml` holds, and what Kubernetes puts into every namespace.
-STANDING = frozenset({"ConfigMap demandops-domain", "ConfigMap kube-root-ca.crt"})
+# From `_domain.yaml`, and from Kubernetes, which adds one to every namespace.
+WITHOUT_DEMANDS = frozenset({"ConfigMap demandops-domain", "ConfigMap kube-root-ca.crt"})
 
 
 def demand(step: int) -> dict[str, Any]:
-    """The goal of a step."""
+    """Return the goal of a step."""
     (file,) = EXPERIMENT.glob(f"{step}-*.yaml")
     goal: dict[str, Any] = yaml.safe_load(file.read_text())
     return goal
 
 
 def title(step: int) -> str:
-    """What happens in a step."""
+    """Return what happens in a step."""
     return str(paper.STEPS[step - 1])
 
 
 def source_end(node: str) -> str:
-    """Name of the client at the source of a node's connection to the edge."""
+    """Return the name of the client at the source of a node's connection to the edge."""
     return f"mqtt-{node}-edge-source-{_ENDS[node][0]}"
 
 
 def target_end(node: str) -> str:
-    """Name of the client at the edge."""
+    """Return the name of the client at the edge."""
     return f"mqtt-{node}-edge-target-{_ENDS[node][1]}"
 
 
 def after(step: int, nodes: Collection[str] = NODES) -> frozenset[str]:
-    """All that must be in the namespace of a cluster with these nodes, and nothing else."""
+    """Return exactly what the namespace must contain on a cluster with these nodes."""
     rows = paper.expected(step) if step else {}
     lines = [line for row in rows for node, line in _of_row(row, rows) if node in nodes]
-    return STANDING | frozenset(lines)
+    return WITHOUT_DEMANDS | frozenset(lines)
 
 
 def _of_row(row: str, rows: dict[str, list[str]]) -> Iterator[tuple[str, str]]:
@@ -92,5 +92,5 @@ def _deployed(node: str, name: str) -> tuple[str, str]:
 
 
 def unscheduled(lines: frozenset[str]) -> frozenset[str]:
-    """The same with the edge's pods waiting for a node."""
+    """Return the lines with the edge's pods unscheduled."""
     return frozenset(line.replace(" on edge, ready", " on no node, not ready") for line in lines)

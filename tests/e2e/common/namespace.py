@@ -1,7 +1,6 @@
-"""One access domain's namespace on one cluster, as tests look at it: names, pods, versions.
+"""An access domain's namespace on a cluster, read by tests: names, pods, versions.
 
-It reads the API and changes nothing. What is particular to a GitOps controller is added by the
-`view` beside that controller's tests.
+Each controller's `view` module adds what is particular to it.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from .expected import FUSION
 
 _INSTANCE = "app.kubernetes.io/instance"
 
-# What can be in a domain's namespace by way of us; events, leases and the like are left out.
+# Kinds that our commits can create in a domain's namespace; no events, leases and the like.
 _OF_RELEASES = (
     "ConfigMap",
     "Deployment",
@@ -35,31 +34,34 @@ _OTHERS = ("Job", "Service")
 
 
 class Namespace:
-    """The namespace; a service's release is an object of the kind `RELEASE`."""
+    """The namespace; a service's release is an object of the kind `RELEASE`.
+
+    `name` is the controller's object that applies the domain's folder.
+    """
 
     RELEASE: ClassVar[str]
-    OWN: ClassVar[tuple[str, ...]] = ()  # further kinds of the controller's own
-    STEADY: ClassVar[tuple[str, ...]] = ()  # those that a commit about something else leaves alone
+    OWN: ClassVar[tuple[str, ...]] = ()  # further kinds that the controller owns
+    STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that an unrelated commit does not change
 
-    def __init__(self, kube: Kube, namespace: str) -> None:
-        self.kube, self.namespace = kube, namespace
+    def __init__(self, kube: Kube, namespace: str, name: str) -> None:
+        self.kube, self.namespace, self.name = kube, namespace, name
         self._node_ids: dict[str, str] = {}
 
-    # --- looking ----------------------------------------------------------------------------
+    # --- reading ----------------------------------------------------------------------------
 
     def get(self, kind: str, name: str) -> Manifest:
-        """An object that must be there."""
+        """Return an object that must exist."""
         found = self.kube.get(kind, name, self.namespace)
-        assert found is not None, f"{kind} {self.namespace}/{name} is not there"
+        assert found is not None, f"{kind} {self.namespace}/{name} does not exist"
         return found
 
     def find(self, kind: str, instance: str = "") -> list[Manifest]:
-        """The namespace's objects of a kind, or those of one release."""
+        """Return the namespace's objects of a kind, or those of one release."""
         selector = f"{_INSTANCE}={instance}" if instance else ""
         return self.kube.find(kind, self.namespace, selector)
 
     def lines(self) -> frozenset[str]:
-        """What is there, in the words of `expected`."""
+        """Return what exists, as lines of the form of `expected`."""
         found = [f"release {name_of(item)}" for item in self.find(self.RELEASE)]
         found += [f"Deployment {name_of(item)}" for item in self.find("Deployment")]
         for config in self.find("ConfigMap"):
@@ -71,12 +73,12 @@ class Namespace:
         return frozenset(found) | {f"twice: {line}" for line in repeated}
 
     def inventory(self) -> frozenset[str]:
-        """Kind and name of everything in the namespace, whoever made it."""
+        """Return kind and name of everything in the namespace, whoever created it."""
         kinds = (*_OF_RELEASES, *_OTHERS, self.RELEASE, *self.OWN)
         return frozenset(f"{kind} {name_of(item)}" for kind in kinds for item in self.find(kind))
 
     def versions(self) -> dict[str, str]:
-        """The resourceVersion of every object that a release is or owns."""
+        """Return the resourceVersion of each release and of each object that it owns."""
         return {
             f"{kind} {name_of(item)}": item["metadata"]["resourceVersion"]
             for kind in (*_OF_RELEASES, *self.STEADY)
@@ -84,26 +86,55 @@ class Namespace:
         }
 
     def identity(self, name: str) -> tuple[object, ...]:
-        """What changes when the pods of a Deployment are restarted, or were about to be."""
+        """Return what changes when the pods of a Deployment are restarted, or soon will be."""
         metadata = self.get("Deployment", name)["metadata"]
         pods = sorted(pod["metadata"]["uid"] for pod in self.find("Pod", name))
         sets = sorted(item["metadata"]["uid"] for item in self.find("ReplicaSet", name))
         return metadata["uid"], metadata["generation"], *pods, *sets
 
+    def pods(self) -> dict[str, tuple[object, ...]]:
+        """Return the UIDs of each Deployment and its pods, by the Deployment's name.
+
+        Without its generation: another controller that applies it may write out a default.
+        """
+        found = {}
+        for item in self.find("Deployment"):
+            uid, _, *below = self.identity(name_of(item))
+            found[name_of(item)] = (uid, *below)
+        return found
+
+    # --- what the controller does -------------------------------------------------------------
+
+    def wake(self) -> None:
+        """Make the controller look at the remote now."""
+        raise NotImplementedError
+
+    def wait_fetched(self, commit: str) -> float:
+        """Wait until the controller has fetched a commit; return when that was seen."""
+        raise NotImplementedError
+
+    def wait_applied(self, commit: str) -> float:
+        """Wait until the controller has applied a commit; return when that was seen."""
+        raise NotImplementedError
+
+    def wait_releases(self) -> None:
+        """Wait until the controller has done everything for the releases except await pods."""
+        raise NotImplementedError
+
     # --- waiting ----------------------------------------------------------------------------
 
     def wait_lines(self, wanted: frozenset[str], timeout: float = 60.0) -> float:
-        """Wait until there is exactly what is wanted; returns when it was seen."""
+        """Wait until exactly the wanted lines exist; return when that was seen."""
         return self._wait_same(self.lines, wanted, timeout)
 
     def wait_inventory(self, wanted: frozenset[str], timeout: float = 60.0) -> None:
-        """Wait until the namespace holds exactly what it held when `inventory` was asked."""
+        """Wait until `inventory` returns exactly this."""
         self._wait_same(self.inventory, wanted, timeout)
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
-        """Wait until no release's object has changed for a while; returns the versions.
+        """Wait until no release's object has changed for a while; return the versions.
 
-        A Deployment's status follows its pods at the controller's leisure: that is waited for.
+        This includes a Deployment's status, which the controller updates after its pods.
         """
         seen, since = self.versions(), time.monotonic()
 
@@ -114,13 +145,13 @@ class Namespace:
                 seen, since = now, time.monotonic()
             return time.monotonic() - since > seconds
 
-        self.kube.wait("the releases to come to rest", quiet, 60)
+        self.kube.wait("the releases to stop changing", quiet, 60)
         return seen
 
     # --- inside -----------------------------------------------------------------------------
 
     def _all_counted(self) -> bool:
-        """Whether every Deployment and ReplicaSet has counted its pods as they are wanted."""
+        """Return whether every Deployment and ReplicaSet has counted all its wanted pods."""
         return all(
             status.get("observedGeneration") == item["metadata"]["generation"]
             and status.get(counted, 0) == item["spec"]["replicas"]
@@ -168,14 +199,14 @@ class Namespace:
 
 
 def fusion_inputs(config: Manifest) -> list[str]:
-    """The topics that the fusion's ConfigMap tells it to take."""
+    """Return the fusion's input topics in its ConfigMap."""
     (parameters,) = yaml.safe_load(config["data"]["params.yml"]).values()
     inputs = parameters["ros__parameters"]["additional_inputs"]
     return [topic for topic in inputs["topics_egodata"] + inputs["topics_objectlist"] if topic]
 
 
 def name_of(item: Manifest) -> str:
-    """An object's name."""
+    """Return an object's name."""
     return str(item["metadata"]["name"])
 
 

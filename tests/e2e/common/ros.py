@@ -1,7 +1,7 @@
-"""A ROS 2 action client that notes when it hears what.
+"""A ROS 2 action client that records the time of each stage.
 
-It spins in a thread of its own, so that a test may wait for the cluster meanwhile and a stage is
-timed when it is told, not when somebody looks.
+It spins in its own thread, so each stage gets the time of its feedback while a test waits for
+the cluster.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ANSWER_S = 60.0
 
 @dataclass
 class Sent:
-    """A goal under way: the stages told so far by their time, and in the end the result."""
+    """A sent goal: the time of each stage so far, and finally the result."""
 
     at: float
     stages: dict[str, float] = field(default_factory=dict)
@@ -43,14 +43,14 @@ class Sent:
 
     @property
     def commit(self) -> str:
-        """The commit that the result names."""
+        """Return the commit that the result names."""
         return self.message.splitlines()[0].split()[-1]
 
-    def hears(self, stage: str, timeout: float = 60.0) -> None:
-        """Wait until a stage is told."""
+    def wait_stage(self, stage: str, timeout: float = 60.0) -> None:
+        """Wait for the feedback of a stage."""
         deadline = time.monotonic() + timeout
         while stage not in self.stages:
-            assert time.monotonic() < deadline, f"not told '{stage}', only {list(self.stages)}"
+            assert time.monotonic() < deadline, f"no feedback '{stage}', only {list(self.stages)}"
             time.sleep(0.005)
 
 
@@ -71,7 +71,7 @@ class Client:
         self._thread.start()
 
     def reaches_a_node(self) -> bool:
-        """Whether an action server is in sight."""
+        """Return whether the client sees an action server."""
         return bool(self._client.server_is_ready())
 
     def send(self, goal: Goal) -> Sent:
@@ -79,26 +79,26 @@ class Client:
         sent = Sent(time.monotonic())
         future = self._client.send_goal_async(
             fill_message(DeploymentRequest.Goal(), goal),
-            feedback_callback=lambda told: _hear(sent, told.feedback.message),
+            feedback_callback=lambda answer: _note_stage(sent, answer.feedback.message),
         )
         future.add_done_callback(lambda done: self._on_response(sent, done.result()))
         return sent
 
     def call(self, goal: Goal) -> Sent:
-        """Send a goal and wait for its result; one that nobody accepts is sent again.
+        """Send a goal and wait for its result; send it again if no node accepts it.
 
-        A server that was killed stays in sight of the client for a while and swallows goals.
+        The client still sees a killed server for a while, and goals to it are lost.
         """
         deadline = time.monotonic() + _ANSWER_S
         sent = self.send(goal)
         while not sent.accepted.wait(3):
-            assert time.monotonic() < deadline, "no node takes the goal"
+            assert time.monotonic() < deadline, "no node accepts the goal"
             sent = self.send(goal)
-        assert sent.answered.wait(_ANSWER_S), f"no result; told {list(sent.stages)}"
+        assert sent.answered.wait(_ANSWER_S), f"no result; feedback {list(sent.stages)}"
         return sent
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Leave the ROS graph."""
         self._executor.shutdown(timeout_sec=1)
         self._thread.join(5)
         self._node.destroy_node()
@@ -111,7 +111,7 @@ class Client:
         handle.get_result_async().add_done_callback(lambda done: _finish(sent, done.result()))
 
 
-def _hear(sent: Sent, message: str) -> None:
+def _note_stage(sent: Sent, message: str) -> None:
     sent.stages[message.split(maxsplit=1)[0]] = time.monotonic()
 
 

@@ -1,6 +1,6 @@
-"""A state repo of its own and the generator that writes it.
+"""A state repo and the generator that writes it.
 
-The generator is a real `demandops serve` that pushes to the rig's Git server by smart HTTP.
+The generator is a `demandops serve` process that pushes to the rig's Git server by smart HTTP.
 """
 
 from __future__ import annotations
@@ -13,14 +13,19 @@ import time
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from tests.e2e.rig import launch
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.errors import RigError
 
+from .expected import demand
+from .namespace import Namespace
 from .ros import Client, Sent
+from .timing import Times
+
+Domain = TypeVar("Domain", bound=Namespace)
 
 _READY = "taking demands on"
 _START_S = 60.0
@@ -38,10 +43,10 @@ class Generator:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self, *arguments: str) -> None:
-        """Start it and wait until it takes goals. It ends with this process, whatever ends that."""
+        """Start it and wait until it accepts goals. It dies with this process, even if killed."""
         command = launch.command(sys.executable, *self._command, *arguments)
         with self.log.open("ab") as log:
-            told = log.tell()
+            start = log.tell()
             self._process = subprocess.Popen(
                 command,
                 env=self._environment,
@@ -50,20 +55,22 @@ class Generator:
                 stderr=subprocess.STDOUT,
             )
         deadline = time.monotonic() + _START_S
-        while not (_READY in self._said(told) and self._client.reaches_a_node()):
+        while not (_READY in self._log_since(start) and self._client.reaches_a_node()):
             ended = self._process.poll() is not None
             if ended or time.monotonic() > deadline:
-                raise RigError(f"the generator takes no demands; {self.log}:\n{self._said(told)}")
+                raise RigError(
+                    f"the generator accepts no demands; {self.log}:\n{self._log_since(start)}"
+                )
             time.sleep(0.05)
 
     def kill(self) -> None:
-        """End it as a crash would."""
+        """Kill it, like a crash."""
         assert self._process is not None
         self._process.kill()
         self._process.wait(10)
 
     def stop(self) -> None:
-        """End it in order, or at once where it does not."""
+        """Ask it to end, and kill it if it does not."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -71,12 +78,15 @@ class Generator:
             except subprocess.TimeoutExpired:
                 self.kill()
 
-    def _said(self, since: int) -> str:
-        return self.log.read_bytes()[since:].decode(errors="replace")
+    def _log_since(self, offset: int) -> str:
+        return self.log.read_bytes()[offset:].decode(errors="replace")
 
 
-class StateRepo:
-    """A state repo in use, written for the controller of the rig that it is on."""
+class StateRepo(Generic[Domain]):
+    """A state repo in use, written for the controller of its rig.
+
+    `domains` are its access domain on each cluster that follows it, by cluster name.
+    """
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
         self.rig, self.client, self.folder = rig, client, folder
@@ -88,29 +98,36 @@ class StateRepo:
         _git(bare, "push", "--quiet", self.push_url, "main")
         self.person = Clone(self.push_url, folder / "person")
         self.generator = Generator(self.push_url, folder, ros_domain, client)
+        self.domains: dict[str, Domain] = {}
+
+    @property
+    def domain(self) -> Domain:
+        """The access domain, if only one cluster follows."""
+        (only,) = self.domains.values()
+        return only
 
     def file(self, path: str) -> str:
-        """A file as the remote has it."""
+        """Return the content of a file at the remote."""
         self._pull()
         return (self.person.folder / path).read_text()
 
     def tip(self) -> str:
-        """The commit that the remote is at."""
+        """Return the tip of the remote."""
         self._pull()
         return self.person.git("rev-parse", "HEAD").strip()
 
     def changed_by(self, commit: str) -> list[str]:
-        """The paths that a commit changed."""
+        """Return the paths that a commit changed."""
         self._pull()
         return self.person.git("show", "--name-only", "--format=", commit).split()
 
     def commits_since(self, commit: str) -> int:
-        """How many commits the remote has on top of one."""
+        """Return how many commits the remote has after a commit."""
         self._pull()
         return int(self.person.git("rev-list", "--count", f"{commit}..HEAD"))
 
     def push(self, files: Mapping[str, str | None], message: str = "by hand") -> str:
-        """Change files as a person would; returns the commit."""
+        """Commit and push files as a person would; return the commit."""
         self._pull()
         return self.person.push(files, message)
 
@@ -120,13 +137,29 @@ class StateRepo:
         assert sent.status == "succeeded", sent.message
         return sent
 
+    def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> Times:
+        """Send the goal of a step and follow it to the pods of the only cluster."""
+        return self.follow(self.demand(demand(number)), wanted, wake=wake)
+
+    def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
+        """Follow a goal that succeeded until the cluster is exactly as wanted."""
+        domain = self.domain
+        if wake:
+            domain.wake()
+        fetched = domain.wait_fetched(sent.commit)
+        applied = domain.wait_applied(sent.commit)
+        ready = domain.wait_lines(wanted)
+        pushed = sent.stages["pushed"]
+        committed = sent.stages.get("committed", pushed)  # not sent if nothing changed
+        return Times(sent.at, committed, pushed, fetched, applied, ready)
+
     def _pull(self) -> None:
         self.person.git("fetch", "--quiet", "origin", "main")
         self.person.git("reset", "--quiet", "--hard", "FETCH_HEAD")
 
 
 def demandops(folder: Path, *arguments: str) -> str:
-    """Run the command line with its data in `folder`."""
+    """Run a command of `demandops` with its data in `folder` and return its output."""
     command = [sys.executable, "-m", "demandops.cli.main", *arguments]
     done = subprocess.run(
         command,
@@ -141,7 +174,7 @@ def demandops(folder: Path, *arguments: str) -> str:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """The environment of our own processes: data and logs in `folder`, loopback only."""
+    """Return the environment of our own processes: data and logs in `folder`, loopback only."""
     return {
         **os.environ,
         "DEMANDOPS_DATA_HOME": str(folder / "data"),

@@ -1,4 +1,4 @@
-"""Where the time goes between a goal and its pods, as a table."""
+"""A table of the time that each stage takes from a goal to its pods."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _STAGES = ("committed", "pushed", "fetched", "applied", "ready", "in all")
 class Times:
     """When a demand reached each stage, on one monotonic clock, in seconds.
 
-    `committed` and `pushed` are told by the node; the others are when a poll every 0.1 s saw them.
+    `committed` and `pushed` are from the node's feedback; a poll every 0.1 s sees the others.
     """
 
     goal: float
@@ -24,24 +24,24 @@ class Times:
 
     @property
     def total(self) -> float:
-        """Seconds from the goal to the last pod ready, or gone."""
+        """Return the seconds from the goal until the last pod is ready or gone."""
         return self.ready - self.goal
 
     def row(self) -> list[float]:
-        """Seconds that each stage took, and their sum."""
+        """Return the seconds that each stage took, and their sum."""
         at = astuple(self)
         return [at[place + 1] - at[place] for place in range(len(at) - 1)] + [self.total]
 
 
 class Table:
-    """Rows by title, shown at the end."""
+    """The times of several demands, by title."""
 
     def __init__(self, heading: str) -> None:
         self._heading = heading
         self._rows: list[tuple[str, Times]] = []
 
     def add(self, title: str, times: Times) -> None:
-        """Note one demand."""
+        """Add the times of a demand."""
         self._rows.append((title, times))
 
     def show(self, say: Callable[[str], None]) -> None:

@@ -7,39 +7,33 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.common.expected import NODES, STANDING
+from tests.e2e.common.expected import NODES, WITHOUT_DEMANDS
 from tests.e2e.common.ros import Client
+from tests.e2e.common.running import NAMESPACE, running
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
 from .world import World
 
+__all__ = ["NAMESPACE"]  # for test_charts
 CLUSTER = "c-its"
-NAMESPACE = "perception"  # of the skeleton's access domain
 
 MakeWorld = Callable[[], World]
 
 
 @pytest.fixture(scope="session")
 def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
-    """A cluster with a node for each of the skeleton's inventory."""
-    failed = request.session.testsfailed
-    cluster = Rig(CLUSTER, nodes=NODES, report=say)
-    cluster.start()
-    say(f"\nrig started: {cluster.timings}")
-    try:
+    """A cluster with a node for each node of the skeleton's inventory."""
+    with running(Rig(CLUSTER, nodes=NODES, report=say), request.session) as cluster:
+        say(f"\nrig started: {cluster.timings}")
         yield cluster
-    finally:
-        if cluster.existing:
-            cluster.kube.delete("Namespace", NAMESPACE)
-        cluster.stop(failed=request.session.testsfailed > failed)
 
 
 @pytest.fixture(scope="module")
 def make_world(
     rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[MakeWorld]:
-    """Lay down a state repo that no cluster follows yet; all go at the end of the module."""
+    """Create a state repo that no cluster follows yet; the end of the module removes it."""
     made: list[World] = []
 
     def make() -> World:
@@ -54,9 +48,9 @@ def make_world(
 
 @pytest.fixture(scope="module")
 def world(make_world: MakeWorld, rig: Rig) -> World:
-    """A state repo that the cluster follows, with its generator running and nothing demanded."""
+    """A state repo that the cluster follows, with a running generator and no demand."""
     made = make_world()
     made.bootstrap(CLUSTER, rig)
     made.generator.start()
-    made.domain.wait_lines(STANDING)
+    made.domain.wait_lines(WITHOUT_DEMANDS)
     return made

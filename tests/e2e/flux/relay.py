@@ -1,4 +1,4 @@
-"""A link between a cluster and the Git server that can be cut, as a vehicle's radio link is."""
+"""A link between a cluster and the Git server that a test can cut, like a vehicle's radio link."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _CHUNK = 64 * 1024
 
 
 class Relay:
-    """Hands connections on to the server of `url`; `pulls` counts what was fetched through it."""
+    """Forwards connections to the server of `url`; `pulls` counts the fetches through it."""
 
     def __init__(self, url: str) -> None:
         self._to = urlsplit(url)
@@ -23,24 +23,24 @@ class Relay:
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
         self.pulls = 0
-        self.mend()
+        self.restore()
 
     @property
     def url(self) -> str:
-        """The same URL by way of this link."""
+        """Return the same URL through this link."""
         return urlunsplit(self._to._replace(netloc=f"{LOOPBACK}:{self._port}"))
 
-    def mend(self) -> None:
-        """Let connections through, from now on."""
+    def restore(self) -> None:
+        """Accept connections from now on."""
         listener = socket.create_server((LOOPBACK, self._port))
         self._listener = listener
         threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
 
     def cut(self) -> None:
-        """Refuse connections and end those that are open."""
+        """Refuse connections and close the open ones."""
         if self._listener is not None:
             with contextlib.suppress(OSError):
-                self._listener.shutdown(socket.SHUT_RDWR)  # or its thread would go on listening
+                self._listener.shutdown(socket.SHUT_RDWR)  # or its thread would still accept
             self._listener.close()
             self._listener = None
         with self._lock:
@@ -67,7 +67,7 @@ class Relay:
 
     @contextlib.contextmanager
     def _known(self, end: socket.socket) -> Iterator[None]:
-        """Keep an end where `cut` finds it, and close it at last."""
+        """Register an open socket for `cut` during the block."""
         with self._lock:
             self._open.add(end)
         try:

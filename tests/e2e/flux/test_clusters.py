@@ -1,4 +1,4 @@
-"""Two clusters on one state repo: the vehicles' and that of the rest, which may lose its link."""
+"""Two clusters on one state repo; the vehicles' cluster may lose its link."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import pytest
 import yaml
 
 from tests.e2e.common import expected
-from tests.e2e.common.expected import NODES, STANDING, STEPS, VEHICLES
+from tests.e2e.common.expected import NODES, STEPS, VEHICLES, WITHOUT_DEMANDS
+from tests.e2e.common.running import NAMESPACE, running
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .conftest import CLUSTER, NAMESPACE, MakeWorld
+from .conftest import CLUSTER, MakeWorld
 from .relay import Relay
 from .view import SOURCE, Domain
 from .world import World
@@ -25,17 +26,11 @@ CLUSTERS, INVENTORY = "inventory/clusters.yaml", "inventory/nodes.yaml"
 @pytest.fixture(scope="module")
 def fleet(rig: Rig, request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
     """The vehicles' own cluster; it reads the same Git server."""
-    failed = request.session.testsfailed
     cluster = Rig(FLEET, nodes=VEHICLES, git_of=rig, report=say)
     if rig.existing and cluster.existing == rig.existing:
-        pytest.skip(f"E2E_KUBECONFIG_{FLEET.upper()} names no second cluster")
-    cluster.start()
-    try:
+        pytest.skip(f"E2E_KUBECONFIG_{FLEET.upper()} does not name a second cluster")
+    with running(cluster, request.session):
         yield cluster
-    finally:
-        if cluster.existing:
-            cluster.kube.delete("Namespace", NAMESPACE)
-        cluster.stop(failed=request.session.testsfailed > failed)
 
 
 @pytest.fixture(scope="module")
@@ -56,15 +51,15 @@ def world(make_world: MakeWorld, rig: Rig, fleet: Rig, link: Relay) -> Iterator[
         node["cluster"] = FLEET if node["id"] in VEHICLES else CLUSTER
     made.push({CLUSTERS: yaml.safe_dump(clusters), INVENTORY: yaml.safe_dump(inventory)})
     made.generator.start()
-    made.demand(expected.demand(1))  # with it the generator takes the inventory in
+    made.demand(expected.demand(1))  # its commit contains the inventory
     made.bootstrap(CLUSTER, rig)
     url = rig.git_url(made.name)
     made.bootstrap(FLEET, fleet, url=url if rig.existing else link.url + made.name)
     yield made
-    made.remove()  # while both clusters are there
+    made.remove()  # while both clusters run
 
 
-def test_each_cluster_gets_what_its_own_nodes_run(world: World) -> None:
+def test_each_cluster_gets_the_services_of_its_own_nodes(world: World) -> None:
     here, there = both(world)
     for step in STEPS:
         sent = world.demand(expected.demand(step))
@@ -73,12 +68,12 @@ def test_each_cluster_gets_what_its_own_nodes_run(world: World) -> None:
             domain.wait_applied(sent.commit)
             domain.wait_lines(expected.after(step, nodes))
         assert here.lines() == expected.after(step, OTHERS)
-    assert here.lines() == there.lines() == STANDING
+    assert here.lines() == there.lines() == WITHOUT_DEMANDS
 
 
 def test_a_cluster_fetches_its_own_part_and_the_charts(world: World, rig: Rig) -> None:
     if rig.existing:
-        pytest.skip("the artifacts of an existing cluster are not reached from here")
+        pytest.skip("the tests cannot reach the artifacts of an existing cluster")
     charts = "appdefs/object-detection-fusion/charts/"
     for cluster, domain in world.domains.items():
         part = f"clusters/{cluster}/{NAMESPACE}/"
@@ -92,7 +87,7 @@ def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(
     world: World, rig: Rig, link: Relay
 ) -> None:
     if rig.existing:
-        pytest.skip("the link of an existing cluster is not ours to cut")
+        pytest.skip("the tests cannot cut the link of an existing cluster")
     here, there = both(world)
     first = world.demand(expected.demand(1))
     for domain, nodes in ((here, OTHERS), (there, VEHICLES)):
@@ -108,8 +103,8 @@ def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(
         here.wait_lines(expected.after(step, OTHERS))
     there.kube.wait("the cut to be noticed", lambda: there.trouble("GitRepository", SOURCE) or None)
     assert there.lines() == expected.after(1, VEHICLES)
-    assert pod_uids(there) == pods, "what runs there goes on"
-    link.mend()
+    assert pod_uids(there) == pods, "a pod was restarted during the cut"
+    link.restore()
     there.wait_applied(sent.commit)
     there.wait_lines(expected.after(6, VEHICLES))
     assert link.pulls == before + 1
@@ -119,7 +114,7 @@ def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(
     for domain in (here, there):
         domain.wake()
         domain.wait_applied(last.commit)
-        domain.wait_lines(STANDING)
+        domain.wait_lines(WITHOUT_DEMANDS)
 
 
 def both(world: World) -> tuple[Domain, Domain]:
@@ -131,7 +126,7 @@ def pod_uids(domain: Domain) -> set[str]:
 
 
 def applied_since(domain: Domain, commit: str) -> list[str]:
-    """The commits that the Kustomization has applied after one, newest first."""
+    """Return the commits that the Kustomization has applied after a commit, newest first."""
     history = domain.get("Kustomization", domain.name)["status"]["history"]
     commits = [entry["metadata"]["revision"].rpartition(":")[2] for entry in history]
     return commits[: commits.index(commit)]

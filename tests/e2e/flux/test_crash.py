@@ -1,4 +1,4 @@
-"""Whatever is killed in the middle of the sequence, and started again: the same end state."""
+"""A part is killed and restarted in each step, and the end state is the same."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ Act = Callable[[World, dict[str, Any]], None]
 
 def test_eight_steps_with_a_kill_in_each(world: World, rig: Rig, say: Report) -> None:
     if rig.existing:
-        pytest.skip("the parts of an existing cluster are not ours to kill")
+        pytest.skip("the tests may not kill parts of an existing cluster")
     domain = world.domain
-    laid_down = domain.inventory()
+    at_first = domain.inventory()
     for step in STEPS:
         before, start = world.tip(), time.monotonic()
         what, play = KILLS[step]
         play(world, expected.demand(step))
         domain.wait_lines(expected.after(step))
-        say(f"  {step}: {what}: as wanted after {time.monotonic() - start:.1f} s")
+        say(f"  {step}: {what}: end state after {time.monotonic() - start:.1f} s")
         assert world.commits_since(before) == 1, "one demand, one commit"
-    domain.wait_inventory(laid_down)
+    domain.wait_inventory(at_first)
 
 
 def helm_at_work(world: World, goal: dict[str, Any]) -> None:
-    """Killed as soon as a release is stored: it is pending, or its objects have just been made."""
+    """Kill helm-controller as soon as a release is stored: pending, or just installed."""
     domain = world.domain
     world.demand(goal)
     domain.wake()
@@ -44,7 +44,7 @@ def helm_at_work(world: World, goal: dict[str, Any]) -> None:
 
 
 def helm_at_uninstall(world: World, goal: dict[str, Any]) -> None:
-    """Killed as soon as the Kustomization has deleted the releases."""
+    """Kill helm-controller as soon as the Kustomization has deleted the releases."""
     sent = world.demand(goal)
     world.domain.wake()
     world.domain.wait_applied(sent.commit)
@@ -52,7 +52,7 @@ def helm_at_uninstall(world: World, goal: dict[str, Any]) -> None:
 
 
 def kustomize(world: World, goal: dict[str, Any]) -> None:
-    """Killed as soon as there is something new to apply."""
+    """Kill kustomize-controller as soon as there is a new commit to apply."""
     sent = world.demand(goal)
     world.domain.wake()
     world.domain.wait_fetched(sent.commit)
@@ -60,36 +60,38 @@ def kustomize(world: World, goal: dict[str, Any]) -> None:
 
 
 def source(world: World, goal: dict[str, Any]) -> None:
-    """Killed as soon as it is asked to look."""
+    """Kill source-controller as soon as it is triggered."""
     world.demand(goal)
     world.domain.wake()
     killed(world, "source-controller")
 
 
 def generator_without_git(world: World, goal: dict[str, Any]) -> None:
-    """The demand is committed and cannot be pushed; the next run finds it in the outbox."""
+    """The demand is committed and cannot be pushed; the next run publishes it."""
     before = world.tip()
     world.rig.stop_component("git")
     try:
-        world.client.send(goal).hears("committed")
+        world.client.send(goal).wait_stage("committed")
         world.generator.kill()
     finally:
         world.rig.start_component("git")
     assert world.tip() == before
     world.generator.start()
-    world.domain.kube.wait("the push of what was in the outbox", lambda: world.tip() != before)
+    world.domain.kube.wait(
+        "the push of what was committed before the kill", lambda: world.tip() != before
+    )
     world.domain.wake()
 
 
 def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
-    """Its `git push` outlives it and may arrive; the next run notices, the client asks again.
+    """Its `git push` survives it and may arrive; the next run notices, and the client sends again.
 
-    What is asked again must be a demand for more: a release would find nothing left to release,
-    and could make no second commit whatever the generator does.
+    The goal must add demands: a repeated release has nothing to release, so it could never make a
+    second commit.
     """
     world.rig.pause("git")
     try:
-        world.client.send(goal).hears("committed")
+        world.client.send(goal).wait_stage("committed")
         time.sleep(0.2)
         world.generator.kill()
     finally:

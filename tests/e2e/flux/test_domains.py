@@ -1,6 +1,6 @@
-"""An access domain's service account reaches its own namespace and nothing else.
+"""An access domain's service account changes only the domain's own namespace.
 
-Each case commits to the domain's folder what a mistake or somebody with write access there might.
+Each case commits to the domain's folder what a mistake or an attacker might commit there.
 """
 
 from __future__ import annotations
@@ -13,34 +13,33 @@ from typing import Any
 import pytest
 
 from tests.e2e.common import expected
+from tests.e2e.common.intrusion import FILE, NEIGHBOUR, binding
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.kube import build_manifest
 
 from .view import Domain
 from .world import World
 
-NEIGHBOUR = "neighbour"
-FILE = "clusters/c-its/perception/edge/foreign.yaml"
 BASE = "clusters/c-its/perception/foreign/kustomization.yaml"
-_RBAC = "rbac.authorization.k8s.io"
 
 
 @pytest.fixture(scope="module")
 def neighbour(rig: Rig) -> Iterator[Domain]:
     rig.kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NEIGHBOUR}})
     domain = Domain(rig.kube, NEIGHBOUR, "none")
-    # what Kubernetes itself puts there
+    # Kubernetes itself creates both
     rig.kube.wait("the account", lambda: rig.kube.get("ServiceAccount", "default", NEIGHBOUR))
     rig.kube.wait("the root", lambda: rig.kube.get("ConfigMap", "kube-root-ca.crt", NEIGHBOUR))
     yield domain
     rig.kube.delete("Namespace", NEIGHBOUR)
 
 
-Slip = Callable[..., None]
+SlipIn = Callable[..., None]
 
 
 @pytest.fixture
-def slip_in(world: World, neighbour: Domain) -> Iterator[Slip]:
+def slip_in(world: World, neighbour: Domain) -> Iterator[SlipIn]:
     """Commit manifests to the domain's folder and wait until Flux has tried them."""
 
     def push(*manifests: dict[str, Any], file: str = FILE) -> None:
@@ -50,11 +49,11 @@ def slip_in(world: World, neighbour: Domain) -> Iterator[Slip]:
         world.domain.wait_attempted(commit)
 
     yield push
-    take_out(world)
+    remove_committed(world)
 
 
-def take_out(world: World) -> None:
-    """Take the file out again, where nobody has yet, and wait until Flux goes on."""
+def remove_committed(world: World) -> None:
+    """Remove the committed file if it still exists, and wait until Flux applies the commit."""
     commit = world.tip()
     if there := {FILE, BASE} & set(world.person.git("ls-files").split()):
         commit = world.push(dict.fromkeys(there))
@@ -63,9 +62,9 @@ def take_out(world: World) -> None:
 
 
 def test_a_foreign_namespace_is_refused_and_nothing_else_of_the_commit_is_applied(
-    world: World, neighbour: Domain, slip_in: Slip
+    world: World, neighbour: Domain, slip_in: SlipIn
 ) -> None:
-    """All or nothing: what runs goes on. With the next demand the generator takes the file out."""
+    """Services run on. With the next demand the generator removes the file."""
     domain, untouched = world.domain, neighbour.inventory()
     world.step(1, expected.after(1))
     slip_in(config("foreign", NEIGHBOUR), config("own", domain.namespace))
@@ -77,29 +76,19 @@ def test_a_foreign_namespace_is_refused_and_nothing_else_of_the_commit_is_applie
 
 
 def config(name: str, namespace: str) -> dict[str, Any]:
-    return object_("v1", "ConfigMap", name, namespace, data={"made": "by hand"})
+    return build_manifest("v1", "ConfigMap", name, namespace, data={"made": "by hand"})
 
 
 def release(**spec: Any) -> dict[str, Any]:
-    """A release of the detection's chart that wants to be in the neighbour's namespace."""
+    """Return a release of the detection's chart for the neighbour's namespace."""
     chart = {"kind": "HelmChart", "name": "object-detection-0.1.0"}
     spec = {"interval": "10m", "chartRef": chart, "targetNamespace": NEIGHBOUR, **spec}
-    return object_("helm.toolkit.fluxcd.io/v2", "HelmRelease", "foreign", "perception", spec=spec)
+    return build_manifest(
+        "helm.toolkit.fluxcd.io/v2", "HelmRelease", "foreign", "perception", spec=spec
+    )
 
 
-def object_(version: str, kind: str, name: str, namespace: str = "", **rest: Any) -> dict[str, Any]:
-    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
-    return {"apiVersion": version, "kind": kind, "metadata": metadata, **rest}
-
-
-def binding(kind: str, namespace: str = "") -> dict[str, Any]:
-    """Administrator's rights for the domain's account."""
-    account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
-    role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
-    return object_(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])
-
-
-KUSTOMIZATION = object_(
+KUSTOMIZATION = build_manifest(
     "kustomize.toolkit.fluxcd.io/v1",
     "Kustomization",
     "foreign",
@@ -127,19 +116,19 @@ KUSTOMIZATION = object_(
     ],
 )
 def test_no_way_around_the_account(
-    world: World, neighbour: Domain, slip_in: Slip, manifest: dict[str, Any]
+    world: World, neighbour: Domain, slip_in: SlipIn, manifest: dict[str, Any]
 ) -> None:
     domain, untouched, here = world.domain, neighbour.inventory(), world.domain.inventory()
     slip_in(manifest)
     wait_refused(domain, "forbidden", manifest)
     assert neighbour.inventory() == untouched
-    take_out(world)
+    remove_committed(world)
     domain.wait_inventory(here)
     assert neighbour.inventory() == untouched
 
 
 def test_a_reference_does_not_leave_the_namespace(
-    world: World, neighbour: Domain, slip_in: Slip
+    world: World, neighbour: Domain, slip_in: SlipIn
 ) -> None:
     domain, here = world.domain, world.domain.inventory()
     chart = {"kind": "HelmChart", "name": "object-detection-0.1.0", "namespace": NEIGHBOUR}
@@ -148,12 +137,12 @@ def test_a_reference_does_not_leave_the_namespace(
     )
     slip_in(manifest)
     wait_refused(domain, "cross-namespace references are not allowed", manifest)
-    take_out(world)
+    remove_committed(world)
     domain.wait_inventory(here)
 
 
 def test_a_base_is_not_fetched_from_elsewhere(
-    world: World, rig: Rig, neighbour: Domain, slip_in: Slip, tmp_path: Path
+    world: World, rig: Rig, neighbour: Domain, slip_in: SlipIn, tmp_path: Path
 ) -> None:
     domain, here, name = world.domain, world.domain.inventory(), f"elsewhere-{world.name}"
     base = {"resources": ["foreign.yaml"]}
@@ -167,12 +156,12 @@ def test_a_base_is_not_fetched_from_elsewhere(
 
 
 def wait_refused(domain: Domain, why: str, manifest: dict[str, Any] | None = None) -> None:
-    """Wait until the Kustomization, or the release that it made, says that it may not."""
-    looks = [("Kustomization", domain.name)]
+    """Wait until the Kustomization, or the release that it created, reports a refusal."""
+    objects = [("Kustomization", domain.name)]
     if manifest is not None and manifest["kind"] == "HelmRelease":
-        looks.append(("HelmRelease", manifest["metadata"]["name"]))
+        objects.append(("HelmRelease", manifest["metadata"]["name"]))
 
     def refused() -> bool:
-        return any(why in domain.trouble(kind, name) for kind, name in looks)
+        return any(why in domain.trouble(kind, name) for kind, name in objects)
 
     domain.kube.wait(f"'{why}' to be reported", refused)

@@ -1,26 +1,5 @@
-"""The paper's eight steps on a real cluster: exactly what must run does, where it must."""
+"""The paper's eight steps with Flux: exactly the right services run on the right nodes."""
 
-from __future__ import annotations
+from tests.e2e.common.steps import test_eight_steps_and_the_fusion_is_never_restarted
 
-from tests.e2e.common import expected
-from tests.e2e.common.expected import FUSION, STEPS
-from tests.e2e.common.timing import Table
-from tests.e2e.rig.tools import Report
-
-from .world import World
-
-
-def test_eight_steps_and_the_fusion_is_never_restarted(world: World, say: Report) -> None:
-    domain, table = world.domain, Table("From the goal to the pods, the source woken by the test")
-    laid_down = domain.inventory()
-    fusion: list[tuple[object, ...]] = []
-    for step in STEPS:
-        times = world.step(step, expected.after(step))
-        table.add(f"{step} {expected.title(step)}", times)
-        domain.wait_releases_ready()
-        assert domain.lines() == expected.after(step), "it was not to stay so"
-        if step < STEPS[-1]:
-            fusion.append(domain.identity(FUSION))
-    table.show(say)
-    assert len(set(fusion)) == 1, f"the fusion was rolled out or restarted: {fusion}"
-    domain.wait_inventory(laid_down)
+__all__ = ["test_eight_steps_and_the_fusion_is_never_restarted"]

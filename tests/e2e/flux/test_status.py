@@ -1,13 +1,11 @@
-"""The requester hears what came of it with Flux."""
+"""The requester learns with Flux whether its services run."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import pytest
 
 from tests.e2e.common.access import access_file, documented_roles, limited
-from tests.e2e.common.answers import TIMEOUT_S, Answers, restarted
+from tests.e2e.common.answers import TIMEOUT_S, Answers, restart_generator
 from tests.e2e.rig.cluster import Rig
 
 from .conftest import CLUSTER, MakeWorld
@@ -16,19 +14,15 @@ from .world import World
 
 @pytest.fixture(scope="module")
 def world(make_world: MakeWorld, rig: Rig) -> World:
-    """With the rights that docs/status.md asks for."""
+    """A state repo whose generator has the rights that docs/status.md requires."""
     made = make_world()
     made.bootstrap(CLUSTER, rig)
     rights = documented_roles("flux")
     kubeconfig = limited(rig.kube, rig.kubeconfig, made.folder, rights)
     access_file(made.folder, CLUSTER, kubeconfig=kubeconfig)
-    restarted(made, TIMEOUT_S)
+    restart_generator(made, TIMEOUT_S)
     return made
 
 
 class TestFlux(Answers):
-    """What is particular to Flux."""
-
-    def all_applied(self, world: Any) -> None:
-        """Each HelmRelease is ready, for it does not wait for pods."""
-        world.domain.wait_releases_ready()
+    """The tests with Flux."""

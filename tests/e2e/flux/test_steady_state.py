@@ -1,4 +1,4 @@
-"""What nobody demanded does not change: a further requester, and what is changed by hand."""
+"""Releases do not change without a demand: another requester, and manual changes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,14 @@ import pytest
 import yaml
 
 from tests.e2e.common import expected
-from tests.e2e.common.byhand import asked_by, change_image, empty, pod_template, wait_for
 from tests.e2e.common.expected import DETECTION, FUSION, source_end, target_end
+from tests.e2e.common.manual import (
+    change_image,
+    overwrite,
+    pod_template,
+    requested_by,
+    wait_restored,
+)
 from tests.e2e.rig.kube import Manifest
 
 from .view import Domain
@@ -20,24 +26,26 @@ REGISTRY = "registry/charts.yaml"
 
 @pytest.fixture
 def running(world: World) -> World:
-    """Step 1 runs, whatever ran before, and nothing changes any more."""
+    """The state repo after step 1, with nothing left to reconcile."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
-    world.domain.wait_releases_ready()
+    world.domain.wait_releases()
     return world
 
 
-def test_a_further_requester_changes_no_object_of_a_release(running: World) -> None:
+def test_another_requester_changes_no_object_of_a_release(running: World) -> None:
     domain = running.domain
     before = domain.wait_quiet()
-    sent = running.demand(asked_by("vehicle03", expected.demand(1)))
+    sent = running.demand(requested_by("vehicle03", expected.demand(1)))
     assert running.changed_by(sent.commit)
     assert all(path.startswith("ledger/") for path in running.changed_by(sent.commit))
     running.follow(sent, expected.after(1))
-    for chart in domain.find("HelmChart"):  # they look at every commit
+    for chart in domain.find("HelmChart"):  # each HelmChart checks every commit
         name = chart["metadata"]["name"]
-        domain.kube.wait(f"{name} to have looked", lambda n=name: sent.commit in looked(domain, n))
+        domain.kube.wait(
+            f"{name} to check the commit", lambda n=name: sent.commit in checked_commit(domain, n)
+        )
     assert domain.wait_quiet(2.0) == before
-    goal = asked_by("vehicle03", expected.demand(1))
+    goal = requested_by("vehicle03", expected.demand(1))
     running.follow(running.demand(goal | {"shutdown": True}), expected.after(1))
     assert domain.wait_quiet() == before
 
@@ -46,39 +54,39 @@ def test_what_helm_deployed_is_restored(running: World) -> None:
     domain, namespace = running.domain, running.domain.namespace
     detection, params = DETECTION["vehicle00"], f"{FUSION}-params"
 
-    def ask() -> None:
+    def reconcile() -> None:
         for release in (detection, FUSION):
             domain.kube.reconcile("HelmRelease", release, namespace)
 
     template, inputs = pod_template(domain, detection), domain.get("ConfigMap", params)["data"]
     change_image(domain, detection)
-    empty(domain, params, "params.yml")
-    ask()
-    wait_for(domain, template, inputs, detection, params)
+    overwrite(domain, params, "params.yml")
+    reconcile()
+    wait_restored(domain, template, inputs, detection, params)
 
     domain.kube.delete("Deployment", detection, namespace)
     domain.kube.delete("ConfigMap", params, namespace)
     domain.kube.wait_gone("Deployment", detection, namespace)
-    ask()
+    reconcile()
     domain.wait_lines(expected.after(1))
-    wait_for(domain, template, inputs, detection, params)
+    wait_restored(domain, template, inputs, detection, params)
 
 
 def test_plain_manifests_are_restored(running: World) -> None:
     domain, namespace = running.domain, running.domain.namespace
     template, topics = pod_template(domain, PLAIN), domain.get("ConfigMap", PLAIN)["data"]
     change_image(domain, PLAIN)
-    empty(domain, PLAIN, "params.yaml")
+    overwrite(domain, PLAIN, "params.yaml")
     gone = [("Deployment", OTHER), ("ConfigMap", OTHER), ("HelmRelease", DETECTION["station00"])]
     for kind, name in gone:
         domain.kube.delete(kind, name, namespace)
         domain.kube.wait_gone(kind, name, namespace)
     domain.kube.reconcile("Kustomization", domain.name, namespace)
     domain.wait_lines(expected.after(1))
-    wait_for(domain, template, topics, PLAIN, PLAIN)
+    wait_restored(domain, template, topics, PLAIN, PLAIN)
 
 
-def test_a_new_version_of_a_chart_restarts_no_pod_that_it_leaves_as_it_was(
+def test_a_new_version_of_a_chart_restarts_no_pod_that_it_does_not_change(
     running: World,
 ) -> None:
     domain = running.domain
@@ -88,9 +96,11 @@ def test_a_new_version_of_a_chart_restarts_no_pod_that_it_leaves_as_it_was(
     old = f"object-fusion-{chart['version']}"
     chart["version"] = registry["charts"]["object-fusion"]["version"] = "99.0.0"
     running.push({CHART: yaml.safe_dump(chart), REGISTRY: yaml.safe_dump(registry)})
-    sent = running.demand(asked_by("vehicle02", expected.demand(1)))  # takes the change in
+    sent = running.demand(
+        requested_by("vehicle02", expected.demand(1))
+    )  # its commit contains the change
     running.follow(sent, expected.after(1))
-    domain.wait_releases_ready()
+    domain.wait_releases()
     assert domain.get("HelmRelease", FUSION)["status"]["history"][0]["chartVersion"][:4] == "99.0"
     assert names(domain.find("HelmChart")) == charts - {old} | {"object-fusion-99.0.0"}
     assert domain.identity(FUSION) == pods
@@ -100,7 +110,7 @@ def names(items: list[Manifest]) -> set[str]:
     return {item["metadata"]["name"] for item in items}
 
 
-def looked(domain: Domain, chart: str) -> str:
-    """The commit that a HelmChart was last held against."""
+def checked_commit(domain: Domain, chart: str) -> str:
+    """Return the commit that a HelmChart has checked last."""
     status: dict[str, str] = domain.get("HelmChart", chart)["status"]
     return status.get("observedSourceArtifactRevision", "")

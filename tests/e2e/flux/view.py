@@ -1,6 +1,6 @@
-"""One access domain on one cluster that Flux keeps: its source, its Kustomization, its releases.
+"""An access domain on a cluster that Flux reconciles: its source, its Kustomization, its releases.
 
-It reads the API and asks Flux to look; it changes nothing that Flux or a release owns.
+It reads the API and triggers Flux; it changes no object that Flux or a release owns.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Callable
 
 from tests.e2e.common.namespace import Namespace, name_of
 from tests.e2e.rig.errors import RigError
-from tests.e2e.rig.kube import Kube
 
 SOURCE = "demandops"  # the GitRepository's name
 
@@ -24,22 +23,18 @@ class Domain(Namespace):
     STEADY = ("HelmRelease",)
     OWN = ("GitRepository", "HelmChart", "Kustomization")
 
-    def __init__(self, kube: Kube, namespace: str, name: str) -> None:
-        super().__init__(kube, namespace)
-        self.name = name
-
-    # --- looking ----------------------------------------------------------------------------
+    # --- reading ----------------------------------------------------------------------------
 
     def applied(self) -> str:
-        """The commit that the Kustomization has applied."""
+        """Return the commit that the Kustomization has applied."""
         return _commit(self._status("Kustomization", self.name).get("lastAppliedRevision"))
 
     def fetched(self) -> str:
-        """The commit that the source has fetched."""
+        """Return the commit that the source has fetched."""
         return _commit(self._status("GitRepository", SOURCE).get("artifact", {}).get("revision"))
 
     def fetched_files(self) -> list[str]:
-        """The paths of what the source has fetched, where its address can be reached from here."""
+        """Return the paths that the source has fetched; its address must be reachable from here."""
         url = self._status("GitRepository", SOURCE)["artifact"]["url"]
         with (
             urllib.request.urlopen(url, timeout=60) as answer,  # noqa: S310 - the source's own
@@ -48,29 +43,31 @@ class Domain(Namespace):
             return [member.name for member in archive if member.isfile()]
 
     def trouble(self, kind: str, name: str) -> str:
-        """Why an object is not ready; empty where it is or has not said yet."""
+        """Return why an object is not ready; empty if it is or has not reported yet."""
         conditions = self._status(kind, name).get("conditions") or []
-        told = [c["message"] for c in conditions if c["type"] == "Ready" and c["status"] == "False"]
-        return " ".join(told)
+        messages = [
+            c["message"] for c in conditions if c["type"] == "Ready" and c["status"] == "False"
+        ]
+        return " ".join(messages)
 
     # --- waiting ----------------------------------------------------------------------------
 
     def wake(self) -> None:
-        """Ask the source to look now; its new artifact wakes the Kustomization."""
+        """Make the source fetch now; its new artifact triggers the Kustomization."""
         self.kube.reconcile("GitRepository", SOURCE, self.namespace)
 
     def wait_fetched(self, commit: str, timeout: float = 60.0) -> float:
-        """Wait until the source has fetched a commit; returns when it was seen."""
+        """Wait until the source has fetched a commit; return when that was seen."""
         self._wait_for(f"{commit[:10]} to be fetched", lambda: self.fetched() == commit, timeout)
         return time.monotonic()
 
     def wait_applied(self, commit: str, timeout: float = 60.0) -> float:
-        """Wait until the Kustomization has applied a commit; returns when it was seen."""
+        """Wait until the Kustomization has applied a commit; return when that was seen."""
         self._wait_for(f"{commit[:10]} to be applied", lambda: self.applied() == commit, timeout)
         return time.monotonic()
 
     def wait_attempted(self, commit: str, timeout: float = 60.0) -> None:
-        """Wait until the Kustomization has tried a commit, whatever came of it."""
+        """Wait until the Kustomization has tried a commit, with or without success."""
 
         def attempted() -> bool:
             status = self._status("Kustomization", self.name)
@@ -78,8 +75,8 @@ class Domain(Namespace):
 
         self._wait_for(f"{commit[:10]} to be tried", attempted, timeout)
 
-    def wait_releases_ready(self) -> None:
-        """Wait until Helm has done all that was asked of it."""
+    def wait_releases(self) -> None:
+        """Wait until each HelmRelease is ready; it does not wait for pods."""
         for release in self.find("HelmRelease"):
             self.kube.wait_ready("HelmRelease", name_of(release), self.namespace)
 
@@ -87,10 +84,13 @@ class Domain(Namespace):
         try:
             self.kube.wait(what, look, timeout)
         except RigError as error:
-            told = [self.trouble("GitRepository", SOURCE), self.trouble("Kustomization", self.name)]
-            raise AssertionError(f"{error}; {'; '.join(filter(None, told))}") from error
+            messages = [
+                self.trouble("GitRepository", SOURCE),
+                self.trouble("Kustomization", self.name),
+            ]
+            raise AssertionError(f"{error}; {'; '.join(filter(None, messages))}") from error
 
 
 def _commit(revision: str | None) -> str:
-    """The commit in a Flux revision (`main@sha1:…`)."""
+    """Return the commit in a Flux revision (`main@sha1:…`)."""
     return (revision or "").rpartition(":")[2]

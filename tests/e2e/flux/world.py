@@ -1,6 +1,6 @@
 """A state repo, its generator, and the clusters whose Flux follows it.
 
-The clusters are told by nothing but the manifests that `demandops init` laid down for them.
+The clusters get only the manifests that `demandops init` wrote for them.
 """
 
 from __future__ import annotations
@@ -10,36 +10,25 @@ from typing import Any
 
 import yaml
 
-from tests.e2e.common.expected import demand
-from tests.e2e.common.ros import Client, Sent
+from tests.e2e.common.ros import Client
 from tests.e2e.common.staterepo import StateRepo
-from tests.e2e.common.timing import Times
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Kube, Manifest
 
 from .view import SOURCE, Domain
 
 
-class World(StateRepo):
-    """A state repo in use; `domains` are its access domain on each cluster, by cluster name."""
+class World(StateRepo[Domain]):
+    """A state repo that Flux follows."""
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
         super().__init__(rig, folder, ros_domain, client)
-        self.domains: dict[str, Domain] = {}
         self._wide: list[tuple[Kube, Manifest]] = []
 
-    @property
-    def domain(self) -> Domain:
-        """The access domain, where there is one cluster only."""
-        (only,) = self.domains.values()
-        return only
-
-    # --- the clusters -----------------------------------------------------------------------
-
     def bootstrap(self, cluster: str, rig: Rig, **source: Any) -> Domain:
-        """Put `bootstrap/<cluster>.yaml` on a cluster and wait until its Flux follows.
+        """Apply `bootstrap/<cluster>.yaml` to a cluster and wait until its Flux follows.
 
-        `source` changes fields of the GitRepository, as a person may with an overlay.
+        `source` changes fields of the GitRepository, as a person may do with an overlay.
         """
         manifests = list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
         (git,) = [item for item in manifests if item["kind"] == "GitRepository"]
@@ -60,37 +49,16 @@ class World(StateRepo):
         return domain
 
     def remove(self) -> None:
-        """Take the state repo off its clusters. The namespace, and what is in it, stays."""
+        """Remove the state repo from its clusters. The namespace and its other objects stay."""
         self.generator.stop()
         for domain in self.domains.values():
             kube, namespace = domain.kube, domain.namespace
             for kind, name in (("Kustomization", domain.name), ("GitRepository", SOURCE)):
                 kube.delete(kind, name, namespace)
                 kube.wait_gone(kind, name, namespace)
-            for kind in (
-                "HelmRelease",
-                "HelmChart",
-            ):  # what is going would take its successor along
+            for kind in ("HelmRelease", "HelmChart"):  # a late deletion would hit the next world's
                 kube.wait(f"each {kind} to go", lambda d=domain, k=kind: d.find(k) == [])
         for kube, item in self._wide:
             kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
         self.domains.clear()
         self._wide.clear()
-
-    # --- demands ----------------------------------------------------------------------------
-
-    def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Send the goal of a step and follow it to the pods of the only cluster."""
-        return self.follow(self.demand(demand(number)), wanted, wake=wake)
-
-    def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Follow a goal that succeeded until the cluster is exactly as wanted."""
-        domain = self.domain
-        if wake:
-            domain.wake()
-        fetched = domain.wait_fetched(sent.commit)
-        applied = domain.wait_applied(sent.commit)
-        ready = domain.wait_lines(wanted)
-        pushed = sent.stages["pushed"]
-        committed = sent.stages.get("committed", pushed)  # not told where nothing changed
-        return Times(sent.at, committed, pushed, fetched, applied, ready)

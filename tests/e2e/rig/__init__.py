@@ -1,5 +1,5 @@
 """A real cluster on loopback, without containers, for the end-to-end tests.
 
-`tools` builds the programs, `cluster.Rig` starts them and is all that a test needs. Nothing is
-imported here, so that the programs can be built by a Python that has no packages installed.
+`tools` builds the programs, `cluster.Rig` starts them and is all that a test needs. This module
+imports nothing, so that a Python without packages can build the programs.
 """

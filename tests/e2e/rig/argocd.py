@@ -1,9 +1,9 @@
 """Argo CD's application-controller, repo-server and server, and their Redis, as plain processes.
 
-One program takes all parts, by `ARGOCD_BINARY_NAME`. The server is there for its webhook. The
-controller runs as the cluster's
-administrator; what a release may do is limited by its AppProject and by the service account that
-is impersonated for it, as docs/argocd.md asks for. Redis is the machine's own `redis-server`.
+One program contains all parts; `ARGOCD_BINARY_NAME` selects one. The server serves the webhook. The
+controller runs as the cluster's administrator. A release's AppProject and the service account that
+is impersonated for it limit what it may do, as docs/argocd.md requires. Redis is the machine's own
+`redis-server`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ CONTROLLER = "argocd-application-controller"
 REPO_SERVER = "argocd-repo-server"
 SERVER = "argocd-server"
 WEBHOOK_SECRET = secrets.token_hex(16)
-"""What calls of the server's webhook are signed with."""
+"""The key that signs calls of the server's webhook."""
 
 
 def settings() -> list[Manifest]:
-    """What both parts read from the API before they start: the lock-down of docs/argocd.md."""
+    """Return the lock-down of docs/argocd.md, which the parts read before they start."""
     labels = {"app.kubernetes.io/part-of": "argocd"}
     return [
         {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}},
@@ -55,7 +55,7 @@ def settings() -> list[Manifest]:
 def components(
     binaries: dict[str, Path], folder: Path, kubeconfig: Path, own: dict[str, list[str]]
 ) -> list[Component]:
-    """Redis and the three parts; `own` holds further arguments by component name."""
+    """Return Redis and the three parts; `own` contains further arguments by component name."""
     redis, repo_server, server_port, data = free_port(), free_port(), free_port(), folder / "argocd"
     data.mkdir(parents=True, exist_ok=True)
     cache = f"--redis={LOOPBACK}:{redis}"
@@ -66,7 +66,7 @@ def components(
         f"--repo-server={LOOPBACK}:{repo_server}",
         "--repo-server-plaintext",
         "--application-namespaces=*",
-        # Tests wait for what this shortens: up to five minutes after repeated edits by hand.
+        # Shortens a wait of up to five minutes after repeated manual changes.
         "--self-heal-backoff-cap-seconds=3",
     ]
     manifests = [
@@ -89,7 +89,7 @@ def components(
         "--insecure",
     ]
     environment = {
-        "ARGOCD_FAKE_IN_CLUSTER": "true",  # "in the cluster" is what the kubeconfig names
+        "ARGOCD_FAKE_IN_CLUSTER": "true",  # "in the cluster" is the kubeconfig's cluster
         "ARGOCD_GPG_ENABLED": "false",
         "ARGOCD_PLUGINSOCKFILEPATH": str(data / "plugins"),
         "ARGOCD_SSH_DATA_PATH": str(data / "ssh"),
@@ -123,7 +123,7 @@ def _part(
     environment: dict[str, str],
     serves: int | None = None,
 ) -> Component:
-    port = free_port()  # of its health; the controller's is on all addresses, it has no flag
+    port = free_port()  # for its health; the controller binds all addresses and has no flag for it
     return Component(
         name,
         (str(binary), f"--metrics-port={port}", "--loglevel=info", *arguments),

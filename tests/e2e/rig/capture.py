@@ -1,4 +1,4 @@
-"""Print past pytest's capture: a cold build takes twenty minutes and must not look stuck."""
+"""Output past pytest's capture: a cold build takes twenty minutes and must not look stuck."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from .tools import Report
 
 
 def uncaptured(config: pytest.Config) -> Report:
-    """A `report` for `Rig` that a person sees at once, whatever pytest captures."""
+    """Return a `report` for `Rig` that prints at once, even while pytest captures output."""
     capture: Any = config.pluginmanager.getplugin("capturemanager")
 
     def say(text: str) -> None:
-        if capture is None:  # switched off with -p no:capture
+        if capture is None:  # disabled with -p no:capture
             print(text, file=sys.stderr, flush=True)
             return
         with capture.global_and_fixture_disabled():

@@ -1,7 +1,6 @@
-"""A work tree of a served repository, for tests that play the person or the generator.
+"""A work tree of a served repository, for tests that act as a person or the generator.
 
-It drives the `git` command with no configuration but its own, so that neither the person's hooks
-nor their name end up in a test.
+It runs `git` without the user's configuration, hooks and name.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from .errors import RigError
 
 
 class Clone:
-    """One clone; the repository is created by its first push."""
+    """A clone; its first push creates the repository."""
 
     def __init__(self, url: str, folder: Path) -> None:
         self.folder = folder

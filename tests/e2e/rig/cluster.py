@@ -1,10 +1,10 @@
-"""The one class that a test needs: a cluster with Flux or Argo CD, fake nodes and a Git server.
+"""A cluster with Flux or Argo CD, fake nodes and a Git server.
 
     with Rig("edge", nodes=["edge"]) as rig:
         rig.kube.apply(...)
 
-The composition root of the rig: it alone knows in which order things start. With the environment
-of `settings` it starts nothing and stands for a cluster that is there already.
+Only this module knows the order of the starts. With the environment of `settings` it starts
+nothing and represents an existing cluster.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ _PARTS: dict[Gitops, ModuleType] = {"flux": flux, "argocd": argocd}
 
 
 class Rig:
-    """One cluster; several can run at once, each with ports and a folder of its own.
+    """A cluster; several can run at once, each with its own ports and folder.
 
-    `nodes` are node ids, `gitops` is the controller that runs there, and `beside` another one.
+    `nodes` are node ids, `gitops` is the controller, and `beside` a second one.
     `git_of` shares another rig's Git server, so that two clusters read one state repo.
-    `credentials` (user, password) makes the Git server ask for them. `arguments` adds to a
+    `credentials` (user, password) makes the Git server require them. `arguments` adds to a
     controller's command line, by its name. `folder` is where data and logs go (a temporary folder
     by default, removed at the end unless a test failed or E2E_KEEP is set).
     """
@@ -87,28 +87,28 @@ class Rig:
     ) -> None:
         self.stop(failed=kind is not None)
 
-    # --- the whole --------------------------------------------------------------------------
+    # --- start and stop ---------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start everything and wait until it is ready; what had started is stopped on failure."""
+        """Start everything and wait until it is ready; stop everything on failure."""
         if self._work is not None:
-            raise RigError(f"rig {self.name}: already started")
+            raise RigError(f"rig {self.name}: already started; stop it first")
         try:
             if self.existing:
                 self._adopt(self.existing)
             else:
                 self._start_own()
             self.add_nodes(self._initial)
-        except BaseException as error:  # an interrupt must not leave a cluster behind either
+        except BaseException as error:  # also after an interrupt
             self.stop(failed=isinstance(error, Exception))
             raise
 
     def stop(self, *, failed: bool = False) -> None:
-        """Stop all that was started; the logs stay where `failed`. May be called twice."""
+        """Stop everything; the logs stay if `failed`. May be called twice."""
         work, processes, kube = self._work, self._processes, getattr(self, "kube", None)
         try:
             if kube is not None and self.existing:
-                for name in self._nodes:  # on our own cluster they go with it
+                for name in self._nodes:  # our own cluster is removed with its nodes
                     kube.delete("Node", name)
             if kube is not None:
                 kube.close()
@@ -121,22 +121,22 @@ class Rig:
                 self._clear(work, failed)
 
     def check(self) -> None:
-        """Raise RigError where a part has died unasked."""
+        """Raise RigError if a part has died without being stopped."""
         if self._processes is not None:
             self._processes.check()
 
     # --- what tests use ---------------------------------------------------------------------
 
     def git_url(self, repository: str) -> str:
-        """The URL by which the cluster reads a repository (`state.git`)."""
+        """Return the URL by which the cluster reads a repository (`state.git`)."""
         return f"{self._git_url}/{repository.strip('/')}"
 
     def push_url(self, repository: str) -> str:
-        """The URL by which a test pushes to it, credentials included."""
+        """Return the URL by which a test pushes to it, with credentials."""
         return f"{self._push_url}/{repository.strip('/')}"
 
     def repository(self, repository: str) -> Path:
-        """The bare repository on disk (for hooks and damage), created where it is not there."""
+        """Return the bare repository on disk (for hooks and damage); create it if missing."""
         path = self._owned("has no repositories on this disk").repositories / repository.strip("/")
         if self._git_of is not None:
             return self._git_of.repository(repository)
@@ -145,7 +145,7 @@ class Rig:
         return path
 
     def add_nodes(self, node_ids: Iterable[str], timeout: float = 60.0) -> list[str]:
-        """Make fake nodes with these `node_id` labels, wait until Ready; returns their names."""
+        """Create fake nodes with these `node_id` labels, wait until Ready; return their names."""
         manifests = [kwok.manifest(node_id) for node_id in node_ids]
         names = [manifest["metadata"]["name"] for manifest in manifests]
         self._nodes += names
@@ -159,7 +159,7 @@ class Rig:
         helm = self._binaries.get("helm") or shutil.which("helm")
         if helm is None:
             helm = self._binaries["helm"] = tools.ensure(["helm"], self._report)["helm"]
-        # Somebody else's kubeconfig may call a login command that wants the person's environment.
+        # The kubeconfig of an existing cluster may call a login command that needs the environment.
         clean = self._work.environment() if self._work and not self.existing else dict(os.environ)
         environment = clean | {"KUBECONFIG": str(self.kubeconfig)}
         done = subprocess.run(
@@ -172,27 +172,27 @@ class Rig:
     # --- single parts -----------------------------------------------------------------------
 
     def components(self) -> list[str]:
-        """Names of the parts that can be killed and started again."""
+        """Return the names of the parts that can be killed and started again."""
         return self._own().names()
 
     def pids(self) -> dict[str, int]:
-        """Process ids of the parts that run."""
+        """Return the process ids of the running parts."""
         return self._own().pids()
 
     def log(self, component: str) -> Path:
-        """A part's log file."""
+        """Return a part's log file."""
         return self._own().log(component)
 
     def url(self, component: str) -> str:
-        """Where a part serves, for those that tests call."""
+        """Return the URL of a part that tests call."""
         return self._own().url(component)
 
     def kill(self, component: str) -> None:
-        """End a part as a crash would; `start_component` brings it back."""
+        """Kill a part, like a crash; `start_component` starts it again."""
         self._own().kill(component)
 
     def stop_component(self, component: str) -> None:
-        """End a part in order."""
+        """Ask a part to end."""
         self._own().stop(component)
 
     def start_component(self, component: str) -> None:
@@ -200,16 +200,16 @@ class Rig:
         self._own().start(component)
 
     def restart(self, component: str) -> None:
-        """Stop a part in order and start it again."""
+        """Stop a part and start it again."""
         self.stop_component(component)
         self.start_component(component)
 
     def pause(self, component: str) -> None:
-        """Make a part hang: connections to it are accepted and never answered."""
+        """Pause a part: it accepts connections and never answers."""
         self._own().signal(component, signal.SIGSTOP)
 
     def resume(self, component: str) -> None:
-        """Let a paused part go on."""
+        """Continue a paused part."""
         self._own().signal(component, signal.SIGCONT)
 
     # --- starting ---------------------------------------------------------------------------
@@ -262,7 +262,7 @@ class Rig:
                 ),
             ]
         )
-        # Until the controller manager has made it, a namespace admits no pods.
+        # A namespace accepts no pods until the controller manager has created it.
         account = ("ServiceAccount", "default", "default")
         self.kube.wait("the default service account", lambda: self.kube.get(*account))
         clock.lap("controllers")
@@ -286,7 +286,9 @@ class Rig:
 
     def _own(self) -> Processes:
         if self._processes is None:
-            raise RigError(f"rig {self.name}: runs no processes of its own")
+            raise RigError(
+                f"rig {self.name}: has no processes; it is not started or uses an existing cluster"
+            )
         return self._processes
 
     def _owned(self, what: str) -> Workdir:
@@ -304,7 +306,7 @@ class Rig:
 
 
 class _Clock:
-    """Notes how long each stage of a start took, in seconds."""
+    """The seconds of each stage of a start."""
 
     def __init__(self, timings: dict[str, float]) -> None:
         self._timings, self._last = timings, time.monotonic()
@@ -316,7 +318,7 @@ class _Clock:
 
 
 def start_all(*rigs: Rig) -> None:
-    """Start several rigs at the same time; where one fails, all are stopped."""
+    """Start several rigs at the same time; if one fails, stop all."""
     try:
         with ThreadPoolExecutor(max_workers=len(rigs)) as pool:
             for job in [pool.submit(rig.start) for rig in rigs]:

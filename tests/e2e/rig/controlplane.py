@@ -1,8 +1,7 @@
-"""How a control plane without containers is started: etcd, API server, controllers, scheduler.
+"""The components of a control plane without containers: etcd, API server, controllers, scheduler.
 
-It turns ports, certificates and paths of programs into `Component`s and starts nothing itself.
-Everything listens on loopback. What the tests throw away needs no safety on disk, so etcd does not
-flush, and nobody else wants to lead, so nobody elects a leader.
+It returns `Component`s and starts nothing itself. Everything listens on loopback. Tests need no
+safe disk, so etcd does not flush; each part runs once, so there is no leader election.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ _SERVICES = "10.96.0.0/16"
 
 @dataclass(frozen=True)
 class ControlPlane:
-    """One control plane's ports and files."""
+    """The ports and files of a control plane."""
 
     binaries: dict[str, Path]
     folder: Path
@@ -29,16 +28,16 @@ class ControlPlane:
 
     @staticmethod
     def plan(binaries: dict[str, Path], folder: Path, pki: Pki) -> ControlPlane:
-        """Choose free ports."""
+        """Return a control plane with free ports."""
         return ControlPlane(binaries, folder, pki, free_port(), free_port())
 
     @property
     def server(self) -> str:
-        """The API server's URL."""
+        """Return the API server's URL."""
         return url(self.api_port, "https")
 
     def etcd(self) -> Component:
-        """The store; it keeps its data through a restart."""
+        """Return etcd; it keeps its data during a restart."""
         client, peer = url(self.etcd_port), url(free_port())
         argv = [
             str(self.binaries["etcd"]),
@@ -55,7 +54,7 @@ class ControlPlane:
         return Component("etcd", tuple(argv), answers(self.etcd_port, "/readyz"))
 
     def apiserver(self) -> Component:
-        """The API server; ready once its own post-start hooks are done."""
+        """Return the API server; it is ready after its own post-start hooks."""
         pki = self.pki
         argv = [
             str(self.binaries["kube-apiserver"]),
@@ -73,24 +72,24 @@ class ControlPlane:
             f"--service-cluster-ip-range={_SERVICES}",
             "--authorization-mode=RBAC",
             "--allow-privileged=true",
-            # Loopback is no address for a Service's endpoints: the API server would refuse its own.
+            # A Service's endpoint must not be on loopback: the API server would refuse its own.
             "--endpoint-reconciler-type=none",
         ]
         probe = answers(self.api_port, "/readyz", pki.authority)
         return Component("kube-apiserver", tuple(argv), probe)
 
     def controller_manager(self, kubeconfig: Path) -> Component:
-        """The controllers that turn a Deployment into pods, and collect what lost its owner."""
+        """Return the controllers that turn a Deployment into pods and delete orphaned objects."""
         port = free_port()
         argv = [
             str(self.binaries["kube-controller-manager"]),
             f"--kubeconfig={kubeconfig}",
             f"--service-account-private-key-file={self.pki.account_private}",
             f"--root-ca-file={self.pki.authority}",
-            # With the defaults of 20 and 30 a burst of releases waits for this client, not for us.
+            # With the defaults of 20 and 30 this client would slow down a burst of releases.
             "--kube-api-qps=200",
             "--kube-api-burst=400",
-            # A machine that stands still for a minute has lost no node.
+            # A slow machine must not lose a node.
             "--node-monitor-grace-period=10m",
             *self._serving(port),
         ]
@@ -98,7 +97,7 @@ class ControlPlane:
         return Component("kube-controller-manager", tuple(argv), probe)
 
     def scheduler(self, kubeconfig: Path) -> Component:
-        """The scheduler: node selectors mean something only with it."""
+        """Return the scheduler, which evaluates node selectors."""
         port = free_port()
         argv = [
             str(self.binaries["kube-scheduler"]),

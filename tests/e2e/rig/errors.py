@@ -1,5 +1,5 @@
-"""What the rig raises: one type, whose text says where, what and how to mend it."""
+"""The exception of the rig; its text says where, what and the remedy."""
 
 
 class RigError(RuntimeError):
-    """The rig could not build, start or reach something; the text is for a person."""
+    """Raised when the rig cannot build, start or reach something."""

@@ -1,8 +1,8 @@
 """Flux's source-, kustomize- and helm-controller as plain processes.
 
-They take the cluster from `KUBECONFIG` (they have no flag for it) and run as its administrator;
-what a release may do is limited by the service account it names, which they impersonate. They are
-locked down as docs/flux.md asks for: what names no account acts as its namespace's `default`.
+They read the cluster from `KUBECONFIG` (they have no flag for it) and run as its administrator.
+The service account of a release, which they impersonate, limits what it may do. They are locked
+down as docs/flux.md requires: an object without an account acts as its namespace's `default`.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ CONTROLLERS = ("source-controller", "kustomize-controller", "helm-controller")
 
 
 def settings() -> list[Manifest]:
-    """What must be there before they start."""
+    """Return the manifests that must exist before they start."""
     return [{"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}}]
 
 
 def components(
     binaries: dict[str, Path], folder: Path, kubeconfig: Path, own: dict[str, list[str]]
 ) -> list[Component]:
-    """The three controllers; `own` holds further arguments by controller name."""
+    """Return the three controllers; `own` contains further arguments by controller name."""
     storage = folder / "artifacts"
     storage.mkdir(parents=True, exist_ok=True)
     artifacts = f"{LOOPBACK}:{free_port()}"
@@ -57,9 +57,9 @@ def _component(name: str, binary: Path, kubeconfig: Path, extra: list[str]) -> C
         "--enable-leader-election=false",
         "--watch-all-namespaces=true",
         "--log-level=info",
-        # Tests wait for what these shorten: half a minute between looks at an unready dependency,
-        # three quarters of a second after an object's first look (which only sets the finalizer),
-        # up to a quarter of an hour after repeated faults, and chance in every interval.
+        # These shorten waits: half a minute between checks of an unready dependency, three quarters
+        # of a second after an object's first reconcile (which only sets the finalizer), up to a
+        # quarter of an hour after repeated errors, and a random part of every interval.
         "--requeue-dependency=1s",
         "--min-retry-delay=50ms",
         "--max-retry-delay=5s",

@@ -1,9 +1,9 @@
 """A smart-HTTP Git server over `git http-backend`, for the state repo.
 
-Runs as a process of its own (`python githttp.py --root DIR --port N`), so that tests can kill it or
-make it hang like any other part of the rig, and needs nothing but Python and Git. Pushing is
-allowed and a push to a repository that is not there creates it. With GIT_HTTP_USER and
-GIT_HTTP_PASSWORD in its environment it wants those by basic authentication.
+Runs as its own process (`python githttp.py --root DIR --port N`), so that tests can kill or pause
+it like any other part of the rig. It needs only Python and Git. A push to a missing repository
+creates it. With GIT_HTTP_USER and GIT_HTTP_PASSWORD in its environment it requires them by basic
+authentication.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ PASSWORD_VARIABLE = "GIT_HTTP_PASSWORD"  # noqa: S105 - a variable's name
 HEALTH = "/-/healthz"
 _CHUNK = 64 * 1024
 
-# Set for every backend, whatever the host's configuration says. A garbage collection in the
-# background would outlive its push and race with the next.
+# Overrides the host's configuration. A garbage collection in the background would race with the
+# next push.
 _CONFIGURATION = {
     "core.fsync": "none",
     "gc.auto": "0",
@@ -44,7 +44,7 @@ _CONFIGURATION = {
 
 
 class GitServer(ThreadingHTTPServer):
-    """Serves every repository below one folder."""
+    """A server of all repositories below a folder."""
 
     daemon_threads = True
     request_queue_size = 128
@@ -62,7 +62,7 @@ class GitServer(ThreadingHTTPServer):
         self.git = program
 
     def environment(self) -> dict[str, str]:
-        """The environment of Git's processes."""
+        """Return the environment of Git's processes."""
         return _environment(self.root)
 
 
@@ -82,7 +82,7 @@ def _environment(root: Path) -> dict[str, str]:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    protocol_version = "HTTP/1.1"  # or a client that asks "may I go on?" would wait for an answer
+    protocol_version = "HTTP/1.1"  # with 1.0 a client that sends "Expect: 100-continue" would wait
     server: GitServer
 
     def do_GET(self) -> None:
@@ -92,15 +92,15 @@ class _Handler(BaseHTTPRequestHandler):
         self._serve()
 
     def _serve(self) -> None:
-        self.close_connection = True  # answers have no length, so their end is the connection's
+        self.close_connection = True  # answers have no length: closing the connection ends them
         path, _, query = self.path.partition("?")
         path = unquote(path)
         if path == HEALTH:
             self._answer(HTTPStatus.OK, "serving")
         elif not self._allowed():
-            self._answer(HTTPStatus.UNAUTHORIZED, "credentials, please")
+            self._answer(HTTPStatus.UNAUTHORIZED, "give a user and a password")
         elif ".." in PurePosixPath(path).parts:
-            self._answer(HTTPStatus.BAD_REQUEST, "no '..' in a path")
+            self._answer(HTTPStatus.BAD_REQUEST, "the path contains '..'; remove it")
         else:
             self._create_for_push(path, query)
             self._run_backend(path, query)
@@ -123,10 +123,10 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def _create_for_push(self, path: str, query: str) -> None:
-        asked = path.removesuffix("/info/refs")
+        name = path.removesuffix("/info/refs")
         pushing = parse_qs(query).get("service") == ["git-receive-pack"]
-        repository = self.server.root / asked.strip("/")
-        if asked != path and pushing and asked.endswith(".git") and not repository.exists():
+        repository = self.server.root / name.strip("/")
+        if name != path and pushing and name.endswith(".git") and not repository.exists():
             init_bare(repository, self.server.git)
 
     def _run_backend(self, path: str, query: str) -> None:
@@ -139,7 +139,7 @@ class _Handler(BaseHTTPRequestHandler):
         assert backend.stdin is not None
         assert backend.stdout is not None
         feeder = threading.Thread(target=self._feed, args=(backend.stdin,), daemon=True)
-        feeder.start()  # beside the reading: a backend may answer before it has read all
+        feeder.start()  # in parallel: a backend may answer before it has read everything
         try:
             self._relay(backend.stdout)
         except OSError:
@@ -165,7 +165,7 @@ class _Handler(BaseHTTPRequestHandler):
         return {name: value for name, value in variables.items() if value}
 
     def _feed(self, stdin: IO[bytes]) -> None:
-        """Hand the request's body on; read it to its end even where the backend has given up."""
+        """Forward the request's body; read it to its end even if the backend has closed."""
         listening = True
         try:
             for chunk in self._body():
@@ -207,7 +207,7 @@ class _Handler(BaseHTTPRequestHandler):
             else:
                 headers.append((name, value.strip()))
         if not headers:
-            self._answer(HTTPStatus.BAD_GATEWAY, "git http-backend gave no answer, see the log")
+            self._answer(HTTPStatus.BAD_GATEWAY, "git http-backend sent no answer; see the log")
             return
         self.send_response(status)
         for name, value in [*headers, ("Connection", "close")]:

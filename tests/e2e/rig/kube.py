@@ -1,7 +1,7 @@
-"""Talk to a cluster: apply, read, wait. The rig's only module that imports `kubernetes`.
+"""A cluster's API: apply, read, wait. The rig's only module that imports `kubernetes`.
 
-Objects go in and out as plain dictionaries, the shape of their manifests. Whatever waits takes a
-deadline, looks often, and says in its error what was last seen.
+Objects are plain dictionaries, like their manifests. Each wait has a deadline, polls often, and
+its error contains what it saw last.
 """
 
 from __future__ import annotations
@@ -47,26 +47,26 @@ _VERSIONS = {
 
 
 class Kube:
-    """One cluster's API. Kinds not listed above are taken from `v1` unless `version` is given."""
+    """A cluster's API. A kind that is not listed above is of `v1` unless `version` is given."""
 
     def __init__(
         self, kubeconfig: Path, cache: Path, check: Callable[[], None] = lambda: None
     ) -> None:
         settings = Configuration()
-        load: Any = load_kube_config  # annotated in some versions of the library, not in others
+        load: Any = load_kube_config  # only some versions of the library annotate it
         load(config_file=str(kubeconfig), client_configuration=settings)
         self.api: Any = ApiClient(settings)
         self._cache, self._check = cache, check
         self._dynamic: Any = None
 
     def close(self) -> None:
-        """Give the connections back."""
+        """Close the connections."""
         self.api.close()
 
     def apply(self, *manifests: Manifest | str, dry_run: bool = False) -> None:
-        """Apply manifests on the server's side; text may hold several YAML documents.
+        """Apply manifests on the server's side; text may contain several YAML documents.
 
-        A dry run has the server check everything, admission included, and store nothing.
+        In a dry run the server checks everything, admission included, and stores nothing.
         """
         for manifest in _documents(manifests):
             meta = manifest["metadata"]
@@ -80,7 +80,7 @@ class Kube:
             )
 
     def get(self, kind: str, name: str, namespace: str = "", version: str = "") -> Manifest | None:
-        """One object, or None where it is not there."""
+        """Return an object, or None if it does not exist."""
         try:
             found = self._resource(kind, version).get(name=name, namespace=namespace or None)
         except NotFoundError:
@@ -90,14 +90,14 @@ class Kube:
     def find(
         self, kind: str, namespace: str = "", selector: str = "", version: str = ""
     ) -> list[Manifest]:
-        """The objects of a kind, in one namespace or in all, by label selector."""
+        """Return the objects of a kind in one namespace or in all, by label selector."""
         found = self._resource(kind, version).get(
             namespace=namespace or None, label_selector=selector or None
         )
         return [dict(item) for item in found.to_dict()["items"]]
 
     def delete(self, kind: str, name: str, namespace: str = "", version: str = "") -> None:
-        """Delete one object; one that is not there is as good as deleted."""
+        """Delete an object, if it exists."""
         try:
             self._resource(kind, version).delete(name=name, namespace=namespace or None)
         except NotFoundError:
@@ -106,7 +106,7 @@ class Kube:
     def patch(
         self, kind: str, name: str, body: Manifest, namespace: str = "", version: str = ""
     ) -> None:
-        """Merge-patch one object."""
+        """Merge-patch an object."""
         self._resource(kind, version).patch(
             name=name,
             namespace=namespace or None,
@@ -115,16 +115,16 @@ class Kube:
         )
 
     def reconcile(self, kind: str, name: str, namespace: str) -> str:
-        """Ask a Flux controller to look now; returns the token that `handled` looks for."""
+        """Trigger a Flux controller; return the token for `handled`."""
         token = f"{time.time():.6f}"
         annotations = {"reconcile.fluxcd.io/requestedAt": token}
         self.patch(kind, name, {"metadata": {"annotations": annotations}}, namespace)
         return token
 
     def wait(self, what: str, look: Callable[[], Seen | None], timeout: float = 60.0) -> Seen:
-        """The first result of `look` that is neither None nor False.
+        """Return the first result of `look` that is neither None nor False.
 
-        Raises RigError after `timeout` seconds, or at once where a part of the rig has died.
+        Raises RigError after `timeout` seconds, or at once if a part of the rig has died.
         """
         deadline = time.monotonic() + timeout
         while True:
@@ -143,7 +143,7 @@ class Kube:
         self, kind: str, name: str, namespace: str = "", timeout: float = 60.0, version: str = ""
     ) -> Manifest:
         """Wait until an object's Ready condition holds for its newest generation."""
-        last: list[str] = ["not there"]
+        last: list[str] = ["does not exist"]
 
         def ready() -> Manifest | None:
             found = self.get(kind, name, namespace, version)
@@ -159,7 +159,7 @@ class Kube:
     def wait_gone(
         self, kind: str, name: str, namespace: str = "", timeout: float = 60.0, version: str = ""
     ) -> None:
-        """Wait until an object is not there."""
+        """Wait until an object does not exist."""
         what = f"{kind} {namespace}/{name} to go"
         self.wait(what, lambda: self.get(kind, name, namespace, version) is None, timeout)
 
@@ -177,22 +177,30 @@ class Kube:
             self.wait(f"CRD {name} to be served", established, timeout)
 
     def _resource(self, kind: str, version: str = "") -> Any:
-        if self._dynamic is None:  # late, for it asks the server what there is
+        if self._dynamic is None:  # late, because it queries the server
             connect: Any = DynamicClient
             self._dynamic = connect(self.api, cache_file=str(self._cache))
         version = version or _VERSIONS.get(kind, "v1")
         return self._dynamic.resources.get(api_version=version, kind=kind)
 
 
+def build_manifest(
+    version: str, kind: str, name: str, namespace: str = "", **fields: Any
+) -> Manifest:
+    """Return an object; one without a namespace belongs to the whole cluster."""
+    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
+    return {"apiVersion": version, "kind": kind, "metadata": metadata, **fields}
+
+
 def handled(manifest: Manifest, token: str) -> bool:
-    """Whether a Flux controller has finished the reconcile asked for with `token`."""
+    """Return whether a Flux controller has finished the reconcile that `token` triggered."""
     return bool(manifest.get("status", {}).get("lastHandledReconcileAt") == token)
 
 
 def _condition(found: Manifest | None) -> str:
-    """Why an object is not ready; empty where it is."""
+    """Return why an object is not ready; empty if it is."""
     if found is None:
-        return "not there"
+        return "does not exist"
     status = found.get("status", {})
     generation = found["metadata"].get("generation")
     fresh = status.get("observedGeneration", generation) == generation

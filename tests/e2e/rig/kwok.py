@@ -1,7 +1,7 @@
-"""Fake nodes and the kwok process that keeps them and their pods alive.
+"""Fake nodes, and the kwok process that keeps them and their pods alive.
 
-A fake node stands for one inventory node: it carries the `node_id` label that releases select.
-It bears the annotation by which a kwok in somebody else's cluster takes it over as well.
+A fake node represents an inventory node: it has the `node_id` label that releases select, and the
+annotation by which the kwok of an existing cluster manages it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _CAPACITY = {"cpu": "64", "memory": "256Gi", "ephemeral-storage": "1Ti", "pods":
 
 
 def component(binary: Path, kubeconfig: Path) -> Component:
-    """The kwok process for all nodes that `manifest` makes."""
+    """Return the kwok process for all nodes that `manifest` returns."""
     port = free_port()
     argv = [
         str(binary),
@@ -42,7 +42,7 @@ def component(binary: Path, kubeconfig: Path) -> Component:
 
 
 def node_name(node_id: str) -> str:
-    """A Kubernetes name for a node id; ids that differ only in lost characters stay apart."""
+    """Return a Kubernetes name for a node id; different ids have different names."""
     slug = re.sub(r"[^a-z0-9]+", "-", node_id.lower()).strip("-")
     if slug == node_id:
         return slug
@@ -50,7 +50,7 @@ def node_name(node_id: str) -> str:
 
 
 def manifest(node_id: str, labels: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """The Node object of one inventory node; raises RigError where its id is no label value."""
+    """Return the Node of an inventory node; raise RigError if its id is not a label value."""
     if not _LABEL_VALUE.fullmatch(node_id):
         raise RigError(f"node {node_id!r}: not a label value; use letters, digits, '-', '_', '.'")
     name = node_name(node_id)

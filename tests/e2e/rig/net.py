@@ -1,7 +1,7 @@
-"""Free loopback ports and readiness probes: all that the rig knows of sockets.
+"""Free loopback ports and readiness probes.
 
-A probe returns None once its component is ready and else says why not, so that a start that never
-comes to an end can name its reason.
+A probe returns None if its component is ready, else the reason why not, which the error of a
+failed start contains.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from pathlib import Path
 LOOPBACK = "127.0.0.1"
 Probe = Callable[[], "str | None"]
 
-# Below the kernel's usual range for outgoing connections (32768 and up), or a port found free
-# could be some client's own before its server binds it.
+# Below the kernel's usual range for outgoing connections (32768 and up), or a client
+# could take a free port before its server binds it.
 _PORTS = range(20000, 32000)
 _given: set[int] = set()
 _lock = threading.Lock()
 
 
 def free_port() -> int:
-    """A loopback port that nothing listens on and that this process gives out once only."""
+    """Return a free loopback port; this process returns each port only once."""
     with _lock:
         for port in random.sample(_PORTS, len(_PORTS)):
             if port not in _given and _bindable(port):
@@ -35,12 +35,12 @@ def free_port() -> int:
 
 
 def url(port: int, scheme: str = "http") -> str:
-    """The base URL of a server on this port."""
+    """Return the base URL of a server on this port."""
     return f"{scheme}://{LOOPBACK}:{port}"
 
 
 def answers(port: int, path: str, authority: Path | None = None) -> Probe:
-    """Ready once `path` is answered with 200, by HTTPS where a certificate authority is given."""
+    """Return a probe: ready if `path` answers 200, by HTTPS if an authority is given."""
     context = ssl.create_default_context(cafile=str(authority)) if authority else None
 
     def probe() -> str | None:
@@ -57,13 +57,13 @@ def answers(port: int, path: str, authority: Path | None = None) -> Probe:
             return f"{LOOPBACK}:{port}{path}: {error}"
         finally:
             connection.close()
-        return None if answer.status == 200 else f"{path} says {answer.status}: {text}"
+        return None if answer.status == 200 else f"{path} answers {answer.status}: {text}"
 
     return probe
 
 
 def accepts(port: int) -> Probe:
-    """Ready once the port takes connections."""
+    """Return a probe: ready if the port accepts connections."""
 
     def probe() -> str | None:
         try:

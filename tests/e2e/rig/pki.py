@@ -1,7 +1,7 @@
-"""Certificates and keys of one rig's control plane, made anew for each rig.
+"""Certificates and keys of a rig's control plane, created for each rig.
 
-One authority signs the servers' certificate and the administrator's. Elliptic keys, because they
-are made in no time. Private keys are readable by their owner only and live as long as the rig.
+One authority signs the servers' and the administrator's certificates. The keys are elliptic
+because those are created fast. Only their owner can read the private keys.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _AUTHORITY = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rig-authority")
 
 @dataclass(frozen=True)
 class Pki:
-    """Paths of the files that the control plane's programs take."""
+    """The paths of the control plane's certificates and keys."""
 
     authority: Path
     server_certificate: Path
@@ -36,7 +36,7 @@ class Pki:
 
 
 def make(folder: Path) -> Pki:
-    """Write an authority, a server and an administrator certificate and the token keys."""
+    """Write the certificates of an authority, a server and an administrator, and the token keys."""
     folder.mkdir(parents=True, exist_ok=True)
     authority = ec.generate_private_key(ec.SECP256R1())
     root = _builder(_AUTHORITY, authority.public_key(), authority).sign(authority, hashes.SHA256())
@@ -57,7 +57,7 @@ def make(folder: Path) -> Pki:
     request = request.add_extension(addresses, critical=False)
     _write(paths.server_certificate, _pem(request.sign(authority, hashes.SHA256())))
     _write(paths.server_key, _private(server))
-    # The group is the one that every cluster's first role binding makes administrators.
+    # Every cluster's first role binding makes this group administrators.
     admin = ec.generate_private_key(ec.SECP256R1())
     request = _builder(_name("rig-admin", "system:masters"), admin.public_key(), authority)
     _write(paths.admin_certificate, _pem(request.sign(authority, hashes.SHA256())))
@@ -74,7 +74,7 @@ def make(folder: Path) -> Pki:
 
 
 def write_kubeconfig(target: Path, name: str, server: str, pki: Pki) -> Path:
-    """Write an administrator's kubeconfig that needs no other file; JSON is YAML too."""
+    """Write an administrator's kubeconfig that refers to no other file; JSON is valid YAML."""
 
     def inline(path: Path) -> str:
         return base64.b64encode(path.read_bytes()).decode()
@@ -107,11 +107,11 @@ def _builder(
         .issuer_name(_AUTHORITY)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(minutes=5))  # clocks step back
+        .not_valid_before(now - datetime.timedelta(minutes=5))  # clocks may go back
         .not_valid_after(now + _LIFE)
         .add_extension(x509.BasicConstraints(ca=ca, path_length=None), critical=True)
         .add_extension(_usage(ca=ca), critical=True)
-        # Python 3.13 and later verify strictly: without these two they refuse the server.
+        # Python 3.13 and later verify strictly and refuse a server without these two.
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer), critical=False)
     )

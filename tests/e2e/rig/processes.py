@@ -1,8 +1,8 @@
-"""Start, watch and stop the rig's processes; it knows nothing of what they are.
+"""The rig's processes: start, watch, stop.
 
-Each process leads a group of its own (so that Ctrl-C reaches the tests only, which then stop
-things in order, and so that its children can be ended with it), a log file, and the kernel's order
-to die with this process. Stopping asks first and kills after a deadline, last started first.
+Each process leads its own group, has a log file, and dies with this process. The group makes
+Ctrl-C reach only the tests, which then stop everything in order, and ends the children too. A stop
+asks first and kills after a deadline, last started first.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from .net import Probe
 
 _POLL_SECONDS = 0.05
 _TAIL_LINES = 30
-_GROUP_SECONDS = 3.0  # an init that does not reap its orphans must not hold a stop up
+_GROUP_SECONDS = 3.0  # an init that does not reap orphans must not delay a stop
 
 
 @dataclass(frozen=True)
 class Component:
-    """How one process is started, when it counts as ready, and where it serves (`url`)."""
+    """How to start a process, when it is ready, and where it serves (`url`)."""
 
     name: str
     argv: tuple[str, ...]
@@ -43,7 +43,7 @@ class Component:
 
 
 class Processes:
-    """The processes of one rig, by component name."""
+    """The processes of a rig, by component name."""
 
     def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
         self._logs = logs
@@ -70,7 +70,7 @@ class Processes:
         process = self._running.get(name)
         if process is not None:
             if _exit_code(process) is None:
-                raise RigError(f"{name}: already runs as {process.pid}; stop it first")
+                raise RigError(f"{name}: already running as {process.pid}; stop it first")
             _end(process)
         self._launch(component)
         self.wait_ready(name)
@@ -85,10 +85,10 @@ class Processes:
                 waited = f"not ready after {component.ready_seconds:.0f} s: {reason}"
                 raise RigError(self._with_log(name, waited))
             time.sleep(_POLL_SECONDS)
-        self.check(name)  # the port may have answered for somebody else's server
+        self.check(name)  # another server may have answered on the port
 
     def check(self, *names: str) -> None:
-        """Raise RigError where one of the named (default: all) processes ended unasked."""
+        """Raise RigError if a named process (default: any) ended without being stopped."""
         for name in names or list(self._running):
             process = self._running.get(name)
             if process is not None and (code := _exit_code(process)) is not None:
@@ -97,12 +97,12 @@ class Processes:
                 raise RigError(self._with_log(name, ended))
 
     def stop(self, name: str) -> None:
-        """Ask a component to end and kill it where it does not; one that is not there is fine."""
+        """Ask a component to end, if it runs, and kill it if it does not end."""
         self._known(name)
         self._stop_batch([name])
 
     def kill(self, name: str) -> None:
-        """End a component at once, as a crash would."""
+        """Kill a component, like a crash."""
         self._known(name)
         process = self._running.pop(name, None)
         if process is not None:
@@ -112,11 +112,11 @@ class Processes:
         """Send a signal to a component and its children (SIGSTOP makes a server hang)."""
         process = self._running.get(self._known(name).name)
         if process is None:
-            raise RigError(f"{name}: does not run, so it cannot get {number.name}")
+            raise RigError(f"{name}: not running, cannot receive {number.name}; start it first")
         os.killpg(process.pid, number)
 
     def stop_all(self) -> None:
-        """Stop everything, last started first; a second interrupt kills what is left at once."""
+        """Stop everything, last started first; a second interrupt kills the others at once."""
         try:
             for batch in reversed(self._batches):
                 self._stop_batch(batch)
@@ -126,24 +126,24 @@ class Processes:
             self._running.clear()
 
     def pids(self) -> dict[str, int]:
-        """Process ids of what runs."""
+        """Return the ids of the running processes."""
         return {name: process.pid for name, process in self._running.items()}
 
     def names(self) -> list[str]:
-        """All components, in the order of their start."""
+        """Return all components, in the order of their start."""
         return list(self._components)
 
     def url(self, name: str) -> str:
-        """Where a component serves what tests ask of it."""
+        """Return the URL of a component that tests call."""
         return self._known(name).url
 
     def log(self, name: str) -> Path:
-        """The log file of a component; it goes on through restarts."""
+        """Return the log file of a component; restarts append to it."""
         return self._logs / f"{name}.log"
 
     def _known(self, name: str) -> Component:
         if name not in self._components:
-            raise RigError(f"no component {name!r}; there are {', '.join(self._components)}")
+            raise RigError(f"no component {name!r}; choose one of {', '.join(self._components)}")
         return self._components[name]
 
     def _launch(self, component: Component) -> None:
@@ -169,7 +169,7 @@ class Processes:
     def _stop_batch(self, names: list[str]) -> None:
         going = {name: self._running[name] for name in names if name in self._running}
         for process in going.values():
-            # CONT as well: a process that a test has stopped would never see the TERM.
+            # CONT too: a paused process would never handle the TERM.
             for number in (signal.SIGTERM, signal.SIGCONT):
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, number)
@@ -189,9 +189,9 @@ class Processes:
 
 
 def _exit_code(process: subprocess.Popen[bytes]) -> int | None:
-    """How the process ended, None while it runs; without reaping it.
+    """Return the exit code of a process without reaping it; None while it runs.
 
-    Reaped, its pid could soon be somebody else's, and so could the group that `_end` kills.
+    After reaping, another process could get its pid and the group that `_end` kills.
     """
     if process.returncode is not None:
         return process.returncode
@@ -202,7 +202,7 @@ def _exit_code(process: subprocess.Popen[bytes]) -> int | None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and what it started, reap it, and wait for the others to be gone."""
+    """Kill a process and its group, reap it, and wait until the group is empty."""
     if process.returncode is not None:
         return
     with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -216,10 +216,10 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 class _Spawner:
-    """Starts every process from one thread that lives as long as this process does.
+    """Starts every process from one thread that lives as long as this process.
 
-    The kernel kills a child when the *thread* that started it ends. A rig started in a worker
-    thread (two clusters at once) would otherwise lose its cluster when that thread is done.
+    The kernel kills a child when the *thread* that started it ends. Otherwise a rig started in a
+    worker thread (two clusters at once) would lose its cluster when that thread ends.
     """
 
     def __init__(self) -> None:

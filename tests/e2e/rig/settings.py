@@ -1,7 +1,7 @@
-"""What the environment says: which cluster the tests are to run on.
+"""The cluster for the tests, from the environment.
 
-With E2E_KUBECONFIG and E2E_GIT_URL the tests use a cluster that is there (kind, k3d), with Flux and
-kwok installed in it, and start nothing. A second cluster is named by E2E_KUBECONFIG_<NAME>.
+With E2E_KUBECONFIG and E2E_GIT_URL the tests use an existing cluster (kind, k3d) with Flux and
+kwok, and start nothing. A second cluster is named by E2E_KUBECONFIG_<NAME>.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from .errors import RigError
 
 @dataclass(frozen=True)
 class Existing:
-    """A cluster that somebody else runs, and the Git server that it reads."""
+    """An existing cluster and the Git server that it reads."""
 
     kubeconfig: Path
     git_url: str
@@ -23,7 +23,7 @@ class Existing:
 
 
 def existing(name: str) -> Existing | None:
-    """The cluster to use for the rig of this name, None where the rig is to start its own."""
+    """Return the cluster for the rig of this name; None if the rig must start its own."""
     own = f"E2E_KUBECONFIG_{name.upper().replace('-', '_')}"
     kubeconfig = os.environ.get(own) or os.environ.get("E2E_KUBECONFIG", "")
     git_url = os.environ.get("E2E_GIT_URL", "")
@@ -34,11 +34,11 @@ def existing(name: str) -> Existing | None:
         raise RigError(
             f"{missing} is not set: an existing cluster needs E2E_KUBECONFIG and E2E_GIT_URL (the "
             "base URL of a Git server that the cluster reaches and that creates repositories on "
-            "push, with E2E_GIT_PUSH_URL where the tests reach it by another URL); unset both and "
+            "push, with E2E_GIT_PUSH_URL if the tests reach it by another URL); unset both and "
             "the tests start a cluster of their own"
         )
     path = Path(kubeconfig).expanduser().resolve()
     if not path.is_file():
-        raise RigError(f"E2E_KUBECONFIG={kubeconfig}: no such file")
+        raise RigError(f"E2E_KUBECONFIG={kubeconfig}: the file does not exist")
     push_url = os.environ.get("E2E_GIT_PUSH_URL") or git_url
     return Existing(path, git_url.rstrip("/"), push_url.rstrip("/"))

@@ -1,7 +1,7 @@
-"""The folder of one rig: its data, its logs, and how both go away again.
+"""The folder of a rig, with its data and logs.
 
-A rig holds a lock on its folder for as long as it lives. A folder whose lock is free belonged to a
-test run that was killed: the next rig removes it, for an etcd alone takes over a hundred megabytes.
+A rig keeps a lock on its folder while it lives. A folder with a free lock belonged to a test run
+that was killed. The next rig removes it, because an etcd alone needs over a hundred megabytes.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import IO
 
 _PREFIX = "demandops-rig-"
-_YOUNG_SECONDS = 60  # another rig may have made its file and not locked it yet
+_YOUNG_SECONDS = 60  # another rig may not have locked its new file yet
 
 
 class Workdir:
-    """A rig's folder; `logs` outlives a failure, the rest does not."""
+    """A rig's folder; only `logs` stays after a failure."""
 
     def __init__(self, name: str, path: Path | None = None) -> None:
         if path is None:
@@ -36,21 +36,21 @@ class Workdir:
 
     @property
     def home(self) -> Path:
-        """HOME of the processes: nothing of the person's own must reach them."""
+        """Return the processes' HOME, without the user's own files."""
         return self.path / "home"
 
     @property
     def temporary(self) -> Path:
-        """TMPDIR of the processes, so that a killed one leaves nothing elsewhere."""
+        """Return the processes' TMPDIR, so that a killed one leaves no files elsewhere."""
         return self.path / "tmp"
 
     @property
     def repositories(self) -> Path:
-        """Root of the Git server."""
+        """Return the root of the Git server."""
         return self.path / "git"
 
     def environment(self) -> dict[str, str]:
-        """What every process of the rig gets, and nothing else of the person's environment."""
+        """Return the environment of the rig's processes, without the user's other variables."""
         return {
             "PATH": os.environ.get("PATH", os.defpath),
             "HOME": str(self.home),
@@ -59,7 +59,7 @@ class Workdir:
         }
 
     def clear(self, *, keep_logs: bool) -> None:
-        """Remove the data, and the logs too unless somebody will want to read them."""
+        """Remove the data, and the logs too unless `keep_logs`."""
         for entry in self.path.iterdir():
             if entry == self.logs and keep_logs:
                 continue
@@ -84,7 +84,7 @@ def _locked(path: Path) -> IO[str]:
 
 def _sweep(parent: Path) -> None:
     for left in parent.glob(f"{_PREFIX}*/lock"):
-        with contextlib.suppress(OSError):  # held by a living rig, somebody else's, or just gone
+        with contextlib.suppress(OSError):  # locked by its rig, another user's, or just removed
             if time.time() - left.stat().st_mtime > _YOUNG_SECONDS:
                 with _locked(left):
                     shutil.rmtree(left.parent, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""What a person might do to a cluster or demand once more, for tests that nothing comes of it."""
+"""Manual changes of a cluster, and a goal of another requester."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 from .namespace import Namespace
 
 
-def asked_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
-    """The same applications and connections, demanded for somebody else."""
+def requested_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
+    """Return a goal for the same applications and connections with another requester."""
     requesters = {"requester_ids": [vehicle, "station00"]}
     apps = [
         app | {"object_detection_fusion_app": app["object_detection_fusion_app"] | requesters}
@@ -19,13 +19,13 @@ def asked_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
 
 
 def pod_template(namespace: Namespace, deployment: str) -> dict[str, Any]:
-    """What a Deployment makes its pods from."""
+    """Return the pod template of a Deployment."""
     template: dict[str, Any] = namespace.get("Deployment", deployment)["spec"]["template"]
     return template
 
 
 def change_image(namespace: Namespace, deployment: str) -> None:
-    """Have a Deployment run something else."""
+    """Change the image of a Deployment."""
     containers = pod_template(namespace, deployment)["spec"]["containers"]
     containers[0]["image"] = "example.invalid/other:1"
     body = {"spec": {"template": {"spec": {"containers": containers}}}}
@@ -34,16 +34,16 @@ def change_image(namespace: Namespace, deployment: str) -> None:
     assert changed == "example.invalid/other:1"
 
 
-def empty(namespace: Namespace, config: str, key: str) -> None:
+def overwrite(namespace: Namespace, config: str, key: str) -> None:
     """Overwrite the only entry of a ConfigMap."""
     namespace.kube.patch("ConfigMap", config, {"data": {key: "by hand"}}, namespace.namespace)
     assert namespace.get("ConfigMap", config)["data"] == {key: "by hand"}
 
 
-def wait_for(
+def wait_restored(
     namespace: Namespace, template: dict[str, Any], data: dict[str, str], *names: str
 ) -> None:
-    """Wait until a Deployment's pods and a ConfigMap's content are as they were."""
+    """Wait until a Deployment has its pod template and a ConfigMap its content again."""
     deployment, config = names
     namespace.kube.wait("the image", lambda: pod_template(namespace, deployment) == template)
     namespace.kube.wait("the content", lambda: namespace.get("ConfigMap", config)["data"] == data)
