@@ -10,7 +10,7 @@ import pytest
 from demandops.cluster import access, reconcile_trigger
 from demandops.errors import InvalidInput
 
-from tests.golden.cases import start
+from tests.kit.golden import start
 from tests.kit.http import Answer, Call, kubeconfig, serving
 
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
