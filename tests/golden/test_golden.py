@@ -65,10 +65,3 @@ def test_between_steps_two_and_seven_only_the_fusions_inputs_change() -> None:
     }
     assert len(fixed) == 1
     assert len(set(texts)) == len(texts)
-
-
-def test_a_further_requester_changes_the_ledger_and_no_release() -> None:
-    steps = rendered("experiment")
-    before, after = steps["1-vehicle00-joins"], steps["2-vehicle01-joins"]
-    assert before[STATION] == after[STATION]
-    assert not any("vehicle01" in before[p] for p in before if p.startswith("clusters/"))

@@ -18,13 +18,13 @@ from pathlib import Path
 from demandops import strict_yaml
 from demandops.decision import State, rendered_files
 
+from tests.kit import goals
 from tests.kit.memory import MemoryRepo
 
 Files = Mapping[str, str]
 """Texts by path."""
 
 GOLDEN = Path(__file__).parents[1] / "golden"
-REQUESTS_OF_THE_EXPERIMENT = GOLDEN.parents[1] / "examples" / "experiment"
 
 EXPERIMENT = "experiment"
 FOLLOWING = ("argocd-experiment",)
@@ -49,7 +49,7 @@ DELETED = "DELETED"
 def requests_of(case: str) -> list[Path]:
     """Return the request files of a case, in order."""
     if case in (EXPERIMENT, *FOLLOWING):
-        return sorted(REQUESTS_OF_THE_EXPERIMENT.glob("*.yaml"))
+        return list(goals.EXPERIMENT)
     return sorted((GOLDEN / case / "requests").glob("*.yaml"))
 
 
