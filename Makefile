@@ -10,12 +10,6 @@ GO     := 1.26
 GO_DIR := build/go-$(GO)
 # Slow, and seldom broken: they build the packages that users install.
 PACKAGE_TESTS := tests/ros/test_colcon.py tests/integration/test_wheel.py
-# The core's tests need no Git: without_git forbids its import, and conftest.py, which imports it, is left out.
-CORE := config decision demand ledger plan render
-CORE_TESTS := -p tests.kit.without_git --confcutdir tests/unit tests/golden tests/model tests/unit \
-  $(addprefix --ignore=tests/unit/,cluster forge service staterepo demand/test_fuzz.py) \
-  --ignore-glob='tests/unit/test_[!s]*'
-CORE_COVERAGE := 84
 # Tests and the demo talk on this machine only.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
@@ -59,6 +53,12 @@ test: system-test setup  ## Run all tests but the end-to-end ones and test-packa
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
 	@$(PY) -m pytest $(PACKAGE_TESTS)
 
+# The core's tests need no Git: without_git forbids its import, and --confcutdir leaves conftest.py out.
+CORE := config decision demand ledger plan render
+CORE_TESTS := -p tests.kit.without_git --confcutdir tests/unit tests/golden tests/model tests/unit \
+  $(addprefix --ignore=tests/unit/,cluster forge service staterepo demand/test_fuzz.py) \
+  --ignore-glob='tests/unit/test_[!s]*'
+CORE_COVERAGE := 84
 coverage: export PYTEST_ADDOPTS := --cov-report=term-missing:skip-covered
 coverage: system-test setup  ## Report what the tests cover, then what the core's tests cover without Git
 	@PYTEST_ADDOPTS="$$PYTEST_ADDOPTS --cov=demandops --cov=demandops_ros" $(MAKE) --no-print-directory test
