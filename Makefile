@@ -15,7 +15,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-packages e2e e2e-argocd check format golden bench load wheel clean
+.PHONY: help setup demo test test-packages e2e e2e-argocd coverage check format golden bench bench-audit load wheel clean
 .PHONY: $(SYSTEM) go
 
 help:  ## Show what there is to make
@@ -53,6 +53,18 @@ test: system-test setup  ## Run all tests but the end-to-end ones and test-packa
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
 	@$(PY) -m pytest $(PACKAGE_TESTS)
 
+# The core's tests need no Git: without_git forbids its import, and --confcutdir leaves conftest.py out.
+CORE := config decision demand ledger plan render
+CORE_TESTS := -p tests.kit.without_git --confcutdir tests/unit tests/golden tests/model tests/unit \
+  $(addprefix --ignore=tests/unit/,cluster forge service staterepo demand/test_fuzz.py) \
+  --ignore-glob='tests/unit/test_[!s]*'
+CORE_COVERAGE := 84
+coverage: export PYTEST_ADDOPTS := --cov-report=term-missing:skip-covered
+coverage: system-test setup  ## Report what the tests cover, then what the core's tests cover without Git
+	@PYTEST_ADDOPTS="$$PYTEST_ADDOPTS --cov=demandops --cov=demandops_ros" $(MAKE) --no-print-directory test
+	@$(PY) -m pytest -n auto --dist worksteal $(CORE_TESTS) \
+	  $(addprefix --cov=demandops.,$(CORE)) --cov-fail-under=$(CORE_COVERAGE)
+
 # On a cluster that is there (E2E_KUBECONFIG) the tests start no programs of their own.
 e2e: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
 e2e: system-e2e setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests on a real cluster with Flux (docs/e2e.md)
@@ -82,6 +94,9 @@ golden: setup  ## Write the golden folders anew; review the diff
 bench: setup  ## Measure what a commit costs, beside the floor
 	@$(PY) -m tests.benchmarks.commits
 
+bench-audit: setup  ## Measure what an auditor's questions cost after 10,000 commits
+	@$(PY) -m tests.benchmarks.audit
+
 load: setup  ## Four generators and a person write at once, 2,000 demands, connections are cut
 	@DEMANDOPS_LOAD_DEMANDS=2000 DEMANDOPS_LOAD_FURTHER=1000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/staterepo/test_many_writers.py tests/integration/staterepo/test_people_in_the_loop.py
 
@@ -89,4 +104,4 @@ wheel: setup  ## Build the wheel into dist/
 	@$(PY) -m build --wheel --outdir dist .
 
 clean:  ## Remove what the other targets made
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache .coverage

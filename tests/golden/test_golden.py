@@ -5,54 +5,63 @@ from __future__ import annotations
 import pytest
 from demandops.decision import rendered_files
 
-from tests.golden.cases import CASES, HERE, play, requests_of, start
+from tests.kit.golden import CASES, DELETED, START, play, problems, read, rendered, whole
 
-
-def _expected(case: str, name: str) -> dict[str, str]:
-    folder = HERE / case / "expected" / name
-    return {
-        path.relative_to(folder).as_posix(): path.read_text()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+STATION = "clusters/c-its/perception/edge/od-edge-station00.yaml"
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_every_step_gives_the_files_that_were_reviewed(case: str) -> None:
-    steps = dict(play(case))
-    assert list(steps) == [file.stem for file in requests_of(case)]
-    for name, files in steps.items():
-        expected = _expected(case, name)
-        assert sorted(files) == sorted(expected), f"{case}/{name}: other files (make golden)"
-        for path, text in files.items():
-            assert text == expected[path], f"{case}/{name}/{path} (make golden)"
+    assert problems(case, read(case)) == [], "run `make golden` and review the diff"
+    assert whole(case) == rendered(case)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_ledger_and_the_configuration_alone_render_the_same_files(case: str) -> None:
+    for step, repo in play(case):
+        files = whole(case)[step]
+        without_ledger = {p: text for p, text in files.items() if not p.startswith("ledger/")}
+        assert rendered_files(repo.state, files) == without_ledger
+
+
+@pytest.mark.parametrize(
+    ("step", "path", "text", "problem"),
+    [
+        ("2-vehicle01-joins", STATION, None, f"{STATION} is not a change of this step"),
+        ("2-vehicle01-joins", "clusters/x.yaml", "", "clusters/x.yaml is not a change of this"),
+        ("9-a-further-step", STATION, "", f"{STATION} is not a change of this step"),
+        ("1-vehicle00-joins", STATION, "", f"{STATION} has another text"),
+        ("5-vehicle00-leaves", DELETED, "", f"{DELETED} has another text"),
+    ],
+    ids=["unchanged file", "further file", "further step", "other text", "other deletions"],
+)
+def test_a_folder_with_anything_else_fails(
+    step: str, path: str, text: str | None, problem: str
+) -> None:
+    stored = read("experiment")
+    unchanged = whole("experiment")["1-vehicle00-joins"]
+    stored.setdefault(step, {})[path] = unchanged[path] if text is None else text
+    (found,) = problems("experiment", stored)
+    assert found.startswith(f"experiment/{step}/{problem}")
+
+
+def test_a_folder_without_a_file_fails() -> None:
+    stored = read("experiment")
+    del stored["1-vehicle00-joins"][STATION]
+    assert problems("experiment", stored) == [f"experiment/1-vehicle00-joins/{STATION} is missing"]
 
 
 def test_after_the_last_vehicle_left_only_what_init_laid_down_is_there() -> None:
-    _, standing = start("experiment")
-    *_, (_, last) = play("experiment")
-    assert last == standing
+    steps = rendered("experiment")
+    assert steps["8-vehicle03-leaves"] == steps[START]
 
 
 def test_between_steps_two_and_seven_only_the_fusions_inputs_change() -> None:
     path = "clusters/c-its/perception/edge/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
-    texts = [files[path] for _, files in list(play("experiment"))[1:7]]
+    texts = [files[path] for files in list(rendered("experiment").values())[2:8]]
     fixed = {
         "\n".join(line for line in text.splitlines() if not line.strip().startswith("- /"))
         for text in texts
     }
     assert len(fixed) == 1
     assert len(set(texts)) == len(texts)
-
-
-def test_a_further_requester_changes_the_ledger_and_no_release() -> None:
-    steps = dict(play("experiment"))
-    before, after = steps["1-vehicle00-joins"], steps["2-vehicle01-joins"]
-    station = "clusters/c-its/perception/edge/od-edge-station00.yaml"
-    assert before[station] == after[station]
-    assert not any("vehicle01" in before[p] for p in before if p.startswith("clusters/"))
-
-
-def test_rendering_from_the_books_alone_gives_the_same_bytes() -> None:
-    state, standing = start("experiment")
-    assert rendered_files(state) == standing

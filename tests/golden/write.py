@@ -1,21 +1,21 @@
-"""``make golden``: write the expected folders anew. Review the diff before you commit it."""
+"""``make golden``: write the expected changes anew. Review the diff before you commit it."""
 
 from __future__ import annotations
 
 import shutil
 
-from tests.golden.cases import CASES, HERE, play
+from tests.kit.golden import CASES, GOLDEN, to_store
 
 
 def main() -> None:
     """Write every case."""
     for case in CASES:
-        expected = HERE / case / "expected"
+        expected = GOLDEN / case / "expected"
         shutil.rmtree(expected, ignore_errors=True)
         count = 0
-        for name, files in play(case):
+        for step, files in to_store(case).items():
             for path, text in files.items():
-                target = expected / name / path
+                target = expected / step / path
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_text(text)
                 count += 1

@@ -12,6 +12,7 @@ from demandops.cli.main import run as run_command
 from demandops.ledger.claim_file import read
 
 from tests.kit.goals import APP, EXPERIMENT, application, connection, goal, perception
+from tests.kit.golden import GOLDEN, requests_of
 from tests.kit.repo import git
 
 Run = Callable[..., Any]
@@ -173,8 +174,7 @@ class TestWhy:
     def test_every_release_of_other_carriers(
         self, demandops: Run, ask: Run, state: Any, case: str
     ) -> None:
-        folder = Path(__file__).parents[1] / "golden" / case
-        overlay = folder / "state-repo"
+        overlay = GOLDEN / case / "state-repo"
         state.commit(
             {
                 file.relative_to(overlay).as_posix(): file.read_text()
@@ -182,8 +182,7 @@ class TestWhy:
                 if file.is_file()
             }
         )
-        first = sorted((folder / "requests").iterdir())[0]
-        assert demandops("request", first, "--state-repo", state.path).code == 0
+        assert demandops("request", requests_of(case)[0], "--state-repo", state.path).code == 0
         clients = [path for path in state.manifests() if "/_" not in path]
         assert clients
         for path in clients:

@@ -19,7 +19,7 @@ from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.render.output_check import check_files
-from demandops.staterepo import new_repo
+from demandops.staterepo import skeleton
 
 from tests.kit.config import configuration
 
@@ -108,7 +108,7 @@ def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
 
 
 def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:
-    runner, files = CliRunner(), new_repo.files()
+    runner, files = CliRunner(), skeleton.files()
     listed = dict(
         line.split(maxsplit=1) for line in runner.invoke(cli, ["schema"]).output.splitlines()
     )

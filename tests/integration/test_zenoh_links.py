@@ -17,7 +17,7 @@ import pytest
 import yaml
 import zenoh
 
-from tests.golden.cases import play
+from tests.kit.golden import rendered
 
 DEADLINE_S = 30.0
 STEP = "2-station00-joins"
@@ -33,9 +33,8 @@ def free_port() -> int:
 @pytest.fixture(scope="module")
 def configurations() -> dict[str, str]:
     """Return the rendered configuration of each node's bridge, its hosts made this machine."""
-    steps = dict(play("zenoh"))
     found = {}
-    for path, text in steps[STEP].items():
+    for path, text in rendered("zenoh")[STEP].items():
         name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
         if path.startswith("clusters/") and name.startswith("zenoh-"):
             config, _ = yaml.safe_load_all(text)

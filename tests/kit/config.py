@@ -8,15 +8,15 @@ from typing import Any
 
 import yaml
 from demandops.config.config import CONFIG_ROOTS
-from demandops.staterepo import new_repo
+from demandops.staterepo.skeleton import files
 
 FAST: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-@lru_cache(maxsize=1)
-def skeleton() -> Mapping[str, str]:
+@lru_cache
+def skeleton(gitops: str = "flux") -> Mapping[str, str]:
     """Return every file of a new state repo."""
-    return new_repo.files()
+    return files(gitops)
 
 
 def configuration(changed: Mapping[str, str | None] | None = None) -> dict[str, str]:

@@ -21,6 +21,8 @@ from demandops import settings
 from demandops.cli import main
 from demandops.cli.repo.schema import SCHEMAS
 
+from tests.kit.golden import CASES, whole
+
 ROOT = Path(__file__).parents[2]
 INTERFACES = ROOT / "ros_bridge" / "interfaces"
 PAGE = (ROOT / "docs" / "public-api.md").read_text()
@@ -123,10 +125,11 @@ def walk(schema: Json, definitions: Json, path: str) -> Iterator[tuple[str, str]
 
 
 def claim_files() -> Json:
-    """Return the top-level fields of the claims in the golden folders."""
+    """Return the top-level fields of the claims in the golden cases."""
     found: dict[str, set[str]] = {}
-    for path in ROOT.glob("tests/golden/*/expected/**/ledger/**/*.yaml"):
-        claim = yaml.safe_load(path.read_text())
+    steps = (files for case in CASES for files in whole(case).values())
+    texts = {text for files in steps for path, text in files.items() if path.startswith("ledger/")}
+    for claim in map(yaml.safe_load, texts):
         found.setdefault(f"{claim['apiVersion']} {claim['kind']}", set()).update(claim)
     return {kind: " ".join(sorted(names)) for kind, names in sorted(found.items())}
 

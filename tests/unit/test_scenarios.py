@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from demandops.config.load import load
 from demandops.errors import InvalidInput
@@ -109,4 +107,3 @@ def test_a_refusal_must_be_the_one_that_is_expected() -> None:
 
 def test_the_scenarios_are_where_they_are_looked_for() -> None:
     assert len(FILES) >= 20
-    assert all(isinstance(path, Path) for path in FILES.values())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Mapping
 from datetime import datetime
@@ -10,14 +9,9 @@ from pathlib import Path
 
 import pygit2
 
-from demandops import strict_yaml
-from demandops.config.config import CONFIG_ROOTS
-from demandops.config.load import load
-from demandops.config.repo_settings import ROOT_FILE
-from demandops.decision import State, rendered_files
 from demandops.errors import StateRepoError
-from demandops.ledger.ledger import Ledger
-from demandops.settings import MAIN_BRANCH, RENDER_VERSION, data_folder
+from demandops.settings import MAIN_BRANCH, RENDER_VERSION
+from demandops.staterepo import skeleton
 from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.signing import Signer
@@ -25,31 +19,6 @@ from demandops.staterepo.history import commit_message
 
 PIPELINES = (".github/workflows/demandops.yml", ".gitlab-ci.yml")
 """The pipelines that check pull requests, on GitHub and GitLab."""
-
-
-def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
-    """Return path → text of a new state repo: skeleton, appdefs and their rendered files.
-
-    Raises:
-        InvalidInput: clusters cannot fetch from ``url``.
-    """
-    contents = _read(data_folder("skeleton"), "")
-    contents |= _read(data_folder("appdefs"), "appdefs/")
-    roots = {"flux": contents.pop(ROOT_FILE), "argocd": contents.pop("demandops.argocd.yaml")}
-    root = strict_yaml.set_key(roots[gitops], "renderVersion", RENDER_VERSION)
-    if url:
-        root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {strict_yaml.to_json(url)}", root)
-    contents[ROOT_FILE] = root
-    config = load({p: text for p, text in contents.items() if p.split("/")[0] in CONFIG_ROOTS})
-    return contents | rendered_files(State.of(config, Ledger()))
-
-
-def _read(folder: Path, prefix: str) -> dict[str, str]:
-    return {
-        prefix + path.relative_to(folder).as_posix(): path.read_text()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.suffix != ".pyc" and path.name != "__init__.py"
-    }
 
 
 def init(
@@ -79,7 +48,7 @@ def init(
         raise StateRepoError(
             f"{target} exists and is not empty; name a new folder (nothing was changed)"
         )
-    content = files(gitops=gitops, url=url)
+    content = skeleton.files(gitops=gitops, url=url)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         partial = target.with_name(f".{target.name}.partial")

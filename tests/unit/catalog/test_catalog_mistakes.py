@@ -12,7 +12,6 @@ from collections.abc import Mapping
 import pytest
 from demandops.config.load import load
 from demandops.errors import InvalidInput
-from demandops.staterepo import new_repo
 
 from tests.kit.config import brokers, configuration, edited, skeleton
 
@@ -470,7 +469,7 @@ class TestArgoCd:
 
     @staticmethod
     def root(**section: object) -> dict[str, str | None]:
-        text = new_repo.files("argocd")[ROOT]
+        text = skeleton("argocd")[ROOT]
         url = "  url: https://git.example/fleet/state-repo.git\n"
         assert url in text
         return {ROOT: text.replace(url, f"  {json.dumps(section)}\n")}

@@ -274,14 +274,6 @@ def test_values_of_a_fusion() -> None:
     }
 
 
-def test_other_inputs_change_the_inputs_only() -> None:
-    before = render("object-fusion")
-    after = render("object-fusion", inputs={"ego_data": [], "object_list": []})
-    assert after["inputs"] == {"egoData": [], "objectList": []}
-    assert before.pop("inputs") != after.pop("inputs")
-    assert before == after
-
-
 def test_a_topic_of_two_sources_is_read_once() -> None:
     twice = [{"topic": topic, "source": "v", "type": ""} for topic in ("/A", "/a", "/a")]
     values = render("object-fusion", inputs={"ego_data": twice, "object_list": []})

@@ -15,7 +15,7 @@ from demandops.cluster import access, controller_webhook
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
 from demandops.errors import InvalidInput
 
-from tests.golden.cases import start
+from tests.kit.golden import start
 from tests.kit.http import Answer, Call, serving
 
 SECRET = "It's a Secret to Everybody"  # noqa: S105 - of an example

@@ -182,9 +182,9 @@ def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
     ],
 )
 def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> None:
-    from demandops.staterepo import new_repo
+    from demandops.staterepo import skeleton
 
-    files = new_repo.files()
+    files = skeleton.files()
     config = {
         path: text
         for path, text in files.items()

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import kubernetes_validate
 import pytest
 import yaml
-from demandops.decision import rendered_files
 from demandops.errors import InvalidInput
 from demandops.render.output_check import check_files
 
 from tests.kit.config import FAST, edited
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal, perception
+from tests.kit.golden import CASES, rendered
 from tests.kit.memory import MemoryRepo as Books
 
-EXPERIMENT = sorted((Path(__file__).parents[3] / "examples" / "experiment").glob("*.yaml"))
 BUILT_IN = {"v1", "apps/v1", "rbac.authorization.k8s.io/v1"}
 
 
@@ -28,38 +26,19 @@ def documents(books: Books) -> Iterator[tuple[str, dict[str, Any]]]:
                 yield path, document
 
 
-@pytest.fixture(scope="module")
-def experiment() -> list[Books]:
-    """Return the state after each step of the experiment."""
-    steps = []
-    books = Books()
-    for path in EXPERIMENT:
-        books.send(yaml.safe_load(path.read_text()))
-        steps.append(books.copy())
-    return steps
-
-
-@pytest.mark.parametrize("step", range(8))
-def test_what_is_rendered_fits_the_schemas_of_kubernetes(
-    experiment: list[Books], step: int
-) -> None:
-    books = experiment[step]
-    check_files({path: text for path, text in books.files.items() if path.startswith("clusters/")
-                 and path.endswith(".yaml")})  # fmt: skip
-    for path, document in documents(books):
-        if document["apiVersion"] in BUILT_IN:
-            kubernetes_validate.validate(document, "1.36", strict=True)
-        else:
-            assert document["metadata"]["namespace"] == "perception", path
-
-
-@pytest.mark.parametrize("step", range(8))
-def test_what_is_kept_is_what_would_be_rendered_anew(experiment: list[Books], step: int) -> None:
-    books = experiment[step]
-    anew = {path for path in rendered_files(books.state) if path.startswith("clusters/")}
-    kept = {path for path, _ in documents(books)}
-    assert kept == anew
-    assert all(books.files[path] == text for path, text in rendered_files(books.state).items())
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_rendered_fits_the_schemas_of_kubernetes(case: str) -> None:
+    seen: set[tuple[str, str]] = set()
+    for files in rendered(case).values():
+        manifests = {path: text for path, text in files.items() if path.startswith("clusters/")}
+        check_files(manifests)
+        for path, text in manifests.items() - seen:
+            for document in yaml.load_all(text, Loader=FAST):
+                if document["apiVersion"] in BUILT_IN:
+                    kubernetes_validate.validate(document, "1.36", strict=True)
+                else:
+                    assert document["metadata"]["namespace"] == "perception", path
+        seen |= manifests.items()
 
 
 def test_requesters_appear_nowhere_below_clusters() -> None:
@@ -133,21 +112,6 @@ def fusion(books: Books) -> dict[str, Any]:
         item for name, item in books.objects("HelmRelease").items() if name.startswith("of-")
     )
     return found
-
-
-def test_the_same_state_gives_the_same_bytes() -> None:
-    files = []
-    for _ in range(2):
-        books = Books({})
-        books.send(perception())
-        files.append(books.files)
-    assert files[0] == files[1]
-
-
-def test_an_empty_domain_keeps_its_placeholder(experiment: list[Books]) -> None:
-    last = experiment[-1]
-    assert last.rendered() == {}
-    assert "clusters/c-its/perception/_domain.yaml" in last.files
 
 
 def test_each_access_domain_has_its_own_folder_namespace_and_account() -> None:

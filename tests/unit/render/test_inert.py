@@ -14,7 +14,7 @@ import pytest
 import yaml
 from demandops import strict_yaml
 
-from tests.kit.config import skeleton
+from tests.kit.config import FAST, skeleton
 from tests.kit.goals import application, connection, goal
 from tests.kit.memory import MemoryRepo as Books
 
@@ -37,10 +37,7 @@ UNSEEN = [
 ]  # fmt: skip
 
 
-Fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
-class Core(Fast):  # type: ignore[misc]
+class Core(FAST):  # type: ignore[misc]
     """The core schema of YAML 1.2.2, section 10.3.2."""
 
 
@@ -65,7 +62,7 @@ SOMEWHERE_NO_TEXT = re.compile(
 
 def both(text: str) -> list[Any]:
     """Return the documents of a text as YAML 1.1 and 1.2 read them, which must be alike."""
-    old = list(yaml.load_all(text, Loader=Fast))
+    old = list(yaml.load_all(text, Loader=FAST))
     new = list(yaml.load_all(text, Loader=Core))
     assert old == new
     return old
@@ -74,7 +71,7 @@ def both(text: str) -> list[Any]:
 def plain_texts(text: str) -> Iterator[str]:
     """Yield every scalar without quotes that PyYAML takes for text."""
     resolver = yaml.resolver.Resolver()  # type: ignore[no-untyped-call]
-    for event in yaml.parse(text, Loader=Fast):
+    for event in yaml.parse(text, Loader=FAST):
         if isinstance(event, yaml.ScalarEvent) and event.style in (None, "") and event.implicit[0]:
             tag = resolver.resolve(yaml.ScalarNode, event.value, (True, False))
             if tag == "tag:yaml.org,2002:str":

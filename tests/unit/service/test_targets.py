@@ -8,7 +8,7 @@ from demandops.cluster.health import ObjectName
 from demandops.decision import decide
 from demandops.service import rollout_targets
 
-from tests.golden.cases import requests_of, start
+from tests.kit.golden import requests_of, start
 from tests.kit.memory import NOW
 
 

@@ -1,0 +1,154 @@
+"""The golden cases: requests played in memory on a state repo, and what they must render.
+
+``tests/golden/<case>/requests/*.yaml`` are played in order. ``expected/<step>/`` holds the files
+that a step changes, as real files that a reviewer and `kubectl` can read, and in ``DELETED`` the
+paths that it deletes. The first step, ``0-start``, is what `init` renders. A case may lay files
+over the skeleton's in ``state-repo/``.
+
+The experiment is stored whole. Every other case stores how its start differs from the
+experiment's; a case in ``FOLLOWING`` stores at every step how it differs from the experiment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+
+from demandops import strict_yaml
+from demandops.decision import State, rendered_files
+
+from tests.kit import goals
+from tests.kit.memory import MemoryRepo
+
+Files = Mapping[str, str]
+"""Texts by path."""
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+
+EXPERIMENT = "experiment"
+FOLLOWING = ("argocd-experiment",)
+CASES = (
+    EXPERIMENT,
+    "differing-topic-names",
+    "charts-from-registries",
+    "mqtt-secured",
+    "zenoh",
+    "ros",
+    *FOLLOWING,
+    "argocd-charts-from-registries",
+    "overrides",
+)
+START = "0-start"
+DELETED = "DELETED"
+
+
+# ---- what is rendered ----
+
+
+def requests_of(case: str) -> list[Path]:
+    """Return the request files of a case, in order."""
+    if case in (EXPERIMENT, *FOLLOWING):
+        return list(goals.EXPERIMENT)
+    return sorted((GOLDEN / case / "requests").glob("*.yaml"))
+
+
+def start(case: str) -> tuple[State, dict[str, str]]:
+    """Return the state before the first request, and the generated files."""
+    overlay = GOLDEN / case / "state-repo"
+    files = {p.relative_to(overlay).as_posix(): p.read_text() for p in overlay.rglob("*.yaml")}
+    state = MemoryRepo(files).state
+    return state, rendered_files(state)
+
+
+def play(case: str) -> Iterator[tuple[str, MemoryRepo]]:
+    """Yield each step's name and the state repo after it."""
+    repo = MemoryRepo(state=start(case)[0])
+    yield START, repo
+    for file in requests_of(case):
+        repo.send(strict_yaml.load(file.read_text()))
+        yield file.stem, repo
+
+
+@lru_cache
+def rendered(case: str) -> Mapping[str, Files]:
+    """Return all generated files after each step."""
+    return {name: dict(repo.files) for name, repo in play(case)}
+
+
+# ---- what is stored ----
+
+
+def read(case: str) -> dict[str, dict[str, str]]:
+    """Return the files below ``expected/``, by step."""
+    expected = GOLDEN / case / "expected"
+    steps: dict[str, dict[str, str]] = {}
+    for path in sorted(expected.rglob("*")):
+        if path.is_file():
+            step, _, name = path.relative_to(expected).as_posix().partition("/")
+            steps.setdefault(step, {})[name] = path.read_text()
+    return steps
+
+
+@lru_cache
+def whole(case: str) -> Mapping[str, Files]:
+    """Return all expected files after each step, from the stored changes."""
+    stored = read(case)
+    steps: dict[str, Files] = {}
+    files: dict[str, str] = {}
+    for step in (START, *(file.stem for file in requests_of(case))):
+        files = _applied(_base(case, step, files, whole), stored.get(step, {}))
+        steps[step] = files
+    return steps
+
+
+def to_store(case: str) -> dict[str, dict[str, str]]:
+    """Return the files that ``expected/`` must hold, by step; a step without change is left out."""
+    steps: dict[str, dict[str, str]] = {}
+    before: Files = {}
+    for step, files in rendered(case).items():
+        if change := _change(_base(case, step, before, rendered), files):
+            steps[step] = change
+        before = files
+    return steps
+
+
+def problems(case: str, stored: Mapping[str, Files]) -> list[str]:
+    """Return how stored changes differ from what is rendered."""
+    found = []
+    wanted = to_store(case)
+    for step in sorted({*wanted, *stored}):
+        must, has = wanted.get(step, {}), stored.get(step, {})
+        for path in sorted({*must, *has}):
+            if path not in has:
+                found.append(f"{case}/{step}/{path} is missing")
+            elif path not in must:
+                found.append(f"{case}/{step}/{path} is not a change of this step")
+            elif must[path] != has[path]:
+                found.append(f"{case}/{step}/{path} has another text")
+    return found
+
+
+def _base(
+    case: str, step: str, before: Files, steps_of: Callable[[str], Mapping[str, Files]]
+) -> dict[str, str]:
+    """Return the files that a stored change applies to."""
+    if case == EXPERIMENT or (step != START and case not in FOLLOWING):
+        return dict(before)
+    steps: dict[str, Files] = {"": {}, **steps_of(EXPERIMENT)}
+    previous = list(steps)[list(steps).index(step) - 1]
+    return _applied(before, _change(steps[previous], steps[step]))
+
+
+def _change(before: Files, after: Files) -> dict[str, str]:
+    change = {path: text for path, text in after.items() if before.get(path) != text}
+    if gone := sorted(set(before) - set(after)):
+        change[DELETED] = "".join(f"{path}\n" for path in gone)
+    return change
+
+
+def _applied(before: Files, change: Files) -> dict[str, str]:
+    gone = change.get(DELETED, "").splitlines()
+    assert set(gone) <= set(before), f"{DELETED} names files that are not there"
+    files = {**before, **change}
+    return {path: text for path, text in files.items() if path not in (DELETED, *gone)}
