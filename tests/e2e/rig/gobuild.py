@@ -17,10 +17,9 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import IO
 
 from . import launch
@@ -33,8 +32,6 @@ REMEDY = (
 )
 _EVERY_SECONDS = 10.0
 _SHOWN_LINES = 40
-_MOST_COMPILED = 1_500_000_000
-"""Bytes of compiled packages that are kept from one program to the next."""
 
 Report = Callable[[str], None]
 
@@ -68,55 +65,61 @@ class Go:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where Go unpacks modules and keeps compiled packages while it builds.
+    """A folder for one wrapper's builds: its sources and what is compiled of them.
 
-    All programs together would fill some 15 GB, so neither outlives the builds.
+    The modules of all wrappers and their compiled packages would fill some 15 GB. So each wrapper
+    keeps only the sources that it builds, in a vendor folder, and is removed after its last build.
     """
 
     folder: Path
 
     @property
     def environment(self) -> dict[str, str]:
-        """The variables by which Go finds it."""
-        return {"GOMODCACHE": str(self.folder / "mod"), "GOCACHE": str(self.folder / "compiled")}
+        """The variables that make Go use this folder."""
+        return {
+            "GOMODCACHE": str(self.folder / "modules"),
+            "GOCACHE": str(self.folder / "compiled"),
+            "GOTMPDIR": str(self.folder),
+        }
 
-    def trim(self) -> None:
-        """Remove the modules, and the compiled packages once they pass their limit."""
-        shutil.rmtree(self.folder / "mod", ignore_errors=True)
-        compiled = self.folder / "compiled"
-        if sum(file.stat().st_size for file in compiled.rglob("*")) > _MOST_COMPILED:
-            shutil.rmtree(compiled)
+    @property
+    def module(self) -> Path:
+        """A copy of the wrapper, with its vendor folder."""
+        return self.folder / "wrapper"
+
+    def vendor(self, go: Go, wrapper: Path, report: Report) -> None:
+        """Copy the sources of all packages that the wrapper builds, checked against `go.sum`."""
+        if (self.module / "vendor").is_dir():
+            return
+        shutil.copytree(wrapper, self.module)
+        fetched = _Counter(report, "fetched {count} modules")
+        _watched([go.program, "mod", "vendor", "-o", "fetched"], self, fetched.line)
+        (self.module / "fetched").rename(self.module / "vendor")
+
+    def drop_modules(self) -> None:
+        """Remove the modules; the vendor folder has what the build needs of them."""
+        shutil.rmtree(self.folder / "modules", ignore_errors=True)
 
     def remove(self) -> None:
-        """Remove it all."""
+        """Remove the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def build(
-    go: Go,
-    wrapper: Path,
-    package: str,
-    flags: list[str],
-    target: Path,
-    workspace: Workspace,
-    report: Report,
+    go: Go, package: str, flags: list[str], target: Path, workspace: Workspace, report: Report
 ) -> None:
-    """Build `package` as pinned by `wrapper` into the file `target`."""
-    go.check(wrapper)
-    report("resolving modules")
-    packages: set[str] = set()
-    fetched = _Counter(report, "fetched {count} modules")
-    listing = _watched([go.program, "list", "-deps", package], wrapper, workspace, fetched.line)
-    packages.update(listing.split())
+    """Build `package` from the workspace's vendor folder into the file `target`."""
+    flags = ["-mod=vendor", *flags]
+    packages = set(_watched([go.program, "list", *flags, "-deps", package], workspace).split())
     compiled = _Counter(report, f"compiled {{count}} of at most {len(packages)} packages", packages)
     argv = [go.program, "build", "-v", *flags, "-o", str(target), package]
-    _watched(argv, wrapper, workspace, compiled.line, tick=compiled.tick)
+    _watched(argv, workspace, compiled.line, tick=compiled.tick)
 
 
-def module_folder(go: Go, wrapper: Path, workspace: Workspace, module: str) -> str:
-    """The folder of a module's unpacked sources."""
-    argv = [go.program, "list", "-m", "-f", "{{.Dir}}", module]
-    return _output(argv, wrapper, workspace.environment).strip()
+def module_folder(go: Go, workspace: Workspace, module: str) -> str:
+    """The folder of a module's unpacked sources, before the modules are dropped."""
+    argv = [go.program, "list", "-mod=mod", "-m", "-f", "{{.Dir}}", module]
+    return _watched(argv, workspace).strip()
 
 
 class _Counter:
@@ -146,12 +149,12 @@ class _Counter:
 
 def _watched(
     argv: list[str],
-    folder: Path,
     workspace: Workspace,
-    line: Callable[[str], bool],
+    line: Callable[[str], bool] = lambda line: False,
     tick: Callable[[], None] = lambda: None,
 ) -> str:
     """Run a command, hand each line of its standard error on, and return its standard output."""
+    folder = workspace.module
     process = subprocess.Popen(
         launch.command(argv[0], *argv[1:], niceness=19),
         cwd=folder,
@@ -227,14 +230,9 @@ def _environment() -> dict[str, str]:
     return {k: v for k, v in os.environ.items() if k not in dropped} | settings
 
 
-def _output(argv: list[str], folder: Path, more: Mapping[str, str] = MappingProxyType({})) -> str:
+def _output(argv: list[str], folder: Path) -> str:
     done = subprocess.run(
-        argv,
-        cwd=folder,
-        env=_environment() | dict(more),
-        capture_output=True,
-        text=True,
-        check=False,
+        argv, cwd=folder, env=_environment(), capture_output=True, text=True, check=False
     )
     if done.returncode != 0:
         raise RigError(f"{folder}: `{' '.join(argv)}` failed: {done.stderr.strip()}")

@@ -87,18 +87,14 @@ def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> 
     go = gobuild.Go.find()
     entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], go)}" for name in wanted}
     missing = [name for name in wanted if not entries[name].is_dir()]
-    workspace = gobuild.Workspace(cache_root() / ".go")
     for place, name in enumerate(missing, start=1):
         with _turn(cache_root(), say):
             if not entries[name].is_dir():  # another run may have built it while we waited
-                report_step = _prefixed(say, place, len(missing), name)
-                _build(TOOLS[name], go, entries[name], workspace, report_step)
-                later = [TOOLS[other].wrapper for other in missing[place:]]
-                if TOOLS[name].wrapper not in later:
-                    workspace.trim()
-    if missing:
-        with _turn(cache_root(), say):
-            workspace.remove()
+                workspace = gobuild.Workspace(cache_root() / f".go-{TOOLS[name].wrapper}")
+                step = _prefixed(say, place, len(missing), name)
+                _build(TOOLS[name], go, entries[name], workspace, step)
+                if TOOLS[name].wrapper not in [TOOLS[other].wrapper for other in missing[place:]]:
+                    workspace.remove()
     return {name: entries[name] / name for name in wanted}
 
 
@@ -186,11 +182,13 @@ def _build(
         start = time.monotonic()
         wrapper = WRAPPERS / tool.wrapper
         binary = staging / tool.name
-        gobuild.build(go, wrapper, tool.package, _flags(tool), binary, workspace, say)
+        go.check(wrapper)
+        say("fetching modules")
+        workspace.vendor(go, wrapper, say)
         if tool.crds_of:
-            _copy_crds(
-                Path(gobuild.module_folder(go, wrapper, workspace, tool.crds_of)), staging / "crds"
-            )
+            _copy_crds(Path(gobuild.module_folder(go, workspace, tool.crds_of)), staging / "crds")
+        workspace.drop_modules()
+        gobuild.build(go, tool.package, _flags(tool), binary, workspace, say)
         seconds = round(time.monotonic() - start, 1)
         (staging / "build.json").write_text(json.dumps({"tool": tool.name, "seconds": seconds}))
         with binary.open("rb") as written:
