@@ -103,8 +103,8 @@ def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: dateti
     slot.close()
 
 
-def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(address: str, bare: Path) -> None:
-    with rig.running(address) as generator:
+def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(url: str, bare: Path) -> None:
+    with rig.running(url) as generator:
         rig.book(generator, put("short"), put("stays", None))
         end = ends(generator, "short")
         wait_until_gone(generator, "short")

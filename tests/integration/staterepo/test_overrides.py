@@ -27,9 +27,9 @@ WATCHED: dict[str, Any] = {"services": ["object-detection"], "nodes": ["edge"]}
 
 
 @pytest.fixture
-def anywhere(address: str) -> Iterator[Generator]:
-    """A generator on the state repo in place, and one on a remote."""
-    with rig.running(address) as running:
+def remote_generator(url: str) -> Iterator[Generator]:
+    """A generator that uses the state repo as a remote."""
+    with rig.running(url) as running:
         yield running
 
 
@@ -155,9 +155,8 @@ def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
 
 
 def test_what_is_denied_is_refused_and_suspended_until_the_override_goes(
-    anywhere: Generator, bare: Path, person: Person
+    generator: Generator, bare: Path, person: Person
 ) -> None:
-    generator = anywhere
     rig.book(generator, rig.goal(1), rig.goal(2))
     running = rig.books(bare)
     files = rig.git(bare, "rev-parse", "main:clusters")
@@ -256,9 +255,9 @@ def test_a_claim_that_a_person_deletes_is_kept_too(
 
 
 def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
-    anywhere: Generator, bare: Path, person: Person
+    remote_generator: Generator, bare: Path, person: Person
 ) -> None:
-    generator = anywhere
+    generator = remote_generator
     rig.book(generator, rig.goal(1))
     plain = file(bare, DETECTION)
     end = datetime.now(timezone.utc) + timedelta(seconds=2)
@@ -294,16 +293,14 @@ def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
     rig.assert_sound(bare)
 
 
-def test_what_expired_while_no_generator_ran_ends_when_one_does(
-    address: str, bare: Path, person: Person
-) -> None:
-    with rig.running(address) as generator:
+def test_what_expired_while_no_generator_ran_ends_when_one_does(bare: Path, person: Person) -> None:
+    with rig.running(bare) as generator:
         rig.book(generator, rig.goal(1))
         end = datetime.now(timezone.utc) + timedelta(seconds=1)
         merge(person, brief=override(WATCHED, replicas=3, expires=end.isoformat()))
         next_demand(generator)
     rig.wait_until(lambda: datetime.now(timezone.utc) > end, "its time has passed")
-    with rig.running(address):
+    with rig.running(bare):
         rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "it is ended")
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
     rig.assert_sound(bare)
