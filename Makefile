@@ -47,7 +47,7 @@ demo: setup  ## Play the paper's experiment: eight demands over ROS 2 become eig
 	@$(PY) examples/experiment/demo.py
 
 test: system-test setup  ## Run all tests but the end-to-end ones and test-packages
-	@$(PY) -m pytest -n auto --dist loadfile tests \
+	@$(PY) -m pytest -n auto --dist worksteal tests \
 	  $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_TESTS))
 
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages

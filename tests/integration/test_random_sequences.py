@@ -21,8 +21,8 @@ from tests.kit.repo import GitRepo, git
 from tests.model.books import Books, Goal, Result, in_model_words, object_lists
 from tests.model.goals import SKELETON, Maker
 
-REQUESTS, CALLS = 150, 6
-SEEDS = range(1, 1 + 2 * int(os.environ.get("DEMANDOPS_EXAMPLES", "1")))
+REQUESTS, CALLS = 120, 6
+SEEDS = range(1, 1 + int(os.environ.get("DEMANDOPS_EXAMPLES", "1")))
 
 
 class CommandLine:

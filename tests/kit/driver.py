@@ -17,6 +17,7 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 
 from demandops.service import Generator, Receipt
@@ -44,12 +45,13 @@ def die() -> None:
 class _At:
     """Dies at the n-th call."""
 
-    def __init__(self, times: int) -> None:
-        self._left = times
+    def __init__(self, times: int, last_act: Callable[[], object]) -> None:
+        self._left, self._last_act = times, last_act
 
     def __call__(self) -> None:
         self._left -= 1
         if self._left <= 0:
+            self._last_act()
             die()
 
 
@@ -74,13 +76,16 @@ def _after(owner: type, name: str, point: Callable[[], None]) -> None:
     setattr(owner, name, wrapped)
 
 
-def arm(where: str) -> None:
+def arm(where: str, address: str) -> None:
     point, _, times = where.partition(":")
-    at = _At(int(times or 1))
+    lock = Path(address, "refs", "heads", "main.lock")
+    at = _At(int(times or 1), lock.touch if point == "locked" else lambda: None)
     if point == "journaled":
         _after(Journal, "append", at)
     elif point == "committed":
         _after(CommitBatch, "commit", at)
+    elif point == "locked":
+        _before(LocalRepository, "publish", at)
     elif point == "publishing":
         _before(RemoteRepository, "publish", at)
         _before(LocalRepository, "publish", at)
@@ -164,7 +169,7 @@ def tell_answer(name: str, future: Future[Receipt]) -> None:
 
 def run(plan: dict[str, Any]) -> None:
     sync.force(plan["synced"])
-    arm(plan["die_at"])
+    arm(plan["die_at"], plan["address"])
     generator = Generator(plan["address"])
     tell(ready=os.getpid())
     lanes = Lanes(generator, plan["lanes"])

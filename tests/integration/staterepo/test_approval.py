@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -110,9 +111,9 @@ def assert_rendered(bare: Path) -> None:
     assert stands == {path: text for path, text in wanted.items() if path.endswith(".yaml")}
 
 
-def test_a_deleted_branch_turns_the_demand_down(address: str, bare: Path, petra: Petra) -> None:
+def test_a_deleted_branch_turns_the_demand_down(url: str, bare: Path, petra: Petra) -> None:
     before = rig.tip(bare)
-    with rig.running(address) as generator:
+    with rig.running(url) as generator:
         proposed = Proposed(generator, goal(1))
         branch = proposed.branch
         petra.delete(branch)
@@ -120,12 +121,12 @@ def test_a_deleted_branch_turns_the_demand_down(address: str, bare: Path, petra:
             rig.receipt(proposed.ticket)
     assert str(error.value) == f"was turned down: {branch} is gone and was not merged"
     assert (rig.tip(bare), branches(bare)) == (before, [])
-    assert rig.restart(address) is True
+    assert rig.restart(url) is True
     assert branches(bare) == []
 
 
-def test_a_demand_that_waits_can_be_taken_back(address: str, bare: Path, petra: Petra) -> None:
-    with rig.running(address) as generator:
+def test_a_demand_that_waits_can_be_taken_back(url: str, bare: Path, petra: Petra) -> None:
+    with rig.running(url) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
         assert generator.withdraw("op-1") is True
@@ -229,10 +230,8 @@ def test_a_branch_that_a_person_works_on_is_left_to_them(bare: Path, petra: Petr
     assert_rendered(bare)
 
 
-def test_the_same_request_sent_twice_waits_on_one_branch(
-    address: str, bare: Path, petra: Petra
-) -> None:
-    with rig.running(address) as generator:
+def test_the_same_request_sent_twice_waits_on_one_branch(bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
         first = Proposed(generator, goal(1), "op-1")
         branch = first.branch
         second = Proposed(generator, goal(1), "op-2")
@@ -243,10 +242,8 @@ def test_the_same_request_sent_twice_waits_on_one_branch(
         assert (first.outcome(), second.outcome()) == ("booked", "booked")
 
 
-def test_a_release_of_what_waits_takes_the_branch_away(
-    address: str, bare: Path, petra: Petra
-) -> None:
-    with rig.running(address) as generator:
+def test_a_release_of_what_waits_takes_the_branch_away(bare: Path, petra: Petra) -> None:
+    with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1))
         assert [proposed.branch] == branches(bare)
         assert rig.book(generator, leave(1))[0].outcome == "released"
@@ -379,7 +376,7 @@ def test_a_policy_that_asks_no_more_lets_what_waits_through(bare: Path, petra: P
     rig.assert_sound(bare)
 
 
-def test_demands_that_need_none_go_on_meanwhile(address: str, bare: Path, petra: Petra) -> None:
+def test_demands_that_need_none_go_on_meanwhile(bare: Path, petra: Petra) -> None:
     petra.policy(
         approval="none",
         rules=[
@@ -387,7 +384,7 @@ def test_demands_that_need_none_go_on_meanwhile(address: str, bare: Path, petra:
             {"name": "residents", "requesters": ["user2", "station00"]},
         ],
     )
-    with rig.running(address) as generator:
+    with rig.running(bare) as generator:
         waits = Proposed(generator, goal(1))
         assert "rule 'visitors' of access domain" in waits.told[-1][1] if waits.branch else False
         assert rig.book(generator, goal(2))[0].outcome == "booked"
@@ -464,7 +461,12 @@ def test_a_server_that_refuses_the_branch_is_told_to_the_requester(
 
 
 @pytest.mark.parametrize(
-    "point", ["journaled:1", "journaled:2", "journaled:3", "proposing", "proposed", "journaled:4"]
+    ("address", "point"),
+    [
+        *(("file-url", f"journaled:{times}") for times in (1, 2, 3, 4)),
+        *product(("embedded", "file-url"), ("proposing", "proposed")),
+    ],
+    indirect=["address"],
 )
 def test_killed_while_proposing_there_is_one_branch_after_the_restart(
     drivers: rig.Drivers, address: str, bare: Path, petra: Petra, point: str
@@ -494,9 +496,9 @@ def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the
 
 
 def test_two_generators_that_take_one_demand_agree_once_it_is_merged(
-    address: str, bare: Path, petra: Petra
+    url: str, bare: Path, petra: Petra
 ) -> None:
-    with rig.running(address) as one, rig.running(address) as two:
+    with rig.running(url) as one, rig.running(url) as two:
         first, second = Proposed(one, goal(1)), Proposed(two, goal(1))
         assert len({first.branch, second.branch}) == 2
         petra.merge(first.branch)

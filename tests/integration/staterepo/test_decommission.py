@@ -23,13 +23,13 @@ def of(generator: Generator, subject: str) -> list[str]:
 
 
 def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
-    address: str, bare: Path, tmp_path: Path, demandops: Run
+    url: str, bare: Path, tmp_path: Path, demandops: Run
 ) -> None:
     """With a generator running, whose look takes both in."""
     person = Person(bare, tmp_path / "person")
-    with rig.running(address, fetch_interval=0.1) as generator:
+    with rig.running(url, fetch_interval=0.1) as generator:
         rig.book(generator, goal(1), goal(2), goal(6))
-        code, out, err = demandops("decommission", "vehicle01", "--state-repo", address)
+        code, out, err = demandops("decommission", "vehicle01", "--state-repo", url)
         assert (code, err) == (0, "")
         commit = rig.commits(bare)[-1]
         assert out.splitlines() == [

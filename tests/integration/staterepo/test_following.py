@@ -44,7 +44,7 @@ def http(server: Server) -> str:
     return f"{server.url}/state.git"
 
 
-@pytest.fixture(params=["embedded", "file-url", "http"])
+@pytest.fixture
 def place(request: pytest.FixtureRequest, bare: Path) -> str:
     """The same state repo by all three ways."""
     if request.param == "embedded":
@@ -105,12 +105,25 @@ def _move_broker(bare: Path) -> dict[str, str | None]:
     return {BROKERS: file_of(bare, BROKERS).replace("service-mqtt-broker-edge", "elsewhere")}
 
 
+def _bump_chart(bare: Path) -> dict[str, str | None]:
+    metadata = "appdefs/object-detection-fusion/charts/object-fusion/Chart.yaml"
+    version = yaml.safe_load(file_of(bare, metadata))["version"]
+    registry = file_of(bare, CHARTS)
+    start = registry.index("object-fusion")
+    return {
+        metadata: file_of(bare, metadata).replace(f"version: {version}", "version: 9.8.7"),
+        CHARTS: registry[:start] + registry[start:].replace(f"{version}", "9.8.7", 1),
+    }
+
+
 CHANGES = {
-    "deleted-claim": (_delete_claim, lambda text: "user1" not in text),
-    "edited-claim": (_edit_claim, lambda text: "/another/topic" in text),
-    "moved-node": (_move_node, lambda text: "garage" in text),
-    "moved-broker": (_move_broker, lambda text: "elsewhere" in text),
+    "deleted-claim": ("embedded", _delete_claim, lambda text: "user1" not in text),
+    "edited-claim": ("file-url", _edit_claim, lambda text: "/another/topic" in text),
+    "moved-node": ("http", _move_node, lambda text: "garage" in text),
+    "moved-broker": ("embedded", _move_broker, lambda text: "elsewhere" in text),
+    "bumped-chart": ("file-url", _bump_chart, lambda text: "9.8.7" in text),
 }
+"""Each by one of the three ways, because what a change leads to does not depend on them."""
 
 
 def _everything(bare: Path) -> str:
@@ -118,11 +131,13 @@ def _everything(bare: Path) -> str:
     return rig.git(bare, "grep", "", "main", "--", "clusters", "ledger")
 
 
-@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize(
+    ("place", "change"), [(CHANGES[name][0], name) for name in CHANGES], indirect=["place"]
+)
 def test_a_change_is_honoured_without_any_demand(
     place: str, bare: Path, person: Person, change: str
 ) -> None:
-    make, holds = CHANGES[change]
+    _, make, holds = CHANGES[change]
     with rig.running(place, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1), goal(2))
         made = person.change(make(bare), f"A {change}")
@@ -135,25 +150,6 @@ def test_a_change_is_honoured_without_any_demand(
         assert committer == "DemandOps generator"
         rig.book(generator, goal(3))
         assert holds(_everything(bare)), "still so after a further demand"
-    rig.assert_sound(bare)
-
-
-def test_a_bumped_chart_version_reaches_its_releases(
-    place: str, bare: Path, person: Person
-) -> None:
-    metadata = "appdefs/object-detection-fusion/charts/object-fusion/Chart.yaml"
-    version = yaml.safe_load(file_of(bare, metadata))["version"]
-    registry = file_of(bare, CHARTS)
-    start = registry.index("object-fusion")
-    bumped = registry[:start] + registry[start:].replace(f"{version}", "9.8.7", 1)
-    files: dict[str, str | None] = {
-        metadata: file_of(bare, metadata).replace(f"version: {version}", "version: 9.8.7"),
-        CHARTS: bumped,
-    }
-    with rig.running(place, fetch_interval=SOON_S) as generator:
-        rig.book(generator, goal(1))
-        followed(bare, person.change(files, "A better fusion"))
-        assert "9.8.7" in rig.git(bare, "grep", "-h", "9.8.7", "main", "--", "clusters")
     rig.assert_sound(bare)
 
 
@@ -182,20 +178,22 @@ def _no_version(bare: Path) -> dict[str, str | None]:
 
 
 BREAKS = {
-    "claim-that-does-not-parse": (_break_claim, "ledger/applications/"),
-    "claim-on-an-unknown-node": (_claim_on_no_node, "ledger/applications/"),
-    "node-on-an-unknown-cluster": (_node_on_no_cluster, NODES),
-    "node-in-use-gone": (without_vehicle01, NODES),
-    "appdef-in-use-gone": (_appdef_in_use_gone, APPDEF),
-    "misspelt-registry": (_no_version, CHARTS),
+    "claim-that-does-not-parse": ("embedded", _break_claim, "ledger/applications/"),
+    "claim-on-an-unknown-node": ("file-url", _claim_on_no_node, "ledger/applications/"),
+    "node-on-an-unknown-cluster": ("embedded", _node_on_no_cluster, NODES),
+    "node-in-use-gone": ("file-url", without_vehicle01, NODES),
+    "appdef-in-use-gone": ("embedded", _appdef_in_use_gone, APPDEF),
+    "misspelt-registry": ("file-url", _no_version, CHARTS),
 }
 
 
-@pytest.mark.parametrize("change", BREAKS)
+@pytest.mark.parametrize(
+    ("address", "change"), [(BREAKS[name][0], name) for name in BREAKS], indirect=["address"]
+)
 def test_a_broken_change_is_reported_with_its_commit_until_it_is_mended(
     address: str, bare: Path, person: Person, change: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    make, where = BREAKS[change]
+    _, make, where = BREAKS[change]
     with rig.running(address, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1), goal(2))
         broken = make(bare)
@@ -223,14 +221,14 @@ def test_a_broken_change_is_reported_with_its_commit_until_it_is_mended(
 
 
 def test_a_problem_that_stands_at_a_restart_is_reported_no_second_time(
-    address: str, bare: Path, person: Person
+    url: str, bare: Path, person: Person
 ) -> None:
-    with rig.running(address, fetch_interval=SOON_S) as generator:
+    with rig.running(url, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1), goal(2))
         followed(bare, person.change(_claim_on_no_node(bare), "Nowhere"))
         rig.book(generator, goal(6))  # of the same application as goal 1
     tip = rig.tip(bare)
-    with rig.running(address, fetch_interval=SOON_S) as generator:
+    with rig.running(url, fetch_interval=SOON_S) as generator:
         rig.wait_until(lambda: generator.state_repo_status.problems, "it is seen again")
         assert rig.tip(bare) == tip
         assert rig.book(generator, leave(6))[0].outcome == "released"
@@ -251,9 +249,9 @@ def test_a_report_that_a_person_removes_or_edits_is_put_right(bare: Path, person
 
 
 def test_several_peoples_commits_are_all_named_and_a_readme_is_not(
-    address: str, bare: Path, person: Person
+    url: str, bare: Path, person: Person
 ) -> None:
-    with rig.running(address) as generator:
+    with rig.running(url) as generator:
         rig.book(generator, goal(1))
         first = person.change(_move_broker(bare), "Elsewhere")
         person.change({"README.md": "Ours\n"}, "Say whose it is")
@@ -331,7 +329,7 @@ def test_a_remote_away_is_logged_once_and_once_when_it_is_back(
     with rig.running(http, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
         server.faults.away = True
-        rig.wait_until(lambda: server.refused > 4, "it was looked at again and again")
+        rig.wait_until(lambda: server.refused > 2, "it was looked at again and again")
         assert "503" in generator.state_repo_status.remote.unreachable
         made = person.change(_move_broker(bare))
         server.faults.away = False

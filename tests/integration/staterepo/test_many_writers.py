@@ -21,13 +21,13 @@ from tests.kit.rig import Drivers, Goal
 pytestmark = pytest.mark.synced
 
 GENERATORS = 4
-DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "64"))
+DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "32"))
 SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
 LANES = 8
 """Requesters that wait for an answer before they send again, at each generator."""
 CUTS = 0.01
 """The share of requests whose connection is cut, once before and once after they are done."""
-PERSONS_PAUSE_S = (0.5, 3.0)
+PERSONS_PAUSE_S = (0.5, 3.0) if DEMANDS > 100 else (0.2, 0.8)
 
 
 def _lanes(who: int) -> list[list[tuple[str, Goal]]]:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.errors import InvalidInput, Refused
-from demandops.service import Generator, Receipt
+from demandops.service import Generator, Receipt, worker
 
 from tests.kit import rig
 from tests.kit.config import override
@@ -27,10 +27,29 @@ WATCHED: dict[str, Any] = {"services": ["object-detection"], "nodes": ["edge"]}
 
 
 @pytest.fixture
-def anywhere(address: str) -> Iterator[Generator]:
-    """A generator on the state repo in place, and one on a remote."""
-    with rig.running(address) as running:
+def remote_generator(url: str) -> Iterator[Generator]:
+    """A generator that uses the state repo as a remote."""
+    with rig.running(url) as running:
         yield running
+
+
+class Clock:
+    """The generator's clock, which a test sets forward instead of waiting."""
+
+    def __init__(self) -> None:
+        self.ahead = timedelta()
+
+    def now(self) -> datetime:
+        return datetime.now(timezone.utc) + self.ahead
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The clock by which overrides end; the generator reads it often."""
+    clock = Clock()
+    monkeypatch.setattr(worker, "_now", clock.now)
+    monkeypatch.setattr(worker, "LONGEST_WAIT_S", 0.1)
+    return clock
 
 
 def parsed(bare: Path, path: str) -> Any:
@@ -155,9 +174,8 @@ def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
 
 
 def test_what_is_denied_is_refused_and_suspended_until_the_override_goes(
-    anywhere: Generator, bare: Path, person: Person
+    generator: Generator, bare: Path, person: Person
 ) -> None:
-    generator = anywhere
     rig.book(generator, rig.goal(1), rig.goal(2))
     running = rig.books(bare)
     files = rig.git(bare, "rev-parse", "main:clusters")
@@ -256,12 +274,12 @@ def test_a_claim_that_a_person_deletes_is_kept_too(
 
 
 def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
-    anywhere: Generator, bare: Path, person: Person
+    clock: Clock, remote_generator: Generator, bare: Path, person: Person
 ) -> None:
-    generator = anywhere
+    generator = remote_generator
     rig.book(generator, rig.goal(1))
     plain = file(bare, DETECTION)
-    end = datetime.now(timezone.utc) + timedelta(seconds=2)
+    end = clock.now() + timedelta(hours=1)
     short = end.isoformat()
     merge(
         person,
@@ -274,8 +292,11 @@ def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
     marker = "ledger/overrides/brief.yaml"
     assert file(bare, "ledger/overrides/late.yaml")
     assert file(bare, marker) == ""
+    clock.ahead = timedelta(minutes=59)
+    next_demand(generator)
+    assert file(bare, marker) == "", "not before its time"
+    clock.ahead = timedelta(hours=1)
     rig.wait_until(lambda: file(bare, marker), "the override has ended")
-    assert datetime.now(timezone.utc) >= end
     assert file(bare, DETECTION) == plain
     (commit,) = [c for c in rig.commits(bare) if c.one("Operation") == "expire-override"]
     assert commit.summary == "End override brief"
@@ -295,15 +316,15 @@ def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
 
 
 def test_what_expired_while_no_generator_ran_ends_when_one_does(
-    address: str, bare: Path, person: Person
+    clock: Clock, bare: Path, person: Person
 ) -> None:
-    with rig.running(address) as generator:
+    with rig.running(bare) as generator:
         rig.book(generator, rig.goal(1))
-        end = datetime.now(timezone.utc) + timedelta(seconds=1)
+        end = clock.now() + timedelta(hours=1)
         merge(person, brief=override(WATCHED, replicas=3, expires=end.isoformat()))
         next_demand(generator)
-    rig.wait_until(lambda: datetime.now(timezone.utc) > end, "its time has passed")
-    with rig.running(address):
+    clock.ahead = timedelta(hours=1)
+    with rig.running(bare):
         rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "it is ended")
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
     rig.assert_sound(bare)
@@ -345,14 +366,15 @@ def test_a_broken_override_is_reported_and_what_was_in_force_stays(
 
 
 def test_an_override_ends_while_people_have_broken_another(
-    generator: Generator, bare: Path, person: Person
+    clock: Clock, generator: Generator, bare: Path, person: Person
 ) -> None:
-    end = datetime.now(timezone.utc) + timedelta(seconds=2)
+    end = clock.now() + timedelta(hours=1)
     merge(person, brief=override(WATCHED, replicas=3, expires=end.isoformat()))
     rig.book(generator, rig.goal(1))
     merge(person, broken="apiVersion: [")
     next_demand(generator)
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 3
+    clock.ahead = timedelta(hours=1)
     rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "it is ended")
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
     next_demand(generator, 2)

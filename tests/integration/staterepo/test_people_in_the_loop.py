@@ -20,7 +20,7 @@ from tests.kit import rig
 from tests.kit.repo import read as text
 from tests.kit.rig import Person
 
-FURTHER = int(os.environ.get("DEMANDOPS_LOAD_FURTHER", "60"))
+FURTHER = int(os.environ.get("DEMANDOPS_LOAD_FURTHER", "24"))
 INTERVAL_S = 0.5
 """The generator's fetch interval; nothing is asserted of it, `make load` prints what it gave."""
 EDGE = "clusters/c-its/perception/edge"

@@ -14,7 +14,7 @@ from tests.kit.rig import Drivers, demand, goal, leave
 
 pytestmark = pytest.mark.synced
 
-EACH = 32
+EACH = 16
 
 
 def _demands(who: int) -> list[tuple[str, rig.Goal]]:

@@ -39,11 +39,9 @@ def test_a_demand_that_waits_can_be_taken_back_and_leaves_no_trace(
 
 
 @pytest.mark.parametrize("stage", ["admitted", "booked"])
-def test_a_demand_can_be_taken_back_until_it_is_committed(
-    address: str, bare: Path, stage: str
-) -> None:
+def test_a_demand_can_be_taken_back_until_it_is_committed(bare: Path, stage: str) -> None:
     answers: list[bool] = []
-    with rig.running(address) as generator:
+    with rig.running(bare) as generator:
 
         def take_back(told: str, text: str) -> None:
             if told == stage:
@@ -108,8 +106,8 @@ def test_closing_finishes_what_is_in_hand(address: str, bare: Path) -> None:
     assert rig.operations(bare) == [f"op-{n}" for n in range(30)]
 
 
-def test_a_demand_after_closing_is_told_so(address: str) -> None:
-    generator = Generator(address)
+def test_a_demand_after_closing_is_told_so(bare: Path) -> None:
+    generator = Generator(str(bare))
     generator.close()
     with pytest.raises(ShuttingDown) as error:
         generator.submit(goal(1))
@@ -117,15 +115,15 @@ def test_a_demand_after_closing_is_told_so(address: str) -> None:
 
 
 @pytest.mark.limit(10)
-def test_closing_twice_ends_twice(address: str) -> None:
-    generator = Generator(address)
+def test_closing_twice_ends_twice(bare: Path) -> None:
+    generator = Generator(str(bare))
     assert generator.close() is True
     assert generator.stop().result(3) is True
 
 
 @pytest.mark.limit(10)
-def test_stopping_from_two_threads_ends_for_both(address: str) -> None:
-    generator = Generator(address)
+def test_stopping_from_two_threads_ends_for_both(bare: Path) -> None:
+    generator = Generator(str(bare))
     rig.book(generator, goal(1))
     both = [generator.stop(), generator.stop()]
     assert [one.result(3) for one in both] == [True, True]
@@ -155,11 +153,9 @@ def test_a_demand_handed_in_while_closing_is_answered_or_not_taken(bare: Path) -
 # ---- limits ----
 
 
-def test_a_full_queue_takes_no_more_and_takes_again_when_there_is_room(
-    address: str, bare: Path
-) -> None:
+def test_a_full_queue_takes_no_more_and_takes_again_when_there_is_room(bare: Path) -> None:
     gate = Gate()
-    with rig.running(address, queue_limit=3) as generator:
+    with rig.running(bare, queue_limit=3) as generator:
         first = generator.submit(goal(0), listener=gate)
         assert gate.reached.wait(rig.PATIENCE_S)
         waiting = [generator.submit(goal(n)) for n in (1, 2, 3)]
@@ -177,10 +173,10 @@ def test_a_full_queue_takes_no_more_and_takes_again_when_there_is_room(
 
 
 @pytest.mark.limit(15)
-def test_a_caller_that_cancels_its_future_stops_nobody_else(address: str, bare: Path) -> None:
+def test_a_caller_that_cancels_its_future_stops_nobody_else(bare: Path) -> None:
     """`asyncio.wait_for(asyncio.wrap_future(ticket.future), …)` does just this."""
     gate = Gate()
-    with rig.running(address) as generator:
+    with rig.running(bare) as generator:
         first = generator.submit(goal(1), listener=gate)
         assert gate.reached.wait(rig.PATIENCE_S)
         second = generator.submit(goal(2))
@@ -193,18 +189,18 @@ def test_a_caller_that_cancels_its_future_stops_nobody_else(address: str, bare: 
     rig.assert_sound(bare)
 
 
-def test_a_listener_that_fails_stops_nothing(address: str, bare: Path) -> None:
+def test_a_listener_that_fails_stops_nothing(bare: Path) -> None:
     def fail(stage: str, text: str) -> None:
         raise RuntimeError(stage)
 
-    with rig.running(address) as generator:
+    with rig.running(bare) as generator:
         assert rig.receipt(generator.submit(goal(1), listener=fail)).outcome == "booked"
         assert rig.book(generator, goal(2))[0].outcome == "booked"
 
 
-def test_a_done_callback_may_hand_in_the_next_demand(address: str, bare: Path) -> None:
+def test_a_done_callback_may_hand_in_the_next_demand(bare: Path) -> None:
     done = threading.Event()
-    with rig.running(address) as generator:
+    with rig.running(bare) as generator:
 
         def then(future: Any) -> None:
             generator.submit(goal(2)).future.add_done_callback(lambda _: done.set())
@@ -256,9 +252,9 @@ def test_an_operation_id_cannot_forge_a_trailer(bare: Path) -> None:
     assert ("Requester", "somebody else") not in made.trailers
 
 
-def test_one_operation_id_handed_in_twice_is_one_commit(address: str, bare: Path) -> None:
+def test_one_operation_id_handed_in_twice_is_one_commit(bare: Path) -> None:
     gate = Gate()
-    with rig.running(address) as generator:
+    with rig.running(bare) as generator:
         generator.submit(goal(0), "op-0", gate)
         assert gate.reached.wait(rig.PATIENCE_S)
         tickets = [generator.submit(goal(1), "op-1"), generator.submit(goal(1), "op-1")]
