@@ -24,7 +24,8 @@ FAKE_GO = """\
 # A fake Go toolchain: `build` writes its target slowly and records its run.
 case "$1" in
 env) printf 'go%s\\nlinux\\namd64\\n' "${FAKE_GO_VERSION:-1.26.8}" ;;
-list) if [ "$2" = -m ]; then echo "$FAKE_GO_MODULE"; else printf 'one\\ntwo\\n'; fi ;;
+mod) mkdir fetched ;;
+list) if [ "$3" = -m ]; then echo "$FAKE_GO_MODULE"; else printf 'one\\ntwo\\n'; fi ;;
 build)
     echo run >> "$FAKE_GO_RUNS"
     printf 'one\\ntwo\\n' >&2
@@ -113,7 +114,7 @@ def test_a_failed_build_shows_the_compilers_message(
     with pytest.raises(RigError) as caught:
         tools.ensure(["etcd"], quiet)
     assert str(caught.value).endswith(" failed with 2:\n  main.go:1: syntax error")
-    assert list(tools.cache_root().glob("*etcd*")) == []
+    assert list(tools.cache_root().glob("*etcd-*")) == []
 
 
 def test_an_old_go_is_named_with_what_to_install(

@@ -90,8 +90,13 @@ class Workspace:
 
     def vendor(self, go: Go, wrapper: Path, report: Report) -> None:
         """Copy the sources of all packages that the wrapper builds, checked against `go.sum`."""
-        if (self.module / "vendor").is_dir():
+        pins = [
+            (folder / name) for folder in (self.module, wrapper) for name in ("go.mod", "go.sum")
+        ]
+        texts = [path.read_bytes() if path.exists() else b"" for path in pins]
+        if (self.module / "vendor").is_dir() and texts[:2] == texts[2:]:
             return
+        self.remove()  # what a killed run left, perhaps with other pins
         shutil.copytree(wrapper, self.module)
         fetched = _Counter(report, "fetched {count} modules")
         _watched([go.program, "mod", "vendor", "-o", "fetched"], self, fetched.line)
