@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jsonschema_rs
+from demandops.errors import Fault
 
 Place = tuple[str | int, ...]
 Schema = dict[str, Any]
@@ -17,8 +18,7 @@ _WRONG_TYPES: dict[str, Any] = {
 }  # fmt: skip
 _OF_TYPE: dict[type, dict[str, Any]] = {
     str: {
-        "empty": "", "reversed text": "a\u202eb", "a bell": "a\ab", "too long": "x" * 2000,
-        "another word": "Nonsense?",
+        "empty": "", "too long": "x" * 2000, "another word": "Nonsense?",
     },
     bool: {},
     int: {"negative": -1, "zero": 0, "large": 10**30, "a fraction": 1.5},
@@ -27,17 +27,36 @@ _OF_TYPE: dict[type, dict[str, Any]] = {
     dict: {"empty": {}},
 }  # fmt: skip
 _SAME = {str: "text", bool: "a truth", int: "a number", list: "a list", dict: "a mapping"}
-CONTROL = ("reversed text", "a bell")
 
 
 class Mutation(NamedTuple):
-    """A document that is changed at one place."""
+    """A document that is changed at one place.
+
+    ``value`` is what was there before. ``new_place`` is where a misspelt field is now.
+    """
 
     place: Place
     kind: str
     document: Any
     value: Any
-    """What was there before."""
+    new_place: Place
+
+    def is_at(self, field: str) -> bool:
+        """Return whether a fault's field is the place, contains it or is inside it."""
+        return any(_is_around(field, path(place)) for place in (self.place, self.new_place))
+
+    def names(self) -> set[str]:
+        """Return the names that were at the place, which references elsewhere may use."""
+        names = {str(part) for part in self.place}
+        values = [self.value]
+        while values:
+            value = values.pop()
+            if isinstance(value, dict | list):
+                values += value
+                values += value.values() if isinstance(value, dict) else ()
+            elif isinstance(value, str):
+                names.add(value)
+        return names
 
 
 def mutations(document: Any) -> Iterator[Mutation]:
@@ -45,21 +64,25 @@ def mutations(document: Any) -> Iterator[Mutation]:
     for place in places(document):
         value = _at(document, place)
         wrong = {kind: new for kind, new in _WRONG_TYPES.items() if kind != _SAME.get(type(value))}
-        if not isinstance(value, str):
+        if isinstance(value, str):
+            wrong |= {"reversed text": f"{value}\u202eb", "a bell": f"{value}\ab"}
+        else:
             wrong["text"] = "x"
         for kind, new in (wrong | _OF_TYPE[type(value)]).items():
             if new != value or type(new) is not type(value):
-                yield Mutation(place, kind, _replaced(document, place, new), value)
+                yield Mutation(place, kind, _replaced(document, place, new), value, place)
         changed = copy.deepcopy(document)
         del _at(changed, place[:-1])[place[-1]]
-        yield Mutation(place, "removed", changed, value)
+        yield Mutation(place, "removed", changed, value, place)
         if isinstance(value, dict):
             more = {**value, "zz": {"q": [1]}}
-            yield Mutation((*place, "zz"), "added", _replaced(document, place, more), "zz")
+            added = (*place, "zz")
+            yield Mutation(added, "added", _replaced(document, place, more), None, added)
         if isinstance(place[-1], str):
             holder = _at(document, place[:-1])
             renamed = {k if k != place[-1] else "Zz?": v for k, v in holder.items()}
-            yield Mutation(place, "misspelt", _replaced(document, place[:-1], renamed), value)
+            changed, now = _replaced(document, place[:-1], renamed), (*place[:-1], "Zz?")
+            yield Mutation(place, "misspelt", changed, value, now)
 
 
 def places(document: Any, place: Place = ()) -> Iterator[Place]:
@@ -94,34 +117,33 @@ def path(place: Place) -> str:
     return text.removeprefix(".")
 
 
-def is_around(field: str, place: str) -> bool:
+def _is_around(field: str, place: str) -> bool:
     """Return whether a fault's field is the place, contains it or is inside it."""
     short, long = sorted((field, place), key=len)
     return long.startswith(short) and (long[len(short) :] or ".")[0] in ".[" or not short
 
 
-def names_in(mutation: Mutation) -> set[str]:
-    """Return the names that were at the place, which references elsewhere may use."""
-    names = {str(part) for part in mutation.place if isinstance(part, str)}
+def problem(
+    mutation: Mutation, faults: Sequence[Fault], form: Form, *, free: Container[str], file: str = ""
+) -> str:
+    """Return what is wrong with the faults of a mutation, or an empty string.
 
-    def collect(value: Any) -> None:
-        if isinstance(value, dict):
-            names.update(value)
-            for inner in value.values():
-                collect(inner)
-        elif isinstance(value, list):
-            for inner in value:
-                collect(inner)
-        elif isinstance(value, str):
-            names.add(value)
-
-    collect(mutation.value)
-    return names
-
-
-def quotes(message: str, names: set[str]) -> bool:
-    """Return whether a message quotes one of the names."""
-    return bool(names & set(re.findall(r"'([^']*)'", message)))
+    What the schema forbids has a fault at its place, and so has a control character in any text.
+    Every fault elsewhere quotes a name from that place, so it stands at a reference.
+    """
+    place = path(mutation.place)
+    here = [found for found in faults if found.file == file and mutation.is_at(found.field)]
+    control = mutation.kind in ("reversed text", "a bell")
+    in_free = any(path(mutation.place[:end]) in free for end in range(1, len(mutation.place) + 1))
+    if not here and (form.forbids(mutation.document) or (control and not in_free)):
+        return f"{place}, {mutation.kind}: no fault there, but {[*map(str, faults)]}"
+    names = mutation.names()
+    astray = [
+        str(found)
+        for found in faults
+        if found not in here and not names & set(re.findall(r"'([^']*)'", found.message))
+    ]
+    return f"{place}, {mutation.kind}: faults elsewhere: {astray}" if astray else ""
 
 
 class Form:
@@ -137,8 +159,17 @@ class Form:
 
     def fields(self) -> set[str]:
         """Return all fields of all mappings, as ``Node.id``."""
+        return {f"{part['title']}.{name}" for part in self._parts() for name in part["properties"]}
+
+    def free(self) -> set[str]:
+        """Return the fields that may have any value, or a mapping of any keys and values."""
         return {
-            f"{part['title']}.{name}" for part in self._parts() for name in part["properties"]
+            f"{part['title']}.{name}"
+            for part in self._parts()
+            for name, field in part["properties"].items()
+            for option in field.get("anyOf", [field])
+            if option.get("additionalProperties") is True
+            or not {"type", "$ref", "const", "enum"} & option.keys()
         }
 
     def _parts(self) -> list[Schema]:
