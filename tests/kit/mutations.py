@@ -120,7 +120,7 @@ def path(place: Place) -> str:
 def _is_around(field: str, place: str) -> bool:
     """Return whether a fault's field is the place, contains it or is inside it."""
     short, long = sorted((field, place), key=len)
-    return long.startswith(short) and (long[len(short) :] or ".")[0] in ".[" or not short
+    return (long.startswith(short) and (long[len(short) :] or ".")[0] in ".[") or not short
 
 
 def problem(
