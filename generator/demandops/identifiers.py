@@ -24,6 +24,14 @@ def absolute_topic(topic: str) -> str:
     return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
 
 
+def control_character(text: str) -> str:
+    """Return the first invisible or bidirectional control character as ``U+202E``, or ""."""
+    for char in text:
+        if unicodedata.category(char) in _UNSEEN or char in _BIDI:
+            return f"U+{ord(char):04X}"
+    return ""
+
+
 def id_problem(value: str) -> str:
     """Return what is wrong with an id, or an empty string.
 
@@ -37,12 +45,9 @@ def id_problem(value: str) -> str:
         return f"{quoted(value)} holds '..'; choose an id without it"
     if value != value.strip():
         return f"{quoted(value)} starts or ends with white space; remove it"
-    for char in value:
-        if unicodedata.category(char) in _UNSEEN or char in _BIDI:
-            return (
-                f"{quoted(value)} holds the control character U+{ord(char):04X}; "
-                "choose an id without it"
-            )
+    control = control_character(value)
+    if control:
+        return f"{quoted(value)} holds the control character {control}; choose an id without it"
     return ""
 
 

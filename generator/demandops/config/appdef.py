@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel, Word
+from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel, Text, Word
 from demandops.errors import suggestion
 
 TopicPattern = Annotated[
@@ -26,14 +26,14 @@ TopicPattern = Annotated[
 class Input(FrozenModel):
     """A role of demanded topics, for example ``point_cloud``."""
 
-    description: str = ""
-    type: str = ""
+    description: Text = ""
+    type: Text = ""
 
 
 class Parameter(FrozenModel):
     """A value that demands may set, and how the values of several demands are merged."""
 
-    description: str = ""
+    description: Text = ""
     default: Any = None
     merge: Literal["union", "max", "min", "latest"] | None = None
 
@@ -63,7 +63,7 @@ class Service(FrozenModel):
     """
 
     prefix: Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9]{0,9}$")]
-    description: str = ""
+    description: Text = ""
     each: Word | None = None
     inputs: dict[Word, str] = Field(default_factory=dict)
     outputs: dict[Word, TopicPattern] = Field(default_factory=dict)
@@ -98,7 +98,7 @@ class ApplicationDefinition(FileModel):
 
     kind: Literal["ApplicationDefinition"]
     name: DnsLabel
-    description: str = ""
+    description: Text = ""
     inputs: dict[Word, Input]
     parameters: dict[Word, Parameter] = Field(default_factory=dict)
     deployment_request: WireNames | None = Field(default=None, alias="deploymentRequest")

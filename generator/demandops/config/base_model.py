@@ -6,12 +6,14 @@ faults that name the field as it is written in the file.
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, ValidationError
 
 from demandops import strict_yaml
-from demandops.errors import Fault, InvalidInput, fault, suggestion
+from demandops.errors import Fault, InvalidInput, fault, quoted, suggestion
+from demandops.identifiers import control_character
 from demandops.settings import API_VERSION
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -23,6 +25,20 @@ DnsLabel = Annotated[
 
 Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_length=63)]
 """The name of a role or a channel in a configuration file."""
+
+
+def _visible(value: str) -> str:
+    control = control_character(re.sub(r"[\n\t]", " ", value))
+    if control:
+        raise ValueError(f"{quoted(value)} holds the control character {control}; remove it")
+    return value
+
+
+Visible = AfterValidator(_visible)
+"""Rejects the control characters that hide or reorder text; lines and tabs are valid."""
+
+Text = Annotated[str, Visible]
+"""Any visible text."""
 
 Approval = Literal["none", "required"]
 """Whether a demand needs a person's approval."""

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Word
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Text, Visible, Word
 from demandops.identifiers import id_problem, message_type_problem, topic_problem
 
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
@@ -21,7 +21,7 @@ SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.
 """A key in a Kubernetes Secret; it becomes a file name."""
 
 _ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
-Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$")]
+Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$"), Visible]
 """A Zenoh endpoint without certificates: ``tcp/host:7447``."""
 
 
@@ -120,15 +120,15 @@ class Cluster(FrozenModel):
     """A Kubernetes cluster whose GitOps controller reads ``clusters/<name>/``."""
 
     name: DnsLabel
-    description: str = ""
+    description: Text = ""
 
 
 class Toleration(FrozenModel):
     """A taint of the node that workloads tolerate (Kubernetes core/v1 Toleration)."""
 
-    key: str = ""
+    key: Text = ""
     operator: Literal["Exists", "Equal"] = "Equal"
-    value: str = ""
+    value: Text = ""
     effect: Literal["", "NoSchedule", "PreferNoSchedule", "NoExecute"] = ""
 
     @model_validator(mode="after")

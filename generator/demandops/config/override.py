@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.base_model import DnsLabel, FileModel, FrozenModel
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Text, Visible
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.config.registry import Image
 from demandops.errors import quoted
@@ -96,7 +96,7 @@ def _some(items: tuple[Any, ...]) -> tuple[Any, ...]:
     return items
 
 
-Patterns = Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_some)]
+Patterns = Annotated[tuple[Text, ...], Field(strict=False), AfterValidator(_some)]
 Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)]
 
 
@@ -170,7 +170,7 @@ class OverrideFile(FileModel):
     expires: Annotated[str, AfterValidator(_moment)] | None = None
     select: Annotated[tuple[Selector, ...], Field(strict=False), AfterValidator(_some)]
     values: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(_patch)] | None = None
-    version: Annotated[str, StringConstraints(min_length=1, max_length=63)] | None = None
+    version: Annotated[str, StringConstraints(min_length=1, max_length=63), Visible] | None = None
     images: Annotated[dict[DnsLabel, ImagePin], Field(min_length=1)] | None = None
     replicas: Annotated[int, Field(ge=0, le=1000)] | None = None
     node: NodeId | None = None

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel
+from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel, Text
 from demandops.errors import quoted
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
@@ -41,7 +41,7 @@ def _duration(text: str) -> str:
 
 
 Duration = Annotated[str, AfterValidator(_duration)]
-Patterns = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
+Patterns = Annotated[tuple[Text, ...], Field(strict=False, min_length=1)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
@@ -117,7 +117,7 @@ class AccessDomain(FrozenModel):
     name: DnsLabel
     namespace: DnsLabel
     service_account: DnsLabel = Field(default="demandops", alias="serviceAccount")
-    nodes: tuple[str, ...] = Field(default=("*",), strict=False)
+    nodes: tuple[Text, ...] = Field(default=("*",), strict=False)
     rules: tuple[Rule, ...] = Field(default=(), strict=False)
     quotas: Quotas = Quotas()
     leases: LeasePolicy = LeasePolicy()

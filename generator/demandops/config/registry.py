@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Word
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Visible, Word
 
 ChartVersion = Annotated[
     str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
@@ -24,8 +24,8 @@ class ChartSource(FrozenModel):
     folder: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")] | None = (
         None
     )
-    oci: Annotated[str, StringConstraints(pattern=r"^oci://[^\s]+$")] | None = None
-    http: Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$")] | None = None
+    oci: Annotated[str, StringConstraints(pattern=r"^oci://[^\s]+$"), Visible] | None = None
+    http: Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$"), Visible] | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> ChartSource:

@@ -7,13 +7,13 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.base_model import DnsLabel, FileModel, FrozenModel
+from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Visible
 from demandops.errors import quoted
 
 ROOT_FILE = "demandops.yaml"
 
 GitUrl = Annotated[
-    str, StringConstraints(pattern=r"^(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+$")
+    str, StringConstraints(pattern=r"^(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+$"), Visible
 ]
 
 
@@ -51,7 +51,7 @@ def _web_url(text: str) -> str:
     return text
 
 
-WebUrl = Annotated[str, AfterValidator(_web_url)]
+WebUrl = Annotated[str, AfterValidator(_web_url), Visible]
 
 
 class Proposals(FrozenModel):
@@ -65,8 +65,8 @@ class Proposals(FrozenModel):
     forge: Literal["none", "gitlab", "github", "gitea"] = "none"
     url: WebUrl | None = None
     api: WebUrl | None = None
-    labels: tuple[Annotated[str, StringConstraints(pattern=r"^[^\s,][^\n\r,]*$")], ...] = Field(
-        default=(), strict=False
+    labels: tuple[Annotated[str, StringConstraints(pattern=r"^[^\s,][^\n\r,]*$"), Visible], ...] = (
+        Field(default=(), strict=False)
     )
 
     @model_validator(mode="after")

@@ -1,0 +1,201 @@
+"""Every mistake of form that a document can have at one place, and what its JSON schema says."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Container, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jsonschema_rs
+from demandops.errors import Fault
+
+Place = tuple[str | int, ...]
+Schema = dict[str, Any]
+
+_WRONG_TYPES: dict[str, Any] = {
+    "a mapping": {"x": 1}, "a list": [1], "a number": 5, "a truth": True, "no value": None,
+}  # fmt: skip
+_OF_TYPE: dict[type, dict[str, Any]] = {
+    str: {
+        "empty": "", "too long": "x" * 2000, "another word": "Nonsense?",
+    },
+    bool: {},
+    int: {"negative": -1, "zero": 0, "large": 10**30, "a fraction": 1.5},
+    float: {"negative": -1.0, "large": 1e30},
+    list: {"empty": []},
+    dict: {"empty": {}},
+}  # fmt: skip
+_SAME = {str: "text", bool: "a truth", int: "a number", list: "a list", dict: "a mapping"}
+
+
+class Mutation(NamedTuple):
+    """A document that is changed at one place.
+
+    ``value`` is what was there before. ``new_place`` is where a misspelt field is now.
+    """
+
+    place: Place
+    kind: str
+    document: Any
+    value: Any
+    new_place: Place
+
+    def is_at(self, field: str) -> bool:
+        """Return whether a fault's field is the place, contains it or is inside it."""
+        return any(_is_around(field, path(place)) for place in (self.place, self.new_place))
+
+    def names(self) -> set[str]:
+        """Return the names that were at the place, which references elsewhere may use."""
+        names = {str(part) for part in self.place}
+        values = [self.value]
+        while values:
+            value = values.pop()
+            if isinstance(value, dict | list):
+                values += value
+                values += value.values() if isinstance(value, dict) else ()
+            elif isinstance(value, str):
+                names.add(value)
+        return names
+
+
+def mutations(document: Any) -> Iterator[Mutation]:
+    """Yield the document with each mistake at each place."""
+    for place in places(document):
+        value = _at(document, place)
+        wrong = {kind: new for kind, new in _WRONG_TYPES.items() if kind != _SAME.get(type(value))}
+        if isinstance(value, str):
+            wrong |= {"reversed text": f"{value}\u202eb", "a bell": f"{value}\ab"}
+        else:
+            wrong["text"] = "x"
+        for kind, new in (wrong | _OF_TYPE[type(value)]).items():
+            if new != value or type(new) is not type(value):
+                yield Mutation(place, kind, _replaced(document, place, new), value, place)
+        changed = copy.deepcopy(document)
+        del _at(changed, place[:-1])[place[-1]]
+        yield Mutation(place, "removed", changed, value, place)
+        if isinstance(value, dict):
+            more = {**value, "zz": {"q": [1]}}
+            added = (*place, "zz")
+            yield Mutation(added, "added", _replaced(document, place, more), None, added)
+        if isinstance(place[-1], str):
+            holder = _at(document, place[:-1])
+            renamed = {k if k != place[-1] else "Zz?": v for k, v in holder.items()}
+            changed, now = _replaced(document, place[:-1], renamed), (*place[:-1], "Zz?")
+            yield Mutation(place, "misspelt", changed, value, now)
+
+
+def places(document: Any, place: Place = ()) -> Iterator[Place]:
+    """Yield the place of every value below the top."""
+    entries: Any = ()
+    if isinstance(document, dict):
+        entries = document.items()
+    elif isinstance(document, list):
+        entries = enumerate(document)
+    for key, value in entries:
+        yield (*place, key)
+        yield from places(value, (*place, key))
+
+
+def _at(document: Any, place: Place) -> Any:
+    for key in place:
+        document = document[key]
+    return document
+
+
+def _replaced(document: Any, place: Place, value: Any) -> Any:
+    if not place:
+        return value
+    changed = copy.deepcopy(document)
+    _at(changed, place[:-1])[place[-1]] = value
+    return changed
+
+
+def path(place: Place) -> str:
+    """Return a place as faults name it: ``nodes[1].id``."""
+    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
+    return text.removeprefix(".")
+
+
+def _is_around(field: str, place: str) -> bool:
+    """Return whether a fault's field is the place, contains it or is inside it."""
+    short, long = sorted((field, place), key=len)
+    return (long.startswith(short) and (long[len(short) :] or ".")[0] in ".[") or not short
+
+
+def problem(
+    mutation: Mutation, faults: Sequence[Fault], form: Form, *, free: Container[str], file: str = ""
+) -> str:
+    """Return what is wrong with the faults of a mutation, or an empty string.
+
+    What the schema forbids has a fault at its place, and so has a control character in any text.
+    Every fault elsewhere quotes a name from that place, so it stands at a reference.
+    """
+    place = path(mutation.place)
+    here = [found for found in faults if found.file == file and mutation.is_at(found.field)]
+    control = mutation.kind in ("reversed text", "a bell")
+    in_free = any(path(mutation.place[:end]) in free for end in range(1, len(mutation.place) + 1))
+    if not here and (form.forbids(mutation.document) or (control and not in_free)):
+        return f"{place}, {mutation.kind}: no fault there, but {[*map(str, faults)]}"
+    names = mutation.names()
+    astray = [
+        str(found)
+        for found in faults
+        if found not in here and not names & set(re.findall(r"'([^']*)'", found.message))
+    ]
+    return f"{place}, {mutation.kind}: faults elsewhere: {astray}" if astray else ""
+
+
+class Form:
+    """What a JSON schema says about documents."""
+
+    def __init__(self, schema: Schema) -> None:
+        self._schema = schema
+        self._validator = jsonschema_rs.validator_for(schema)
+
+    def forbids(self, document: Any) -> bool:
+        """Return whether the schema rejects a document."""
+        return not self._validator.is_valid(document)
+
+    def fields(self) -> set[str]:
+        """Return all fields of all mappings, as ``Node.id``."""
+        return {f"{part['title']}.{name}" for part in self._parts() for name in part["properties"]}
+
+    def free(self) -> set[str]:
+        """Return the fields that may have any value, or a mapping of any keys and values."""
+        return {
+            f"{part['title']}.{name}"
+            for part in self._parts()
+            for name, field in part["properties"].items()
+            for option in field.get("anyOf", [field])
+            if option.get("additionalProperties") is True
+            or not {"type", "$ref", "const", "enum"} & option.keys()
+        }
+
+    def _parts(self) -> list[Schema]:
+        parts = [self._schema, *self._schema.get("$defs", {}).values()]
+        return [part for part in parts if "properties" in part]
+
+    def fields_in(self, document: Any) -> set[str]:
+        """Return the fields that a document gives a value."""
+        return set(self._used(document, self._schema))
+
+    def _used(self, value: Any, schema: Schema) -> Iterator[str]:
+        if "$ref" in schema:
+            schema = self._schema["$defs"][schema["$ref"].rpartition("/")[2]]
+        for option in schema.get("anyOf", ()):
+            yield from self._used(value, option)
+        if isinstance(value, list) and "items" in schema:
+            for item in value:
+                yield from self._used(item, schema["items"])
+        if not isinstance(value, dict):
+            return
+        named = schema.get("properties", {})
+        patterns = list(schema.get("patternProperties", {}).values())
+        other = patterns[0] if patterns else schema.get("additionalProperties")
+        for key, inner in value.items():
+            if key in named:
+                yield f"{schema['title']}.{key}"
+            below = named.get(key, other)
+            if isinstance(below, dict):
+                yield from self._used(inner, below)

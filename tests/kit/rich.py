@@ -1,0 +1,246 @@
+"""A valid configuration and valid goals in which every field has a value."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from tests.kit.config import configuration, override
+from tests.kit.goals import CLOUD, EGO, Goal, application, connection, goal
+
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+_FOLDER = "appdefs/object-detection-fusion/charts"
+_DIGEST = "sha256:" + "0" * 64
+
+_ROOT = """
+apiVersion: demandops/v1
+kind: StateRepository
+gitops: flux
+renderVersion: 1
+source: demandops
+flux: {url: "https://git.example/fleet/state.git", interval: 1m, secret: git}
+argocd: {url: "https://git.example/fleet/state.git", namespace: argocd}
+proposals: {forge: gitlab, url: "https://git.example/fleet/state", labels: [demand]}
+"""
+_PROPOSALS_BY_API = """
+apiVersion: demandops/v1
+kind: StateRepository
+gitops: argocd
+renderVersion: 1
+argocd: {url: "https://git.example/fleet/state.git", namespace: argocd}
+proposals: {forge: gitea, url: "https://git.example/fleet/state", api: "https://git.example/api/v1"}
+"""
+_CLUSTERS = """
+apiVersion: demandops/v1
+kind: Clusters
+clusters:
+  - {name: c-its, description: All nodes}
+  - {name: depot, description: A second cluster}
+"""
+_NODES = """
+apiVersion: demandops/v1
+kind: Nodes
+nodes:
+  - id: vehicle00
+    type: vehicle
+    cluster: c-its
+    selector: {example.org/host: first}
+    topics: {ego_data: /vehicles/vehicle00/ego_data}
+    tolerations:
+      - {key: road, operator: Equal, value: wet, effect: NoSchedule}
+      - {operator: Exists}
+    imagePullSecrets: [registry]
+    hostNetwork: false
+    ros: {domainId: 3, rmw: rmw_zenoh_cpp}
+    zenoh: {endpoint: "tcp/v0:7447", listen: ["tcp/0.0.0.0:7447"], connect: ["udp/router:7447"]}
+    wan: {host: 192.0.2.1, firstPort: 20000, lastPort: 20099, transport: udp}
+    types: {/vehicles/vehicle00/ego_data: perception_msgs/msg/EgoData}
+    bridged: {edge: [/clock]}
+  - {id: edge, type: edge, cluster: c-its}
+  - {id: cloud, type: cloud, cluster: depot}
+"""
+_BROKERS = """
+apiVersion: demandops/v1
+kind: Brokers
+brokers:
+  - node: edge
+    type: mqtt
+    host: broker-edge
+    port: 8883
+    tls: {caSecret: ca, caKey: ca.crt}
+    credentials: {secret: login, userKey: user, passwordKey: password}
+"""
+_DOMAINS = """
+apiVersion: demandops/v1
+kind: AccessDomains
+domains:
+  - name: perception
+    namespace: perception
+    serviceAccount: demandops
+    nodes: ["vehicle*", edge]
+    rules:
+      - name: all
+        requesters: ["*"]
+        applications: ["*"]
+        nodes: ["*"]
+        brokers: ["*"]
+        approval: none
+    quotas: {claimsPerRequester: 50, servicesPerNode: 60, demandsPerMinute: 70}
+    leases: {default: 1h, longest: 2h, slack: 20s, deploymentRequests: true}
+    network: namespace
+    approval: none
+  - {name: backend, namespace: backend, nodes: [cloud]}
+"""
+_CHARTS = f"""
+apiVersion: demandops/v1
+kind: Charts
+charts:
+  object-detection:
+    folder: {_FOLDER}/object-detection
+    version: 0.1.0
+    channels:
+      next: {{oci: "oci://registry.example/charts/od", version: 0.2.0}}
+      old: {{http: "https://charts.example", version: 0.0.9}}
+      other: {{folder: {_FOLDER}/object-detection-next, version: 0.3.0}}
+  object-fusion: {{folder: {_FOLDER}/object-fusion, version: 0.1.0}}
+  by-oci: {{oci: "oci://registry.example/charts/x", version: 1.0.0}}
+  by-http: {{http: "https://charts.example", version: 1.0.0}}
+"""
+_IMAGES = "apiVersion: demandops/v1\nkind: Images\nimages:\n" + "".join(
+    f"  {name}: {{repository: registry.example/{name}, tag: v1, digest: '{_DIGEST}'}}\n"
+    for name in (
+        *("object-detection", "object-fusion", "k8s-configmap-watcher"),
+        *("mqtt-client", "zenoh-bridge", "dds-router"),
+    )
+)
+_APPDEF = """
+apiVersion: demandops/v1
+kind: ApplicationDefinition
+name: object-detection-fusion
+description: Detects and fuses
+approval: none
+inputs:
+  ego_data: {description: State of a vehicle, type: perception_msgs/msg/EgoData}
+  point_cloud: {description: Lidar points, type: sensor_msgs/msg/PointCloud2}
+parameters:
+  rate: {description: Highest rate in Hz, default: 10, merge: max}
+deploymentRequest:
+  type: 1
+  inputs: {ego_data_topics: ego_data, pointcloud_topics: point_cloud}
+services:
+  object-detection:
+    prefix: od
+    description: Detects objects
+    each: point_cloud
+    outputs: {object_list: "/{instance}_objects"}
+    placement: application
+    chart: object-detection
+    images: [object-detection]
+    values: values/object-detection.yaml.j2
+  object-fusion:
+    prefix: of
+    inputs: {ego_data: ego_data, object_list: object-detection.object_list}
+    outputs:
+      raw_objects: "/{instance}_raw"
+      fused_objects: "/{instance}_fused"
+      fused_trajectories: "/{instance}_trajectories"
+    scaling: {min: 1, max: 4, topicsPerReplica: 2}
+    chart: object-fusion
+    images: [object-fusion, k8s-configmap-watcher]
+    values: values/object-fusion.yaml.j2
+"""
+_OVERRIDES = {
+    "values": override(
+        {"services": ["object-d*"], "appdefs": ["*"], "applications": ["edge/*"], "nodes": ["e*"]},
+        {"services": ["object-detection"], "labels": {"node_id": "edge"}, "requesters": ["*"]},
+        priority=3,
+        expires="2027-01-31T12:00:00Z",
+        values={"podLabels": {"a": "b"}},
+        version="next",
+        images={
+            "object-detection": {"repository": "mirror.example/od", "tag": "v2", "digest": _DIGEST}
+        },
+        replicas=2,
+        node="edge",
+    ),
+    "hold": override({"services": ["object-fusion"]}, hold=True),
+    "deny": override({"connections": ["c*"]}, deny=True),
+    "keep": override({"applications": ["main"]}, keep=True),
+}
+
+
+def rich() -> dict[str, str]:
+    """Return the files of a valid configuration with every field except ``proposals.api``."""
+    files = configuration(
+        {
+            "demandops.yaml": _ROOT,
+            "inventory/clusters.yaml": _CLUSTERS,
+            "inventory/nodes.yaml": _NODES,
+            "inventory/brokers.yaml": _BROKERS,
+            "policy/access-domains.yaml": _DOMAINS,
+            "registry/charts.yaml": _CHARTS,
+            "registry/images.yaml": _IMAGES,
+            APPDEF: _APPDEF,
+        }
+        | {f"overrides/{name}.yaml": text for name, text in _OVERRIDES.items()}
+    )
+    chart = files[f"{_FOLDER}/object-detection/Chart.yaml"]
+    files[f"{_FOLDER}/object-detection-next/Chart.yaml"] = chart.replace(
+        "version: 0.1.0", "version: 0.3.0"
+    )
+    return files
+
+
+def rich_with_api() -> dict[str, str]:
+    """Return the same files for Argo CD, with ``proposals.api`` (which excludes ``labels``)."""
+    return rich() | {"demandops.yaml": _PROPOSALS_BY_API}
+
+
+def reference_goal() -> Goal:
+    """Return a valid goal of the reference's action with every field."""
+    topics = [EGO[0], CLOUD[0]]
+    made = goal([application(ego=[EGO])], [connection(topics=topics, targets=["/a", "/b"])])
+    body = made["apps"][0]["object_detection_fusion_app"]
+    body["pointcloud_topics"][0]["type"] = "sensor_msgs/msg/PointCloud2"
+    return made
+
+
+def own_goal() -> Goal:
+    """Return a valid demand in our own format with every field."""
+    text = """
+apiVersion: demandops/v1
+kind: Demand
+operation: put
+demand: patrol
+request: patrol-1
+requesters: [vehicle00]
+lease: 10m
+answer: pushed
+applications:
+  - id: main
+    type: object-detection-fusion
+    node: edge
+    version: next
+    connect: none
+    inputs:
+      ego_data:
+        - {topic: /ego, source: vehicle00, type: perception_msgs/msg/EgoData}
+    parameters: {rate: 5}
+  - id: second
+    type: object-detection-fusion
+    node: edge
+    inputs: {point_cloud: [{topic: /points, source: vehicle00}]}
+    parameters_json: {rate: "7"}
+connections:
+  - id: link
+    type: mqtt
+    source: vehicle00
+    target: edge
+    broker: edge
+    topics:
+      - {source: /a, target: /b, type: std_msgs/msg/String, reverse: false, qos: 1, retained: true,
+         primitive: true, reliability: reliable, durability: volatile, queue: 5, rate: 0}
+"""
+    made: dict[str, Any] = yaml.safe_load(text)
+    return made

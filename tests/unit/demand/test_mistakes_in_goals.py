@@ -1,0 +1,55 @@
+"""One mistake at any place of a valid goal gives a fault at that place, and changes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from demandops.demand.demand_goal import DemandGoal
+from demandops.demand.deployment_request_goal import WireGoal
+from demandops.errors import Refused
+
+from tests.kit import mutations, rich
+from tests.kit.goals import Goal
+from tests.kit.memory import MemoryRepo
+from tests.kit.mutations import Form
+
+REFERENCE, OWN = Form(WireGoal.model_json_schema()), Form(DemandGoal.model_json_schema())
+FREE = {"GoalApplication.parameters", "DemandGoal.lease"}
+FREE_PLACES = ("applications[0].parameters", "applications[1].parameters_json")
+ELSEWHERE = {
+    "connections[0].source_topics": "connections[0].target_topics",  # one has more topics then
+    "connections[0].type": "connections[0].",  # another type has other rules
+    "applications[0].parameters.rate": "parameters.rate",  # when it is merged, without its place
+    "applications[1].parameters_json.": "applications[1].parameters.",
+}
+"""Where a fault may also be when the mistake is here."""
+
+
+@pytest.mark.parametrize(
+    ("valid", "form"), [(rich.reference_goal, REFERENCE), (rich.own_goal, OWN)]
+)
+def test_a_mistake_anywhere_is_a_fault_at_its_place(valid: Callable[[], Goal], form: Form) -> None:
+    repo = MemoryRepo(rich.rich())
+    assert not isinstance(repo.copy().take(valid()), Refused)
+    problems = []
+    for mutation in mutations.mutations(valid()):
+        taken = repo.copy().take(mutation.document)
+        place = mutations.path(mutation.place)
+        also = tuple(field for start, field in ELSEWHERE.items() if place.startswith(start))
+        found = [
+            fault
+            for fault in (taken.faults if isinstance(taken, Refused) else ())
+            if mutation.is_at(fault.field) or not fault.field.startswith(also)
+        ]
+        problems.append(mutations.problem(mutation, found, form, free=FREE_PLACES))
+    assert list(filter(None, problems)) == []
+
+
+def test_every_field_of_a_goal_is_tried() -> None:
+    assert REFERENCE.fields() == REFERENCE.fields_in(rich.reference_goal())
+    assert OWN.fields() == OWN.fields_in(rich.own_goal())
+
+
+def test_only_the_listed_fields_may_have_any_value() -> None:
+    assert REFERENCE.free() | OWN.free() == FREE
