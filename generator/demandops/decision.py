@@ -18,11 +18,11 @@ from demandops.config.config import Config
 from demandops.demand import (
     admission,
     approval_rule,
+    connection_type_choice,
     decommission_goal,
     demand_goal,
     deployment_request_goal,
     permission,
-    transport_choice,
 )
 from demandops.demand.claim import Subject
 from demandops.demand.demand_request import DemandRequest, Operation
@@ -198,7 +198,7 @@ def admit(
         if parsed is None:
             raise Refused(faults)
         request = permission.with_lease_terms(parsed, config)
-    request = transport_choice.with_chosen_types(request, config, state.ledger.type_of)
+    request = connection_type_choice.with_chosen_types(request, config, state.ledger.type_of)
     malformed = {found.field for found in faults}
     content_faults = [*admission.faults(request, config), *permission.faults(request, config)]
     content = _with_goal_fields(content_faults, request, config)

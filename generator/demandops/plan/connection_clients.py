@@ -16,9 +16,9 @@ from demandops.config.config import Config
 from demandops.config.inventory import Node
 from demandops.demand import route as routes
 from demandops.demand.claim import ConnectionClaim
+from demandops.demand.connection_type_choice import choose_broker, message_type, route_faults
 from demandops.demand.demand_request import ConnectionType
 from demandops.demand.route import Route
-from demandops.demand.transport_choice import choose_broker, message_type, route_faults
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.ledger import Ledger
 from demandops.plan import naming
