@@ -225,7 +225,7 @@ def form_faults(goal: object) -> list[Fault]:
 def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
-    """Return the changes of rendered files that a person's change of claims requires."""
+    """Return the changes to rendered files that follow when a person changes claims."""
     keys = affected_keys(before, state.ledger, state.config, subjects)
     return changeset.build_changeset(
         before, state.ledger, (), keys, (state.config, state.engine, read)

@@ -198,7 +198,7 @@ def _listener(claim: ConnectionClaim, config: Config) -> Node | None:
 
 
 def _address(connection: str, listener: Node) -> Address:
-    """Return where a connection's routers meet; the port depends on the connection id alone."""
+    """Return the address of a connection's routers; its port depends on the connection id only."""
     wan = listener.wan
     assert wan is not None  # noqa: S101 - a listener has one
     ports = wan.last_port - wan.first_port + 1

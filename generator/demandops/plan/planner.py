@@ -189,7 +189,7 @@ def _is_usual(config: Config, service: Service, source: str, topic: str) -> bool
 
 
 def outputs(config: Config, service: Service, key: ServiceKey) -> dict[str, str]:
-    """Return the topics that a service instance publishes, by the appdef's name for each."""
+    """Return the topics that a service instance publishes, by the names of the appdef's outputs."""
     if key.application is not None:
         instance = naming.topic_part(key.application)
     elif _is_usual(config, service, str(key.source), str(key.topic)):

@@ -1,6 +1,6 @@
 """Evaluates one demand on top of the commits of its batch.
 
-Every error of a demand is its own answer: it stops no other demand.
+A demand that fails gets its error as the answer. The other demands of the batch continue.
 """
 
 from __future__ import annotations

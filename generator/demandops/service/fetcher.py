@@ -70,7 +70,7 @@ class Fetcher:
     def fetch_if_due(self, known: Snapshot, due: bool) -> bool:
         """Fetch if it is time to, and carry out what others pushed.
 
-        A repository on this disk is read each time, because that costs nothing.
+        A repository on this disk is read each time, because that is cheap.
 
         Args:
             known: the newest state that was read.
@@ -94,14 +94,14 @@ class Fetcher:
         return True
 
     def carry_out_changes(self) -> None:
-        """Carry out people's changes up to the newest tip that is known, without a fetch."""
+        """Carry out people's changes up to the last fetched tip; does not fetch."""
         try:
             self._carry_out_changes()
         except StateRepoError as error:
             self.record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Commit and publish what follows from people's changes; return whether anything did."""
+        """Commit and publish what follows from people's changes; return whether it committed."""
         for _ in range(_TRIES):
             commits = self._new_commit_batch()
             if commits.publish():

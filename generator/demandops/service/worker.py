@@ -211,7 +211,7 @@ class Worker:
             self._override_expiry.postpone(_now())
 
     def tidy(self) -> None:
-        """Pack the repository every few hundred commits: each leaves some twenty loose objects."""
+        """Pack the repository every few hundred commits; each adds about twenty loose objects."""
         if self._commits_since_tidy >= _TIDY_EVERY:
             self._commits_since_tidy = 0
             self._repository.tidy()

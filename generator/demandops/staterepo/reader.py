@@ -264,7 +264,7 @@ class Reader:
         )
 
     def git_user(self) -> tuple[str, str]:
-        """Return name and e-mail address of who runs this program."""
+        """Return the name and e-mail address of the person who runs this program."""
         return authorship.git_user(self._repository.objects)
 
 

@@ -31,7 +31,7 @@ class OverrideExpiry:
                 continue
             try:
                 commits.end_override(override, now)
-                log.info("%s ended at its time, %s", override.path, override.expires)
+                log.info("%s ended as planned at %s", override.path, override.expires)
             except InvalidInput as error:
                 self._failed[override.name, override.end or now] = now
                 for problem in error.faults:
@@ -42,7 +42,7 @@ class OverrideExpiry:
         self._not_before = now + _RETRY
 
     def is_due(self, config: Config, now: datetime) -> bool:
-        """Return whether an override is to be ended now."""
+        """Return whether to end an override now."""
         return any(time <= now for time in self._due_times(config))
 
     def seconds_until_due(self, config: Config, now: datetime, longest: float) -> float:
