@@ -18,11 +18,11 @@ from demandops.config.config import Config
 from demandops.demand import (
     admission,
     approval_rule,
+    connection_type_choice,
     decommission_goal,
     demand_goal,
     deployment_request_goal,
     permission,
-    transport_choice,
 )
 from demandops.demand.claim import Subject
 from demandops.demand.demand_request import DemandRequest, Operation
@@ -198,7 +198,7 @@ def admit(
         if parsed is None:
             raise Refused(faults)
         request = permission.with_lease_terms(parsed, config)
-    request = transport_choice.with_chosen_types(request, config, state.ledger.type_of)
+    request = connection_type_choice.with_chosen_types(request, config, state.ledger.type_of)
     malformed = {found.field for found in faults}
     content_faults = [*admission.faults(request, config), *permission.faults(request, config)]
     content = _with_goal_fields(content_faults, request, config)
@@ -225,7 +225,7 @@ def form_faults(goal: object) -> list[Fault]:
 def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
-    """Return the changes of rendered files that a person's change of claims requires."""
+    """Return the changes to rendered files that follow when a person changes claims."""
     keys = affected_keys(before, state.ledger, state.config, subjects)
     return changeset.build_changeset(
         before, state.ledger, (), keys, (state.config, state.engine, read)

@@ -180,7 +180,7 @@ def dump(data: Mapping[str, Any]) -> str:
 
 
 def set_key(text: str, key: str, value: object) -> str:
-    """Return a file's text with one top-level key set; the rest stays, comments included.
+    """Return a file's text with one top-level key set; all else, also comments, stays the same.
 
     A plain value is replaced in place. A missing key is added at the end.
 

@@ -66,11 +66,11 @@ def patches_commute(one: object, other: object) -> bool:
         return all(patches_commute(one[key], other[key]) for key in one if key in other)
     return json.dumps(one, sort_keys=True) == json.dumps(
         other, sort_keys=True
-    )  # unlike ==, it tells 1 from True
+    )  # unlike ==, it distinguishes 1 from True
 
 
 def can_meet(one: Iterable[Selector], other: Iterable[Selector], config: Config) -> bool:
-    """Return whether any release, now or later, may match a selector of each."""
+    """Return whether one release, now or later, may match selectors of both overrides."""
     others = list(other)
     return any(_meet(left, right, config) for left in one for right in others)
 
@@ -131,7 +131,7 @@ def patterns_overlap(one: str, other: str) -> bool:
 
 
 def _past_stars(pattern: str, positions: set[int]) -> set[int]:
-    """Return the positions reached if each star on the way matches no characters."""
+    """Return the positions after the stars that follow, if each matches no characters."""
     found = set()
     for position in positions:
         here = position

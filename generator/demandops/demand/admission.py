@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from demandops.config.config import Config
+from demandops.demand import connection_type_choice
 from demandops.demand import demand_request as shape
-from demandops.demand import transport_choice
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -105,10 +105,10 @@ def _connection(
         return
     if kind is ConnectionType.AUTO:
         ends_known = connection.source in config.nodes and connection.target in config.nodes
-        if ends_known and transport_choice.choose_type(connection, config) is kind:
-            yield _within(where, transport_choice.no_type_fault(connection, config))
+        if ends_known and connection_type_choice.choose_type(connection, config) is kind:
+            yield _within(where, connection_type_choice.no_type_fault(connection, config))
         return
-    for found in transport_choice.type_faults(kind, connection, config):
+    for found in connection_type_choice.type_faults(kind, connection, config):
         yield _within(where, found)
 
 

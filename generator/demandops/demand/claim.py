@@ -123,7 +123,7 @@ def is_override_claim(claim: Claim) -> bool:
 
 
 def demand_id(request: str, requesters: Iterable[str]) -> str:
-    """Return the demand id of a request that has none, like the reference's.
+    """Return a demand id for a request of the reference's action, which has none.
 
     It is a digest of the request id and the set of requesters, so a repeated request is the same
     demand.

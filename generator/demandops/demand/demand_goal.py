@@ -167,7 +167,7 @@ def _application(
     for name, text in app.parameters_json.items():
         place = f"{where}.parameters_json.{name}"
         if name in parameters:
-            faults.append(fault(place, "is given in parameters already; give it once"))
+            faults.append(fault(place, "is already given in parameters; give it once"))
             continue
         try:
             parameters[name] = _storable(place, json.loads(text), faults)

@@ -54,7 +54,7 @@ class ConnectionType(Enum):
     """The type of a connection; the values are the numbers in ``DeploymentRequest``.
 
     Only requests contain ``AUTO``, which has no number there. Claims have the chosen type
-    (:func:`demandops.demand.transport_choice.with_chosen_types`).
+    (:func:`demandops.demand.connection_type_choice.with_chosen_types`).
     """
 
     AUTO = -1

@@ -1,4 +1,4 @@
-"""Validation of the form of a goal: the valid part of plain data, and the faults of the rest.
+"""Validation of the form of a goal: the valid part of plain data, and the faults.
 
 Fields of the wrong form are left out and the others kept, so that faults of form and of content
 can be reported together.
@@ -24,7 +24,7 @@ Goal = TypeVar("Goal", bound=BaseModel)
 def parse_valid_part(
     data: dict[str, Any], model: type[Goal], lists_of_text: Container[str]
 ) -> tuple[Goal, list[Fault]]:
-    """Return the part of ``data`` that has the form of ``model``, and the faults of the rest.
+    """Return the part of ``data`` that has the form of ``model``, and a fault for each other part.
 
     Args:
         data: the goal.

@@ -11,6 +11,7 @@ from dataclasses import replace
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain, Rule, matches, seconds_of
 from demandops.demand.claim import ApplicationClaim
+from demandops.demand.connection_type_choice import choose_broker
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -19,7 +20,6 @@ from demandops.demand.demand_request import (
     Operation,
 )
 from demandops.demand.lease import Term
-from demandops.demand.transport_choice import choose_broker
 from demandops.errors import Fault, fault
 
 Access = list[tuple[str, str]]

@@ -1,8 +1,8 @@
 """Routes: one topic of a connection, with its names, direction and options.
 
 Requests and claims contain :class:`Route`, and clients are configured from it. This module knows
-the valid options; :mod:`demandops.demand.transport_choice` knows which connection type supports
-them. :func:`parse` is for options from messages and from the ledger's files.
+the valid options; :mod:`demandops.demand.connection_type_choice` knows which type supports them.
+:func:`parse` is for options from messages and from the ledger's files.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Forges: opens pull requests for proposals, with the API of GitHub or Gitea (Forgejo).
 
-Knows pull requests and HTTP, and nothing of demands or Git: the branch has already been pushed.
+Knows pull requests and HTTP, but not demands or Git: the branch has already been pushed.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The one way to change the ledger: :func:`apply` carries out a request.
 
-What each operation means: ``docs/architecture.md``, "Booking".
+What each operation means: ``docs/demand.md``, "How a demand is booked".
 """
 
 from __future__ import annotations

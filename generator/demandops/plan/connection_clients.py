@@ -16,9 +16,9 @@ from demandops.config.config import Config
 from demandops.config.inventory import Node
 from demandops.demand import route as routes
 from demandops.demand.claim import ConnectionClaim
+from demandops.demand.connection_type_choice import choose_broker, message_type, route_faults
 from demandops.demand.demand_request import ConnectionType
 from demandops.demand.route import Route
-from demandops.demand.transport_choice import choose_broker, message_type, route_faults
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.ledger import Ledger
 from demandops.plan import naming
@@ -198,7 +198,7 @@ def _listener(claim: ConnectionClaim, config: Config) -> Node | None:
 
 
 def _address(connection: str, listener: Node) -> Address:
-    """Return where a connection's routers meet; the port depends on the connection id alone."""
+    """Return the address of a connection's routers; its port depends on the connection id only."""
     wan = listener.wan
     assert wan is not None  # noqa: S101 - a listener has one
     ports = wan.last_port - wan.first_port + 1

@@ -1,4 +1,4 @@
-"""A plan that is updated from one ledger to the next, by what each release read of the ledger.
+"""A plan that follows a sequence of ledgers: it records what each release read of the ledger.
 
 Planning is a function of ledger and configuration. If nothing that a release read has changed, its
 plan is the same; only the others are planned again. The generator predicts which releases a claim

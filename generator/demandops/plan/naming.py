@@ -49,8 +49,8 @@ def object_name(prefix: str, *ids: str) -> str:
 def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name (``vehicle00``, ``edge/fusion``).
 
-    ``extra`` distinguishes further instances of the same id, such as a source's second point cloud.
-    It appears as a slug with a hash.
+    ``extra`` keeps names with the same id apart, for example two point clouds of one source. It
+    is added as a slug with a hash.
     """
     exact = not extra and len(id) <= _MAX_TOKEN and _TOPIC_PATH.fullmatch(id)
     if exact and not _LOOKS_HASHED.fullmatch(id):

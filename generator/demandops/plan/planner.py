@@ -18,7 +18,7 @@ from demandops.errors import Refused, fault
 from demandops.ledger.ledger import Ledger
 from demandops.plan import connection_clients, naming, parameters
 from demandops.plan.connection_clients import BridgeKey, EndKey
-from demandops.plan.overrides import effects
+from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.suspended_claims import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease, node_and_domain
 from demandops.plan.release_keys import ReleaseKey, appdef_of, keys_of
@@ -33,7 +33,7 @@ def plan(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
     """
     ledger = without_suspended(ledger, config)
     release = _unshaped(ledger, config, key)
-    return effects.apply_overrides(release, ledger, config) if release else None
+    return release_overrides.apply_overrides(release, ledger, config) if release else None
 
 
 def denied_release(
@@ -42,7 +42,7 @@ def denied_release(
     """Return the release at ``key`` and the override that denies it, or ``None``."""
     ledger = without_suspended(ledger, config)
     release = _unshaped(ledger, config, key)
-    by = effects.service_denied_by(release, ledger, config) if release else None
+    by = release_overrides.service_denied_by(release, ledger, config) if release else None
     return (release, by) if release and by else None
 
 
@@ -189,7 +189,7 @@ def _is_usual(config: Config, service: Service, source: str, topic: str) -> bool
 
 
 def outputs(config: Config, service: Service, key: ServiceKey) -> dict[str, str]:
-    """Return the topics that a service instance publishes, by the appdef's name for each."""
+    """Return the topics that a service instance publishes, by the names of the appdef's outputs."""
     if key.application is not None:
         instance = naming.topic_part(key.application)
     elif _is_usual(config, service, str(key.source), str(key.topic)):

@@ -132,7 +132,7 @@ class RosEnd(ConnectionEnd):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A host and port at which DDS Routers meet."""
+    """The host and port at which one DDS Router listens for the other."""
 
     host: str
     port: int

@@ -41,7 +41,7 @@ def check_values(
 
     Args:
         values: the values to check.
-        chart: where the chart comes from.
+        chart: the chart's source and version.
         config: the configuration, which holds the chart's files.
         template: the file that gives the values: a template or an override.
 

@@ -1,7 +1,7 @@
 """The file of a release: comment lines that name the overrides, then the rendered body.
 
 A ``hold`` override keeps the body of a file byte for byte; only the comments above it may change.
-They go on naming the overrides that shaped the body when it was frozen.
+The comments still name the overrides that shaped the body at the start of the hold.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Evaluates one demand on top of the commits of its batch.
 
-Every error of a demand is its own answer: it stops no other demand.
+A demand that fails gets its error as the answer. The other demands of the batch continue.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ class Evaluator:
 
     def evaluate(
         self,
-        line: commit_batch.CommitBatch,
+        commits: commit_batch.CommitBatch,
         ticket: Ticket,
         published: dict[str, commit_log.RecordedOutcome],
         earlier: list[Result],
     ) -> Receipt | DemandOpsError | Deferred:
-        """Decide a demand, commit it on the commit line and return its result.
+        """Decide a demand, commit it on the commit batch and return its result.
 
         Args:
             published: what :meth:`published_before` returned for the batch.
@@ -64,18 +64,18 @@ class Evaluator:
         if ticket.operation in published:
             return _receipt_of_published(ticket, published[ticket.operation])
         try:
-            released = self._approvals.released_in_batch(ticket, line.head.state, earlier)
+            released = self._approvals.released_in_batch(ticket, commits.head.state, earlier)
             earlier[:] = [
                 (t, Withdrawn(RELEASED) if t.operation in released else r) for t, r in earlier
             ]
             goal = ticket.goal
             if rollback_goal.is_rollback(goal):
-                goal = rollback_goal.to_restoration(goal, self._repository, line.start)
+                goal = rollback_goal.to_restoration(goal, self._repository, commits.start)
             decision = decide(
-                line.head.state,
+                commits.head.state,
                 goal,
                 ticket.received,
-                line.read,
+                commits.read,
                 lambda stage: ticket.notify(stage, stage),
                 lambda request, config: self._rate_limit.faults(
                     request, config, ticket.operation, ticket.received
@@ -86,14 +86,14 @@ class Evaluator:
             if not self._queue.mark_committed(ticket):
                 return Withdrawn(TAKEN_BACK)
             self._approvals.withdraw_replaced(decision.request)
-            before = line.head.state.ledger
+            before = commits.head.state.ledger
             targets = targets_of_decision(before, decision) if self._with_targets else ()
-            return replace(_commit(line, ticket, decision), targets=targets)
+            return replace(_commit(commits, ticket, decision), targets=targets)
         except InvalidInput as error:
             if self._approvals.has_released_a_proposal(ticket):  # which held no claims yet
-                line.note_settled(ticket.operation, "Unchanged")
-                return _receipt_of_released(ticket, str(line.head.commit))
-            line.note_settled(ticket.operation, "Refused")
+                commits.note_settled(ticket.operation, "Unchanged")
+                return _receipt_of_released(ticket, str(commits.head.commit))
+            commits.note_settled(ticket.operation, "Refused")
             return error
         except SigningFailed as error:
             return error
@@ -115,13 +115,13 @@ class Evaluator:
         return published
 
 
-def _commit(line: commit_batch.CommitBatch, ticket: Ticket, decision: Decision) -> Receipt:
+def _commit(commits: commit_batch.CommitBatch, ticket: Ticket, decision: Decision) -> Receipt:
     if decision.files:
-        commit = line.commit(decision, ticket.operation, ticket.received, _now())
+        commit = commits.commit(decision, ticket.operation, ticket.received, _now())
         ticket.notify("committed", f"committed {commit}")
     else:
-        commit = str(line.head.commit)
-        line.note_settled(ticket.operation, "Unchanged")
+        commit = str(commits.head.commit)
+        commits.note_settled(ticket.operation, "Unchanged")
     return Receipt(
         operation=ticket.operation,
         request_id=decision.request.id,

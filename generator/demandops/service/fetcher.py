@@ -33,7 +33,7 @@ class Fetcher:
         repository: StateRepository,
         queue: DemandQueue,
         fetch_interval: float,
-        new_commit_line: Callable[[], commit_batch.CommitBatch],
+        new_commit_batch: Callable[[], commit_batch.CommitBatch],
         on_published: Callable[[commit_batch.CommitBatch], None],
     ) -> None:
         """Plan the first fetch.
@@ -42,13 +42,13 @@ class Fetcher:
             repository: the state repo.
             queue: the demands, which go first.
             fetch_interval: seconds between two fetches; 0: only on request.
-            new_commit_line: returns a commit line on the newest tip, with the commits that carry
+            new_commit_batch: returns a commit batch on the newest tip, with the commits that carry
                 out people's changes.
-            on_published: called with each commit line after it was published.
+            on_published: called with each commit batch after it was published.
         """
         self._repository = repository
         self._queue = queue
-        self._new_commit_line, self._on_published = new_commit_line, on_published
+        self._new_commit_batch, self._on_published = new_commit_batch, on_published
         self._timer = PollTimer(fetch_interval, embedded=repository.always_current)
         self._logged: frozenset[Fault] = frozenset()
         self._stopped = threading.Event()
@@ -70,7 +70,7 @@ class Fetcher:
     def fetch_if_due(self, known: Snapshot, due: bool) -> bool:
         """Fetch if it is time to, and carry out what others pushed.
 
-        A repository on this disk is read each time, because that costs nothing.
+        A repository on this disk is read each time, because that is cheap.
 
         Args:
             known: the newest state that was read.
@@ -94,19 +94,19 @@ class Fetcher:
         return True
 
     def carry_out_changes(self) -> None:
-        """Carry out people's changes up to the newest tip that is known, without a fetch."""
+        """Carry out people's changes up to the last fetched tip; does not fetch."""
         try:
             self._carry_out_changes()
         except StateRepoError as error:
             self.record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Commit and publish what follows from people's changes; return whether anything did."""
+        """Commit and publish what follows from people's changes; return whether it committed."""
         for _ in range(_TRIES):
-            line = self._new_commit_line()
-            if line.publish():
-                self._on_published(line)
-                return line.head.commit != line.start.commit
+            commits = self._new_commit_batch()
+            if commits.publish():
+                self._on_published(commits)
+                return commits.head.commit != commits.start.commit
             self._repository.refresh()
             self._stopped.wait(random.uniform(0, _LONGEST_PAUSE_S))  # noqa: S311 - not for security
         return False  # other generators are faster, and they carry out the same changes

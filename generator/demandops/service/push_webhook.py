@@ -233,7 +233,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing of a request: headers hold secrets, and anyone may write the path."""
+        """Do not log a request: its headers hold secrets, and anyone may write the path."""
 
 
 def _bytes(text: str) -> bytes:

@@ -38,7 +38,7 @@ def is_rollback(goal: object) -> bool:
 def to_restoration(
     goal: dict[str, Any], repository: StateRepository, head: Snapshot
 ) -> Restoration:
-    """Return the request that a rollback goal stands for.
+    """Return the request of a rollback goal.
 
     Raises:
         Refused: if its commit is not in the history of the state repo.

@@ -51,9 +51,9 @@ class Receipt:
 class ProposalRecord:
     """What the journal keeps of a proposal, enough to resume it.
 
-    ``commits`` are those that the branch was set to or is about to be, the newest last; ``base`` is
-    the commit of main below the newest. ``pushed``: the branch existed once. ``link``: where a
-    person finds it. ``withdrawn``: why it is to be deleted, or empty.
+    ``commits`` are the past, current and next commits of the branch, the newest last; ``base`` is
+    the commit of main below the newest. ``pushed``: the branch existed once. ``link``: its web
+    address. ``withdrawn``: the reason to delete it, or empty.
     """
 
     branch: str

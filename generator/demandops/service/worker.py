@@ -61,7 +61,7 @@ class Worker:
         self._stopped_retrying = threading.Event()
         embedded = repository.always_current
         self.fetcher = Fetcher(
-            repository, queue, fetch_interval, self._new_commit_line, self._set_snapshot
+            repository, queue, fetch_interval, self._new_commit_batch, self._set_snapshot
         )
         self._batch_limit = LIMIT_EMBEDDED if embedded else LIMIT_REMOTE
 
@@ -129,27 +129,27 @@ class Worker:
         self._queue.answer_withdrawn(batch)
         part = batch[: backoff.max_demands]
         self._approvals.remove_released(part, self.snapshot.state)
-        line = self._new_commit_line()
+        commits = self._new_commit_batch()
         began = time.monotonic()
-        published = self._evaluator.published_before(line.start, part)
+        published = self._evaluator.published_before(commits.start, part)
         results: list[Result] = []
         for ticket in part:
-            result = self._evaluator.evaluate(line, ticket, published, results)
+            result = self._evaluator.evaluate(commits, ticket, published, results)
             results.append((ticket, result))
         evaluated = time.monotonic()
-        if line.head.commit == line.start.commit and not self._tip_is_fresh:
+        if commits.head.commit == commits.start.commit and not self._tip_is_fresh:
             # nothing to push, so only a fetch shows whether the remote has moved
             tip = self._repository.refresh()
             self._tip_is_fresh = True
-            if tip != line.start.commit:
+            if tip != commits.start.commit:
                 return None
-        if self._publish_line(line, results):
+        if self._publish_commits(commits, results):
             self._answer(results)
             del batch[: len(part)]
             backoff.published()
             return None
         log.info("the state repo has moved; evaluating %d demands again", len(part))
-        _mark_maybe_published(part, line.start)
+        _mark_maybe_published(part, commits.start)
         self._must_fetch = True
         return backoff.overtaken(len(part), evaluated - began, time.monotonic() - evaluated)
 
@@ -211,48 +211,48 @@ class Worker:
             self._override_expiry.postpone(_now())
 
     def tidy(self) -> None:
-        """Pack the repository every few hundred commits: each leaves some twenty loose objects."""
+        """Pack the repository every few hundred commits; each adds about twenty loose objects."""
         if self._commits_since_tidy >= _TIDY_EVERY:
             self._commits_since_tidy = 0
             self._repository.tidy()
 
-    def _publish_line(self, line: commit_batch.CommitBatch, results: list[Result]) -> bool:
-        """Publish a commit line; return False if another writer was first.
+    def _publish_commits(self, commits: commit_batch.CommitBatch, results: list[Result]) -> bool:
+        """Publish a commit batch; return False if another writer was first.
 
         If the remote rejects the push for another reason, that is the answer of all its demands.
         """
         try:
-            published = line.publish()
+            published = commits.publish()
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
             self.fetcher.remote.record_push_denied(str(error))
             return True
         if not published:
             return False
-        self.fetcher.record_reached(pushed=line.head.commit != line.start.commit)
-        self._set_snapshot(line)
+        self.fetcher.record_reached(pushed=commits.head.commit != commits.start.commit)
+        self._set_snapshot(commits)
         self._commits_since_tidy += len(results)
         return True
 
-    def _set_snapshot(self, line: commit_batch.CommitBatch) -> None:
-        before, self.snapshot = self.snapshot, line.head
-        if line.head.commit != before.commit:  # a merge may need no commit of the generator
-            self._on_published(line.head.state.config)
+    def _set_snapshot(self, commits: commit_batch.CommitBatch) -> None:
+        before, self.snapshot = self.snapshot, commits.head
+        if commits.head.commit != before.commit:  # a merge may need no commit of the generator
+            self._on_published(commits.head.state.config)
 
-    def _new_commit_line(self) -> commit_batch.CommitBatch:
-        """Return a commit line on the newest known tip, which carries out people's changes."""
+    def _new_commit_batch(self) -> commit_batch.CommitBatch:
+        """Return a commit batch on the newest known tip, which carries out people's changes."""
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems:
-            line = commit_batch.CommitBatch(self._repository, before)
-            self._override_expiry.end_due(line, _now())
-            return line
+            commits = commit_batch.CommitBatch(self._repository, before)
+            self._override_expiry.end_due(commits, _now())
+            return commits
         advance = self._ahead.advance(self._repository.objects, before, tip)
-        line = commit_batch.CommitBatch(self._repository, advance.snapshot)
-        line.follow(advance, before, _now())
-        self.fetcher.log_problems(line.head.problems)
-        self._override_expiry.end_due(line, _now())
-        return line
+        commits = commit_batch.CommitBatch(self._repository, advance.snapshot)
+        commits.follow(advance, before, _now())
+        self.fetcher.log_problems(commits.head.problems)
+        self._override_expiry.end_due(commits, _now())
+        return commits
 
 
 def _mark_maybe_published(batch: list[Ticket], start: Snapshot) -> None:

@@ -17,7 +17,7 @@ from demandops.ledger.operations.restoration import Restoration
 from demandops.render.changes.changeset import FileReader
 from demandops.staterepo.audit import commit_signatures, verification
 from demandops.staterepo.audit.verification import Verdict
-from demandops.staterepo.git import connect
+from demandops.staterepo.git import repository_choice
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.address import is_url
 from demandops.staterepo.git.repository import StateRepository
@@ -51,7 +51,7 @@ class Reader:
             self._slot = Slot(settings.data_home(address) / "reader")
             folder = self._slot.folder
         try:
-            self._repository = connect.connect(address, folder)
+            self._repository = repository_choice.connect(address, folder)
             self._tip = self._repository.refresh()
         except BaseException:
             self.close()
@@ -264,7 +264,7 @@ class Reader:
         )
 
     def git_user(self) -> tuple[str, str]:
-        """Return name and e-mail address of who runs this program."""
+        """Return the name and e-mail address of the person who runs this program."""
         return authorship.git_user(self._repository.objects)
 
 

@@ -207,7 +207,7 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
 
 
 def _person(objects: Repository, now: datetime) -> Signature:
-    """Return who runs the command, from git's configuration; else the generator."""
+    """Return the person who runs the command, from git's configuration; else the generator."""
     try:
         who = objects.default_signature
     except (KeyError, ValueError, pygit2.GitError):

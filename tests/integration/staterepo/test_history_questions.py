@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from demandops.staterepo import reader
-from demandops.staterepo.git import connect
+from demandops.staterepo.git import repository_choice
 
 from tests.kit import rig
 from tests.kit.rig import Person
@@ -43,7 +43,7 @@ def test_a_folder_is_unchanged_where_its_content_is(bare: Path, line: list[str])
 
 
 def test_the_paths_that_differ_are_told(bare: Path, tmp_path: Path, line: list[str]) -> None:
-    repository = connect.connect(str(bare), tmp_path / "data")
+    repository = repository_choice.connect(str(bare), tmp_path / "data")
     assert repository.changed_paths(line[0], line[2]) == [f"{CHART}/notes.txt", "notes.txt"]
     assert repository.changed_paths(line[2], line[2]) == []
     assert repository.changed_paths("", line[2]) is None

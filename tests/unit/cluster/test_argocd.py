@@ -77,7 +77,7 @@ FAILED = {"kind": "Application", "name": "od-edge", "status": "SyncFailed", "mes
 @pytest.mark.parametrize(
     ("found", "state", "reason", "failing"),
     [
-        (None, "waiting", "is not there; apply bootstrap/", False),
+        (None, "waiting", "does not exist; apply bootstrap/", False),
         (over(), "waiting", "has not applied the commit yet", False),
         (over(sync="Synced", at="a"), "waiting", "has not applied the commit yet", False),
         (over(sync="Synced", at="b"), "reconciled", "", False),

@@ -6,7 +6,7 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
-from demandops.demand import transport_choice
+from demandops.demand import connection_type_choice
 from demandops.demand.route import Route, RouteOptions, contradictions, faults, merge_routes, parse
 
 OPTIONS: dict[str, object] = {
@@ -47,7 +47,7 @@ def test_options_and_routes_have_the_same_fields_and_defaults() -> None:
 
 
 def test_every_option_does_something_in_some_client() -> None:
-    honoured = set().union(*transport_choice.SUPPORTED_OPTIONS.values())
+    honoured = set().union(*connection_type_choice.SUPPORTED_OPTIONS.values())
     assert honoured == RouteOptions.model_fields.keys() - {"type", "reverse"}
 
 

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import yaml
-from demandops.demand import transport_choice
+from demandops.demand import connection_type_choice
 from demandops.demand.route import RouteOptions
 
 from tests.kit.config import skeleton
@@ -53,7 +53,7 @@ def test_every_field_of_a_route_is_explained_with_the_types_that_honour_it() -> 
     rows = re.findall(r"^\| `(\w+)`[^|]*\|[^|]*\| ([^|]*) \|$", PAGE, re.MULTILINE)
     told = {name: row for name, row in rows if name in RouteOptions.model_fields}
     assert told.keys() == RouteOptions.model_fields.keys()
-    for kind, options in transport_choice.SUPPORTED_OPTIONS.items():
+    for kind, options in connection_type_choice.SUPPORTED_OPTIONS.items():
         label = {"MQTT": "MQTT", "ZENOH": "Zenoh", "ROS": "ROS"}[kind.name]
         listed = {name for name, row in told.items() if label in row and name != "type"}
         assert listed == options

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from demandops.errors import StateRepoError
 from demandops.staterepo.git.address import is_url, without_secrets
-from demandops.staterepo.git.connect import connect
 from demandops.staterepo.git.repository import RemoteAway
+from demandops.staterepo.git.repository_choice import connect
 
 URLS = [
     "https://example.org/state.git",

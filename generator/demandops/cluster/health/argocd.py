@@ -37,12 +37,12 @@ def objects_to_confirm(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
 
 
 def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether the Application of a domain's folder has applied a commit."""
+    """Return how far the Application of a domain's folder has applied a commit."""
     application = _folder_application(domain)
     name = f"Application {application.namespace}/{application.name}"
     app = objects.get(("Application", *application))
     if app is None:
-        return Health("waiting", "is not there; apply bootstrap/ to the cluster", name)
+        return Health("waiting", "does not exist; apply bootstrap/ to the cluster", name)
     if any(history.includes(revision, commit) for revision in _applied_commits(app)):
         return Health("reconciled")
     waiting = "has not applied the commit yet"
@@ -55,7 +55,7 @@ def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history:
 
 
 def release_health(target: Target, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether a release of an applied commit runs, or is removed if unwanted."""
+    """Return how far an applied commit has started a release, or removed it if unwanted."""
     if not target.wanted:
         return _removal_health(target, objects)
     if not target.by_helm:
@@ -63,7 +63,7 @@ def release_health(target: Target, commit: str, objects: Objects, history: Histo
     name = f"Application {target.domain.namespace}/{target.name}"
     app = objects.get(("Application", target.domain.namespace, target.name))
     if app is None:
-        return Health("reconciled", "is not there yet", name)
+        return Health("reconciled", "does not exist yet", name)
     if app["metadata"].get("deletionTimestamp"):
         return Health("reconciled", "is being removed and will then be created again", name)
     outdated = _why_outdated(target.domain, app, commit, objects, history)
@@ -149,7 +149,7 @@ def _synced_health(app: Object, name: str, objects: Objects) -> Health:
             continue
         key = ("Deployment", str(item.get("namespace", "")), str(item.get("name", "")))
         if key not in objects:
-            return Health("reconciled", "is not there yet", f"Deployment {key[1]}/{key[2]}")
+            return Health("reconciled", "does not exist yet", f"Deployment {key[1]}/{key[2]}")
         health = deployment_health(objects[key])
         if health.state != "healthy":
             return health

@@ -23,11 +23,11 @@ def deployment_health(deployment: Object) -> Health:
 
 
 def client_health(target: Target, objects: Objects) -> Health:
-    """Return whether a communication client runs; its Deployment decides."""
+    """Return the health of a communication client, from its Deployment."""
     namespace = target.domain.namespace
     deployment = objects.get(("Deployment", namespace, target.name))
     if deployment is None:
-        return Health("reconciled", "is not there yet", f"Deployment {namespace}/{target.name}")
+        return Health("reconciled", "does not exist yet", f"Deployment {namespace}/{target.name}")
     return deployment_health(deployment)
 
 

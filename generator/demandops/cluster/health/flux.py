@@ -34,11 +34,11 @@ def objects_to_confirm(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
 
 
 def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether a domain's Kustomization has applied a commit."""
+    """Return how far a domain's Kustomization has applied a commit."""
     kustomization = objects.get(("Kustomization", domain.namespace, domain.name))
     name = f"Kustomization {domain.namespace}/{domain.name}"
     if kustomization is None:
-        return Health("waiting", "is not there; apply bootstrap/ to the cluster", name)
+        return Health("waiting", "does not exist; apply bootstrap/ to the cluster", name)
     status = kustomization.get("status") or {}
     reached = _commit(status.get("lastAppliedRevision"))
     if reached and history.includes(reached, commit):
@@ -56,7 +56,7 @@ def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history:
 
 
 def release_health(target: Target, commit: str, objects: Objects, history: History) -> Health:
-    """Return whether a release of an applied commit runs, or is removed if unwanted."""
+    """Return how far an applied commit has started a release, or removed it if unwanted."""
     if not target.wanted:
         return _removal_health(target, objects)
     if not target.by_helm:
@@ -64,7 +64,7 @@ def release_health(target: Target, commit: str, objects: Objects, history: Histo
     release = objects.get(("HelmRelease", target.domain.namespace, target.name))
     name = f"HelmRelease {target.domain.namespace}/{target.name}"
     if release is None:
-        return Health("reconciled", "is not there yet", name)
+        return Health("reconciled", "does not exist yet", name)
     status = release.get("status") or {}
     ready = condition(status, "Ready")
     current = status.get("observedGeneration") == release["metadata"].get("generation")

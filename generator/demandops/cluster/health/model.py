@@ -57,8 +57,9 @@ class Target:
 class Health:
     """The state of a domain or a release.
 
-    ``reason`` says why it is not further, if possible in the controller's words. ``object`` is the
-    object that the reason comes from. ``failing`` says whether the reason is a failure.
+    ``reason`` says why it has not reached the next level, if possible in the controller's words.
+    ``object`` is the object that the reason comes from. ``failing`` says whether the reason is a
+    failure.
     """
 
     state: State
@@ -103,13 +104,13 @@ class HealthReader(Protocol):
     def domain_health(
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return whether a commit is applied in a domain."""
+        """Return how far a domain has applied a commit."""
         ...
 
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return whether a release of an applied commit runs, or is removed if unwanted."""
+        """Return how far an applied commit has started a release, or removed it if unwanted."""
         ...
 
     def last_transition(self, target: Target, objects: Objects) -> str:

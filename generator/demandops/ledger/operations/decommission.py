@@ -80,7 +80,7 @@ def _without_node(claim: Claim, node: str, now: datetime) -> Claim | None:
 
 
 def _nothing_held(ledger: Ledger, leaving: DecommissionTarget) -> Fault:
-    """Return the fault that nothing is held. A similar name helps to find a typo."""
+    """Return the fault for a name without claims; it suggests a similar name."""
     names = [ledger.indexed_names("requester")] if "requester" in leaving.kinds else []
     names += (
         [ledger.indexed_names("node"), ledger.indexed_names("link")]

@@ -1,4 +1,4 @@
-"""A put: a demand that names itself becomes what the request lists."""
+"""A put: replaces the claims of a demand that names itself by what the request lists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A shutdown: which claims it means, and what remains of them."""
+"""A shutdown: which claims it matches, and what remains of them."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _listed(request: DemandRequest) -> Iterator[tuple[Subject, Demanded]]:
 
 
 def _matching_claim(claims: Iterable[Claim], request: str, listed: Demanded) -> Claim | None:
-    """Return the claim that a shutdown means, or ``None`` if that is not certain."""
+    """Return the claim that a shutdown matches, or ``None`` if none or several could match."""
     claims = [claim for claim in claims if _same_ends(claim, listed)]
     requesters = set(listed.requesters)
     own_id = demand_id(request, requesters)
@@ -141,7 +141,7 @@ def _subtract_topics(
 
 
 def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
-    """Return the fault of a shutdown that matches no claim. Similar claims help to find a typo."""
+    """Return the fault for a shutdown that matches no claim; it suggests similar claims."""
     near = [
         f"{claim.subject} for {', '.join(claim.requesters)} (request '{claim.request}')"
         for subject, _ in _listed(request)

@@ -15,7 +15,7 @@ from demandops.config.policy import matches
 from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
-from demandops.plan.overrides.effects import apply_effects, effects_on
+from demandops.plan.overrides.release_overrides import apply_effects, effects_on
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import affected_keys

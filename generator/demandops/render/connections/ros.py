@@ -72,12 +72,12 @@ def _all(end: RosEnd) -> list[Route]:
 
 
 def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
-    """Return the routes by which one participant sends to the other and not back."""
+    """Return the routes that let only one participant send to the other."""
     return [{"src": sender, "dst": [receiver]}, {"src": receiver}]
 
 
 def _qos(route: Route, *, reads: bool) -> dict[str, Any]:
-    """Return a topic's settings; the reading end limits the rate, before the link."""
+    """Return a topic's settings; the end that reads the topic limits its rate, before the link."""
     qos: dict[str, Any] = {}
     if route.reliability:
         qos["reliability"] = route.reliability == "reliable"

@@ -1,4 +1,4 @@
-"""The proposals that await approval, and what becomes of them.
+"""The proposals that await approval, and how each one ends.
 
 Belongs to the worker thread. A proposal is complete once main has its claims, however they got
 there. Until then its branch is kept up to date: merging it must give what main would render.
@@ -41,9 +41,9 @@ log = logging.getLogger("demandops")
 
 CHECK_EMBEDDED_S = 1.0
 CHECK_REMOTE_S = 5.0
-"""Between two checks of the branches, because nothing else shows that one was deleted."""
+"""The interval between checks of the branches; only a check shows that one was deleted."""
 _PAUSE_FACTOR = 9
-"""Each check is followed by a pause nine times as long, so checks take a tenth of the time."""
+"""The pause after a check, as a multiple of its duration: checks take a tenth of the time."""
 
 _UNFINISHED = "unfinished"
 

@@ -1,7 +1,7 @@
 """Keeps the branches and pull requests of proposals up to date while main moves on.
 
-Belongs to the worker thread. What becomes of a proposal is decided in
-:mod:`demandops.service.approvals.approvals`.
+Belongs to the worker thread. :mod:`demandops.service.approvals.approvals`
+decides how a proposal ends.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class BranchSync:
 
     def _mark_edited(self, proposal: Proposal) -> None:
         if not proposal.edited:
-            log.info("%s has commits by a person and is left as it is", proposal.branch)
+            log.info("%s has commits by a person and stays unchanged", proposal.branch)
         proposal.edited = True
 
     def _decide(

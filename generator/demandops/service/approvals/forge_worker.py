@@ -20,7 +20,7 @@ from demandops.settings import MAIN_BRANCH
 log = logging.getLogger("demandops")
 
 POLL_S = 30.0
-"""Between two queries for the state of each pull request: closing one does not touch its branch."""
+"""The interval between queries for pull requests; a branch does not show that one was closed."""
 
 
 @dataclass(frozen=True, slots=True)

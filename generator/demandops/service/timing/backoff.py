@@ -12,7 +12,7 @@ FIRST_PAUSE_S = 0.05
 LONGEST_AWAY_S = 10.0
 """The longest delay while the remote cannot be reached."""
 LONGEST_TURN_S = 0.4
-"""The longest delay after another writer was first. Short: who waits long loses again."""
+"""The longest delay after another writer was first; a writer that waits long loses again."""
 LIMIT_EMBEDDED = 20
 LIMIT_REMOTE = 200
 """How many demands to publish together: a push costs some 50 ms, moving a branch less than one."""

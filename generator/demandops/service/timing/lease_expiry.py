@@ -1,8 +1,8 @@
-"""Which leases have ended, by a clock that somebody may set.
+"""Which leases have ended, by a clock that a person may set.
 
 A clock that is set back only delays a release. A clock that jumps forward would end leases that
-were renewed in time, so after a jump every lease gets its full term again. A machine that was
-asleep looks the same and is treated alike.
+were renewed in time, so after a jump every lease gets its full term again. A machine that
+was asleep looks the same, so its leases get their full term too.
 """
 
 from __future__ import annotations

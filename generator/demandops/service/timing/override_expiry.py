@@ -23,15 +23,15 @@ class OverrideExpiry:
         self._failed: dict[tuple[str, datetime], datetime] = {}
         self._not_before: datetime | None = None
 
-    def end_due(self, line: CommitBatch, now: datetime) -> None:
+    def end_due(self, commits: CommitBatch, now: datetime) -> None:
         """Commit the end of each expired override; one whose end fails is tried again later."""
-        for override in expired_overrides(line.head.state.config, now):
+        for override in expired_overrides(commits.head.state.config, now):
             tried = self._failed.get((override.name, override.end or now))
             if tried is not None and now < tried + _RETRY:
                 continue
             try:
-                line.end_override(override, now)
-                log.info("%s ended at its time, %s", override.path, override.expires)
+                commits.end_override(override, now)
+                log.info("%s ended as planned at %s", override.path, override.expires)
             except InvalidInput as error:
                 self._failed[override.name, override.end or now] = now
                 for problem in error.faults:
@@ -42,7 +42,7 @@ class OverrideExpiry:
         self._not_before = now + _RETRY
 
     def is_due(self, config: Config, now: datetime) -> bool:
-        """Return whether an override is to be ended now."""
+        """Return whether to end an override now."""
         return any(time <= now for time in self._due_times(config))
 
     def seconds_until_due(self, config: Config, now: datetime, longest: float) -> float:

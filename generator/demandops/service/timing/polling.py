@@ -17,7 +17,7 @@ DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
 _SHORTEST_GAP_S = 0.5
 _EMBEDDED_S = 1.0
-"""The longest interval for a repository on this disk, where a check reads one file."""
+"""The longest interval for a repository on this disk, because a check reads only one file."""
 
 
 def parse_interval(text: str) -> float:

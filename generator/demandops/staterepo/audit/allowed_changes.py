@@ -1,7 +1,7 @@
 """What a commit of the generator may change: generated files, and claims that its message names.
 
 Part of proving a commit (:mod:`demandops.staterepo.audit.verification`). Reads only files and
-messages; knows nothing of releases.
+messages, and does not know releases.
 """
 
 from __future__ import annotations

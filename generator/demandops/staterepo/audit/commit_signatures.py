@@ -27,7 +27,7 @@ _CONFIG = ("-c", "gpg.ssh.program=ssh-keygen", "-c", "gpg.minTrustLevel=undefine
 
 
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Return the verdicts with the result for each commit's signature."""
+    """Return the verdicts with the check of each commit's signature added."""
     verdicts = list(verdicts)
     lists: dict[str, list[str]] = {}
     signatures = {}

@@ -1,9 +1,9 @@
 """Proving commits: the generated files are those that ledger and configuration give.
 
 A commit is proven whole (everything is loaded and rendered) or by its differences from the commit
-proven before it. The second way trusts object ids, and that planning and rendering are functions.
-It does not trust which releases the generator considered affected: it plans and renders every
-release again if any input of its plan changed (:mod:`demandops.plan.incremental_plan`), and
+proven before it. The second way relies on object ids, and on plans and files that depend on their
+input only. It does not trust which releases the generator considered affected: it plans and renders
+every release again if any input of its plan changed (:mod:`demandops.plan.incremental_plan`), and
 compares every file that differs in Git. The first and the last commit are proven whole.
 """
 
@@ -146,7 +146,7 @@ class _Unreadable(Exception):
 
 
 class _Proofs:
-    """The proofs of successive commits."""
+    """Proves commits one after the other."""
 
     def __init__(self, repo: Repository) -> None:
         self._repo = repo
@@ -156,7 +156,7 @@ class _Proofs:
         """Return the files of a commit that differ from what was rendered.
 
         Args:
-            whole: reuse nothing from another commit.
+            whole: do not reuse results of another commit.
 
         Raises:
             _Unreadable, InvalidInput: the commit cannot be read or rendered.

@@ -1,6 +1,7 @@
 """The state repo that a writer uses: Git objects, and a tip that only moves forward.
 
-There are two kinds, on this disk and behind a URL; :mod:`demandops.staterepo.git.connect` chooses.
+There are two kinds, on this disk and behind a URL;
+:mod:`demandops.staterepo.git.repository_choice` chooses.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Who is behind a change: the commits by people, and who runs this program.
+"""Authors: the commits by people, and the person who runs this program.
 
 A follow commit renders what people committed; it names their commits and has them as author.
 A commit is by a person if no generator made it, on any machine.
@@ -128,7 +128,7 @@ def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Sig
 
 
 def operator() -> str:
-    """Return ``name <email>`` of who runs this program, or an empty text if git does not know."""
+    """Return ``name <email>`` of the person who runs this program; empty if git does not know."""
     try:
         ident = git.Git().execute(
             ["git", "-c", "user.useConfigOnly=true", "var", "GIT_AUTHOR_IDENT"]
@@ -139,7 +139,7 @@ def operator() -> str:
 
 
 def git_user(repo: Repository) -> tuple[str, str]:
-    """Return name and e-mail address of who runs this program, from git or else the login."""
+    """Return the name and e-mail address of this program's user, from git or else the login."""
     settings = repo.config.snapshot()
     try:
         login = getpass.getuser()

@@ -67,7 +67,7 @@ def snapshot_at(repo: Repository, commit: Commit, record: LogEntry) -> Snapshot:
         lambda path: None,
     )
     # placeholder: advancing to later commits finds the real problems again
-    problems = snapshot.problems or (Fault("invalid", "", "is to be checked again"),)
+    problems = snapshot.problems or (Fault("invalid", "", "must be checked again"),)
     return replace(
         snapshot,
         other_config_source=source,

@@ -32,7 +32,7 @@ Replacements = Mapping[str, Oid | None]
 
 @dataclass(frozen=True, slots=True)
 class ConfigSource:
-    """Where the configuration in effect is: the files of a commit, some in another version."""
+    """The source of the configuration in effect: a commit, with some files in another version."""
 
     commit: Oid
     replacements: Replacements = field(default_factory=dict)

@@ -38,7 +38,7 @@ class Snapshot:
     ``problems``: what is not valid; the last valid versions are in effect instead.
     ``last_valid_commit``: the newest commit without problems.
     ``quarantined_files``: ledger files whose content at this commit is not in effect.
-    ``other_config_source``: where the configuration in effect is, if not in this commit.
+    ``other_config_source``: the source of the configuration in effect, if not this commit.
     """
 
     commit: Oid
@@ -51,7 +51,7 @@ class Snapshot:
 
     @property
     def config_source(self) -> ConfigSource:
-        """Where the configuration in effect is."""
+        """The source of the configuration in effect."""
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
@@ -71,14 +71,14 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Advance:
-    """A later snapshot, and the subjects that changed on the way to it."""
+    """A later snapshot, and the subjects that changed since the earlier one."""
 
     snapshot: Snapshot
     subjects: tuple[Subject, ...]
     config_changed: bool
 
     def followed_by(self, further: Advance) -> Advance:
-        """Return both steps as one; ``further`` starts where this one ends."""
+        """Return this advance and the next one, ``further``, as one."""
         return Advance(
             further.snapshot,
             tuple(dict.fromkeys((*self.subjects, *further.subjects))),

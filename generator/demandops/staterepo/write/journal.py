@@ -64,8 +64,8 @@ class Journal:
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Remove demands that are published, refused or withdrawn.
 
-        Fsynced only if ``durably``: the next :meth:`append` does it, and before that no demand
-        exists that replaying these could harm.
+        Fsynced only if ``durably``: without a later demand it is harmless to replay these, and the
+        :meth:`append` of a later demand fsyncs them too.
         """
         for operation in operations:
             if self.pending.pop(operation, None) is not None:
@@ -144,7 +144,7 @@ class Slot:
                 self.folder, self._lock = folder, lock
                 break
         else:
-            raise OSError(f"{_MAX_SLOTS} processes use {root} already")
+            raise OSError(f"{_MAX_SLOTS} processes already use {root}")
         self.journal = Journal(self.folder / "outbox.jsonl")
         self._adopt_orphans(root)
 

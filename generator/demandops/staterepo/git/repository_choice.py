@@ -22,7 +22,7 @@ def connect(
 
     Args:
         address: a folder with a bare repository, or any URL that git clones.
-        folder: where the clone of a URL is kept.
+        folder: the folder for the clone of a URL.
         notify: called with a text before work that takes a while.
         allow_offline: use an existing clone if its remote cannot be reached.
 
