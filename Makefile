@@ -9,7 +9,7 @@ SYSTEM := system-demo system-test system-e2e system-e2e-argocd
 GO     := 1.26
 GO_DIR := build/go-$(GO)
 # Slow, and seldom broken: they build the packages that users install.
-PACKAGE_TESTS := tests/ros/test_colcon.py tests/integration/test_wheel.py
+PACKAGE_TESTS := tests/packages
 # Tests and the demo talk on this machine only.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 

@@ -206,7 +206,7 @@ def commits(repo: Path, revisions: str = "main") -> list[Commit]:
     return [commit for commit in found if commit.parents]
 
 
-def tip(repo: Path) -> str:
+def tip(repo: Path | str) -> str:
     """Return the newest commit of main."""
     return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)
 

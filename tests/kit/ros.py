@@ -1,4 +1,4 @@
-"""ROS in tests: a domain of one's own, `demandops serve` as a process, and an action client."""
+"""ROS in tests: a ROS domain, `demandops serve` as a process, and an action client."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import random
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import time
 import uuid
@@ -43,7 +44,7 @@ _LAST = 100
 
 @contextmanager
 def reserved() -> Iterator[int]:
-    """Hold a domain that nobody on this machine uses, and talk on this machine only."""
+    """Reserve a ROS domain that is not in use, and talk on this machine only."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     domains = list(range(1, _LAST + 1))
     random.shuffle(domains)
@@ -61,7 +62,7 @@ def reserved() -> Iterator[int]:
 
 
 def _is_free(domain: int) -> bool:
-    """Tell whether nobody listens where the domain's first participant would."""
+    """Return whether the port of the domain's first participant is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("", 7400 + 250 * domain + 10))
@@ -78,8 +79,10 @@ class Served:
     state_repo: str
     log: Path
     environment: dict[str, str]
+    domain: int
 
     def demandops(self, *args: str) -> str:
+        """Run a command on the state repo in this process and return its output."""
         with redirect_stdout(io.StringIO()) as printed:
             assert run([*args, "--state-repo", self.state_repo]) == 0
         return printed.getvalue()
@@ -96,9 +99,41 @@ class Served:
 Serve = Callable[..., Served]
 
 
+class Servers:
+    """Starts `demandops serve` in one ROS domain."""
+
+    def __init__(self, folder: Path, domain: int, **environment: str) -> None:
+        self._folder, self._domain = folder, domain
+        self._environment = environment
+        self._started: list[Served] = []
+
+    def start(self, state_repo: str, *args: str) -> Served:
+        log = self._folder / f"node-{len(self._started)}.log"
+        command = [sys.executable, "-m", "demandops.cli.main", "serve", "--state-repo", state_repo]
+        environment = {
+            **os.environ,
+            "ROS_DOMAIN_ID": str(self._domain),
+            "ROS_LOG_DIR": str(self._folder / "ros-log"),
+            **self._environment,
+        }
+        with log.open("w") as sink:
+            process = subprocess.Popen(
+                [*command, *args], env=environment, stdout=sink, stderr=subprocess.STDOUT, text=True
+            )
+        self._started.append(Served(process, state_repo, log, environment, self._domain))
+        return self._started[-1]
+
+    def kill(self) -> None:
+        """Kill those that still run."""
+        for served in self._started:
+            if served.process.poll() is None:
+                served.process.kill()
+                served.process.wait(10)
+
+
 @dataclass
 class Sent:
-    """A goal under way, and what was heard of it."""
+    """A goal that was sent, and what the server has answered so far."""
 
     handle: Any = None
     accepted: bool | None = None
@@ -132,22 +167,22 @@ class Client:
         self.node.create_subscription(
             DeploymentRequest.Impl.FeedbackMessage,
             f"{action}/_action/feedback",
-            self._hear,
+            self._on_feedback,
             DEEP_QOS,
         )
 
     def wait(self, condition: Callable[[], bool], seconds: float = DEADLINE_S) -> None:
-        """Spin until something holds; fail the test where it does not in time."""
+        """Spin until a condition holds; fail the test if it does not in time."""
         end = time.monotonic() + seconds
         while not condition():
-            assert time.monotonic() < end, "the client waited in vain"
+            assert time.monotonic() < end, "the condition did not hold in time"
             self._executor.spin_once(timeout_sec=0.05)
 
     def ready(self) -> None:
         self.wait(self._client.server_is_ready)
 
     def send(self, goal: dict[str, Any]) -> Sent:
-        """Send a goal; what is heard of it arrives while the client waits for something."""
+        """Send a goal; its answers arrive while the client waits for a condition."""
         sent, id = Sent(), uuid.uuid4().bytes
         self._sent[id] = sent
         future = self._client.send_goal_async(
@@ -156,10 +191,10 @@ class Client:
         future.add_done_callback(lambda done: self._on_response(sent, done.result()))
         return sent
 
-    def _hear(self, told: Any) -> None:
-        sent = self._sent.get(bytes(told.goal_id.uuid))
+    def _on_feedback(self, message: Any) -> None:
+        sent = self._sent.get(bytes(message.goal_id.uuid))
         if sent is not None:
-            sent.feedback.append(told.feedback.message)
+            sent.feedback.append(message.feedback.message)
 
     def _on_response(self, sent: Sent, handle: Any) -> None:
         sent.handle, sent.accepted = handle, handle.accepted
@@ -174,7 +209,7 @@ class Client:
         sent.status = STATUS[answer.status]
 
     def cancel(self, sent: Sent) -> bool:
-        """Ask to cancel; tell whether the server agreed."""
+        """Cancel a goal; return whether the server agreed."""
         future = sent.handle.cancel_goal_async()
         self.wait(future.done)
         return bool(future.result().goals_canceling)

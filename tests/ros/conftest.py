@@ -1,54 +1,40 @@
-"""A node as people run it, and a client: real processes, real rclpy, a ROS graph of their own."""
+"""Nodes as people run them, and clients: real processes, real rclpy, ROS graphs of their own."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import yaml
+from demandops_ros import DemandClient, DemandError
 
-from tests.kit.repo import init
-from tests.kit.ros import Client, Serve, Served, reserved
+from tests.kit import sync
+from tests.kit.repo import POLICY, GitRepo, init, read
+from tests.kit.ros import Client, Serve, Served, Servers, reserved
+
+APPDEFS = Path(__file__).parents[1] / "appdefs"
 
 
 @pytest.fixture(scope="session")
 def ros_domain() -> Iterator[int]:
-    """A ROS domain for this test process, so that nothing else answers."""
+    """A ROS domain for the nodes of single tests, so that nothing else answers."""
     with reserved() as domain:
         yield domain
 
 
 @pytest.fixture
-def serve(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Serve]:
+def serve(
+    tmp_path: Path, data_home: Path, ros_domain: int, new_repo: Callable[[str], Path]
+) -> Iterator[Serve]:
     """Start nodes, and end those that a test leaves running."""
-    started: list[Served] = []
-    environment = {
-        **os.environ,
-        "ROS_DOMAIN_ID": str(ros_domain),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_LOG_DIR": str(tmp_path / "ros-log"),
-    }
+    servers = Servers(tmp_path, ros_domain)
 
-    def start(state_repo: str | None = None, *args: str) -> Served:
-        if state_repo is None:
-            state_repo = str(init(tmp_path / "state.git"))
-        log = tmp_path / f"node-{len(started)}.log"
-        command = [sys.executable, "-m", "demandops.cli.main", "serve", "--state-repo", state_repo]
-        with log.open("w") as sink:
-            process = subprocess.Popen(
-                [*command, *args], env=environment, stdout=sink, stderr=subprocess.STDOUT, text=True
-            )
-        started.append(Served(process, state_repo, log, environment))
-        return started[-1]
+    def start(state_repo: str | Path | None = None, *args: str) -> Served:
+        return servers.start(str(state_repo or new_repo("state.git")), *args)
 
     yield start
-    for served in started:
-        if served.process.poll() is None:
-            served.process.kill()
-            served.process.wait(10)
+    servers.kill()
 
 
 @pytest.fixture
@@ -56,3 +42,61 @@ def client(ros_domain: int) -> Iterator[Client]:
     made = Client(ros_domain)
     yield made
     made.close()
+
+
+# ---- one node for all tests that leave it as it is ----
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A node that serves many tests, each with ids of its own.
+
+    Its state repo has a third type of application and a rule.
+    """
+    folder = tmp_path_factory.mktemp("shared")
+    bare = init(folder / "state.git")
+    sync.force_in(bare, False)
+    policy = yaml.safe_load(read(bare, POLICY))
+    rule = {"name": "known", "requesters": ["vehicle*", "station*", "r*"]}
+    policy["domains"][0] |= {"rules": [rule]}
+    GitRepo(bare).commit(_recorder(bare) | {POLICY: yaml.safe_dump(policy)})
+    with reserved() as domain:
+        servers = Servers(folder, domain, DEMANDOPS_DATA_HOME=str(folder / "home"))
+        yield servers.start(str(bare))
+        servers.kill()
+
+
+def _recorder(bare: Path) -> dict[str, str | None]:
+    """Return the files that add the recorder to a state repo: YAML and charts, no code."""
+    charts, images = "registry/charts.yaml", "registry/images.yaml"
+    files: dict[str, str | None] = {
+        f"appdefs/{path.relative_to(APPDEFS).as_posix()}": path.read_text()
+        for path in sorted((APPDEFS / "recorder").rglob("*"))
+        if path.is_file()
+    }
+    chart = "  recorder:\n    folder: appdefs/recorder/charts/recorder\n    version: 0.1.0\n"
+    image = "  {0}:\n    repository: ghcr.io/example/{0}\n    tag: v1\n"
+    added = "".join(image.format(name) for name in ("driver", "recorder"))
+    return files | {charts: read(bare, charts) + chart, images: read(bare, images) + added}
+
+
+@pytest.fixture(scope="session")
+def caller(shared: Served) -> Iterator[Client]:
+    """A client of the shared node for the reference's action."""
+    made = Client(shared.domain)
+    made.ready()
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="session")
+def vehicle(shared: Served) -> Iterator[DemandClient]:
+    """A client of the shared node for DemandOps' own action.
+
+    The node has answered it once. Before, it may not have discovered the client: the answer to a
+    goal is then lost, the client sends the goal again, and a demand is ``unchanged``.
+    """
+    with DemandClient("vehicle00", domain_id=shared.domain) as made:
+        with pytest.raises(DemandError, match="not-held"):
+            made.renew("nothing")
+        yield made

@@ -1,4 +1,4 @@
-"""Our own action over real ROS 2: the client library, leases, the latched topic, the command."""
+"""DemandOps' own action over real ROS 2: client library, leases, latched topic, command line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,17 +16,16 @@ import yaml
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops_interfaces.action import Demand
 from demandops_interfaces.msg import Bookkeeping
-from demandops_ros import DemandClient, DemandError
+from demandops_ros import DemandClient, DemandError, client
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
-from tests.kit.repo import GitRepo, git
-from tests.kit.repo import init as new_state_repo
-from tests.kit.repo import read as text
-from tests.kit.ros import Serve
+from tests.kit.cli import Run
+from tests.kit.generator import wait_until
+from tests.kit.repo import POLICY, GitRepo, git, tip
+from tests.kit.ros import Served
 
-APPDEFS = Path(__file__).parent.parent / "appdefs"
 POINTS = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 RECORDER: dict[str, Any] = {
     "id": "edge/record",
@@ -36,218 +34,194 @@ RECORDER: dict[str, Any] = {
     "inputs": {"point_cloud": [{"topic": POINTS, "source": "vehicle00"}]},
     "parameters": {"rate": 10, "labels": ["night"]},
 }
-LINK = {
-    "id": "link",
-    "source": "vehicle00",
-    "target": "edge",
-    "topics": [{"source": "/a", "qos": 1, "reverse": True}, {"source": "/b", "target": "/c"}],
-}
 
 
-def with_policy(state_repo: Path, **more: Any) -> None:
-    path = "policy/access-domains.yaml"
-    policy = yaml.safe_load(text(state_repo, path))
-    policy["domains"][0] |= more
-    GitRepo(state_repo).commit({path: yaml.safe_dump(policy)})
+def link(id: str) -> dict[str, Any]:
+    """Return a connection."""
+    topics = [{"source": "/a", "qos": 1, "reverse": True}, {"source": "/b", "target": "/c"}]
+    return {"id": id, "source": "vehicle00", "target": "edge", "topics": topics}
+
+
+def operations(served: Served, since: str) -> list[str]:
+    form = "--format=%(trailers:key=Operation,valueonly)"
+    return git(served.state_repo, "log", "--reverse", form, f"{since}..main").split()
 
 
 @pytest.fixture
-def client(ros_domain: int) -> Iterator[DemandClient]:
-    with DemandClient("vehicle00", domain_id=ros_domain) as made:
-        yield made
+def before(shared: Served) -> str:
+    """The newest commit before a test."""
+    return tip(shared.state_repo)
 
 
-def operations(state_repo: Path) -> list[str]:
-    form = "--format=%(trailers:key=Operation,valueonly)"
-    return git(state_repo, "log", "--reverse", form, "main").split()
-
-
-def wait(condition: Any, what: str, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, f"waited {seconds:g} s for {what}"
-        time.sleep(0.05)
+@pytest.fixture
+def raw(shared: Served) -> Iterator[SingleThreadedExecutor]:
+    """An executor in the domain of the shared node, with a node that is not the client's."""
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=shared.domain)
+    executor = SingleThreadedExecutor(context=context)
+    node = rclpy.create_node("raw", context=context)
+    executor.add_node(node)
+    yield executor
+    executor.shutdown(timeout_sec=1)
+    node.destroy_node()
+    context.try_shutdown()
 
 
 def test_a_third_type_of_application_is_demanded_with_yaml_alone(
-    serve: Serve, client: DemandClient, tmp_path: Path
+    shared: Served, vehicle: DemandClient, before: str
 ) -> None:
-    state = new_state_repo(tmp_path / "state.git")
-    charts, images = "registry/charts.yaml", "registry/images.yaml"
-    folder = "appdefs/recorder/charts/recorder"
-    added = {
-        f"appdefs/{path.relative_to(APPDEFS).as_posix()}": path.read_text()
-        for path in sorted((APPDEFS / "recorder").rglob("*"))
-        if path.is_file()
-    }
-    chart = f"  recorder:\n    folder: {folder}\n    version: 0.1.0\n"
-    added[charts] = text(state, charts) + chart
-    added[images] = text(state, images) + "".join(
-        f"  {name}:\n    repository: ghcr.io/example/{name}\n    tag: v1\n"
-        for name in ("driver", "recorder")
-    )
-    GitRepo(state).commit(added)
-    served = serve(str(state))
     stages: list[str] = []
-    with client.demand(
+    with vehicle.demand(
         "v0/recording", [RECORDER], on_stage=lambda stage, _: stages.append(stage)
-    ) as it:
-        assert it.answer is not None and it.answer.outcome == "booked"
-        assert it.answer.warnings == ()
-        books = served.bookkeeping()
+    ) as held:
+        assert held.answer is not None and held.answer.outcome == "booked"
+        assert held.answer.warnings == ()
+        books = shared.bookkeeping()
         assert {entry["service"] for entry in books["services"].values()} == {"driver", "recorder"}
-        assert list(books["connections"]) == ["derived/vehicle00/edge"]
-        assert books["commit"] == it.commit
-    assert served.bookkeeping()["services"] == {}
-    assert operations(state)[-2:] == ["put", "release"]
+        assert "derived/vehicle00/edge" in books["connections"]
+        assert books["commit"] == held.commit
+    assert shared.bookkeeping()["services"] == {}
+    assert operations(shared, before) == ["put", "release"]
     # an action client may miss feedback at the start, and forgets it once it has the result
     assert stages == [s for s in ("admitted", "booked", "committed", "pushed") if s in stages]
 
 
-def test_a_refusal_names_code_field_and_remedy(serve: Serve, client: DemandClient) -> None:
-    served = serve()
+def test_a_refusal_names_code_field_and_remedy(
+    shared: Served, vehicle: DemandClient, before: str
+) -> None:
     with pytest.raises(DemandError) as caught:
-        client.put("d", [RECORDER | {"type": "recoder", "node": "egde"}])
+        vehicle.put("refused", [RECORDER | {"type": "recoder", "node": "egde"}])
     assert caught.value.code == "unknown-application"
     assert "applications[0].type: 'recoder' is not a known application type" in str(caught.value)
     assert "applications[0].node: 'egde' is not in inventory/nodes.yaml" in str(caught.value)
     with pytest.raises(DemandError) as caught:
-        client.release("d")
+        vehicle.release("refused")
     assert caught.value.code == "not-held"
     with pytest.raises(
         ValueError, match="'node_id' is not a field of an application; did you mean"
     ):
-        client.put("d", [{"node_id": "edge"}])
-    assert client.put("d", connections=[LINK]).outcome == "booked"
-    assert served.bookkeeping()["connections"]["link"]["topics"] == ["/a", "/b"]
+        vehicle.put("refused", [{"node_id": "edge"}])
+    assert tip(shared.state_repo) == before
+    assert vehicle.put("refused", connections=[link("refused")]).outcome == "booked"
+    assert shared.bookkeeping()["connections"]["refused"]["topics"] == ["/a", "/b"]
 
 
-def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(
-    serve: Serve, client: DemandClient
-) -> None:
-    serve()
-    answer = client.put("d", connections=[LINK], answer="healthy")
+def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: DemandClient) -> None:
+    answer = vehicle.put("healthy", connections=[link("healthy")], answer="healthy")
     assert (answer.outcome, answer.reached) == ("booked", "pushed")
     assert answer.warnings == ("answered at pushed: this node has no access to the clusters",)
 
 
-def test_numbers_that_the_message_does_not_define_are_refused_with_their_field(
-    serve: Serve, ros_domain: int
+def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(
+    shared: Served, vehicle: DemandClient, before: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    serve()
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=ros_domain)
-    node = rclpy.create_node("raw", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    raw = ActionClient(node, Demand, DEFAULT_DEMAND_ACTION_NAME)
-    try:
-        assert raw.wait_for_server(60)
-        goal = Demand.Goal(operation=7, demand_id="d", requester_ids=["r"], answer=9)
-        sent = raw.send_goal_async(goal)
-        executor.spin_until_future_complete(sent, 60)
-        done = sent.result().get_result_async()
-        executor.spin_until_future_complete(done, 60)
-        result = done.result().result
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
+    monkeypatch.setattr(client, "_UNHEARD_S", 0.002)
+    answer = vehicle.put("again", connections=[link("again")])
+    assert answer.outcome in ("booked", "unchanged")
+    assert operations(shared, before) == ["put"]
+
+
+def test_numbers_that_the_message_does_not_define_are_refused_with_their_field(
+    raw: SingleThreadedExecutor,
+) -> None:
+    action = ActionClient(raw.get_nodes()[0], Demand, DEFAULT_DEMAND_ACTION_NAME)
+    assert action.wait_for_server(60)
+    goal = Demand.Goal(operation=7, demand_id="d", requester_ids=["r"], answer=9)
+    sent = action.send_goal_async(goal)
+    raw.spin_until_future_complete(sent, 60)
+    done = sent.result().get_result_async()
+    raw.spin_until_future_complete(done, 60)
+    result = done.result().result
+    action.destroy()
     assert result.code == "invalid"
     fields = [line.split(": ")[1] for line in result.message.split("\n")]
     assert {"operation", "answer"} <= set(fields)
 
 
-def test_a_client_that_dies_loses_its_demand_and_one_that_lives_keeps_it(
-    serve: Serve, client: DemandClient, tmp_path: Path
+@pytest.fixture
+def short_leases(shared: Served) -> Iterator[None]:
+    """The domain's leases end after two seconds."""
+    repo = GitRepo(Path(shared.state_repo))
+    text = repo.files(POLICY)[POLICY]
+    policy = yaml.safe_load(text)
+    policy["domains"][0]["leases"] = {"default": "2s", "slack": "0s"}
+    repo.commit({POLICY: yaml.safe_dump(policy)})
+    yield
+    repo.commit({POLICY: text})
+
+
+@pytest.mark.usefixtures("short_leases")
+def test_a_demand_of_a_client_that_died_ends_and_one_that_is_renewed_does_not(
+    shared: Served, vehicle: DemandClient, before: str
 ) -> None:
-    state = new_state_repo(tmp_path / "state.git")
-    with_policy(state, leases={"default": "2s", "slack": "0s"})
-    served = serve(str(state))
-    other = {**LINK, "id": "other"}
-    with client.demand("kept", connections=[LINK]) as kept:
+    def booked() -> set[str]:
+        return {"kept", "left"} & shared.bookkeeping()["connections"].keys()
+
+    with vehicle.demand("kept", connections=[link("kept")]) as kept:
         assert kept.answer is not None and kept.answer.lease_s == 2
-        assert client.put("left", connections=[other]).lease_s == 2
-        wait(lambda: "expire" in operations(state), "the lease of the other to end")
-        books = served.bookkeeping()["connections"]
-        assert list(books) == ["link"], "renewed every third of two seconds"
-    assert served.bookkeeping()["connections"] == {}
+        assert vehicle.put("left", connections=[link("left")]).lease_s == 2
+        wait_until(lambda: "expire" in operations(shared, before), "the lease has ended", 60)
+        assert booked() == {"kept"}, "renewed every third of two seconds"
+    assert booked() == set()
 
 
 def test_the_bookkeeping_is_published_and_latched(
-    serve: Serve, client: DemandClient, ros_domain: int
+    vehicle: DemandClient, raw: SingleThreadedExecutor
 ) -> None:
-    serve()
-    commit = client.put("d", connections=[LINK]).commit
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=ros_domain)
-    node = rclpy.create_node("late", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
+    commit = vehicle.put("latched", connections=[link("latched")]).commit
     heard: list[Any] = []
     qos = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(Bookkeeping, "/demandops/bookkeeping", heard.append, qos)
-    try:
-        end = time.monotonic() + 60
-        while not any(told.commit == commit for told in heard):
-            assert time.monotonic() < end, "nothing is latched"
-            executor.spin_once(0.1)
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
+    raw.get_nodes()[0].create_subscription(Bookkeeping, "/demandops/bookkeeping", heard.append, qos)
+
+    def is_latched() -> bool:
+        raw.spin_once(0.1)
+        return any(message.commit == commit for message in heard)
+
+    wait_until(is_latched, "the commit's bookkeeping is latched", 60)
     books = json.loads(heard[-1].bookkeeping_json)
-    assert books["commit"] == commit and list(books["connections"]) == ["link"]
+    assert books["commit"] == commit and "latched" in books["connections"]
 
 
-def command(*args: str) -> list[str]:
-    return [sys.executable, "-m", "demandops.cli.main", "demand", *args]
-
-
-def test_the_command_line_sends_holds_and_gives_up(serve: Serve, tmp_path: Path) -> None:
-    served = serve()
-    state = Path(served.state_repo)
+def test_the_command_line_sends_holds_and_gives_up(
+    shared: Served,
+    before: str,
+    demandops: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(shared.domain))
     file = tmp_path / "demand.yaml"
-    document = {"apiVersion": "demandops/v1", "kind": "Demand", "demand": "d", "requesters": ["v"]}
-    file.write_text(yaml.safe_dump(document | {"connections": [LINK]}))
-
-    def run(*args: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            command(str(file), *args),
-            check=False,
-            env=served.environment,
-            capture_output=True,
-            text=True,
-            timeout=90,
-        )
-
-    sent = run("--output", "json")
-    assert sent.returncode == 0, sent.stderr
-    assert json.loads(sent.stdout)["outcome"] == "booked"
-    assert run().stdout.startswith("unchanged in ")
-    assert run("--release").stdout.startswith("released in ")
-    gone = run("--release")
-    assert gone.returncode == 1 and "not-held: demand: 'd' holds nothing" in gone.stderr
+    document = {"apiVersion": "demandops/v1", "kind": "Demand", "demand": "typed"}
+    document |= {"requesters": ["vehicle01"], "connections": [link("typed")]}
+    file.write_text(yaml.safe_dump(document))
+    sent = demandops("demand", file, "--output", "json")
+    assert sent.code == 0, sent.err
+    assert sent.json()["outcome"] == "booked"
+    assert demandops("demand", file).out.startswith("unchanged in ")
+    assert demandops("demand", file, "--release").out.startswith("released in ")
+    gone = demandops("demand", file, "--release")
+    assert gone.code == 1 and "not-held: demand: 'typed' holds nothing" in gone.err
     holding = subprocess.Popen(
-        command(str(file), "--hold"),
-        env=served.environment,
+        [sys.executable, "-m", "demandops.cli.main", "demand", str(file), "--hold"],
+        env=shared.environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-    wait(lambda: operations(state)[-1] == "put", "the demand to be held")
+    held = ["put", "release", "put"]
+    wait_until(lambda: operations(shared, before) == held, "the demand is held", 60)
     holding.send_signal(signal.SIGINT)
-    out, told = holding.communicate(timeout=60)
-    assert holding.returncode == 0, told
-    assert out.startswith("booked in ") and told.endswith("released\n")
-    assert operations(state)[-1] == "release"
+    out, err = holding.communicate(timeout=60)
+    assert holding.returncode == 0, err
+    assert out.startswith("booked in ") and err.endswith("released\n")
+    assert operations(shared, before) == [*held, "release"]
 
 
-def test_who_may_not_is_told_which_rule_says_so(
-    serve: Serve, client: DemandClient, tmp_path: Path
-) -> None:
-    state = new_state_repo(tmp_path / "state.git")
-    with_policy(state, rules=[{"name": "stations", "requesters": ["station*"]}])
-    serve(str(state))
-    with pytest.raises(DemandError) as caught:
-        client.put("d", connections=[LINK])
+def test_a_requester_without_permission_is_refused_with_the_rule(shared: Served) -> None:
+    with (
+        DemandClient("stranger", domain_id=shared.domain) as stranger,
+        pytest.raises(DemandError) as caught,
+    ):
+        stranger.put("d", connections=[link("d")])
     assert caught.value.code == "not-allowed"
-    assert "no rule of access domain 'perception' is for 'vehicle00'" in str(caught.value)
+    assert "no rule of access domain 'perception' is for 'stranger'" in str(caught.value)

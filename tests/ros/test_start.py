@@ -1,0 +1,43 @@
+"""What `demandops serve` refuses at its start, with the remedy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.kit.cli import Run
+
+LOG_LEVEL = "parameter log_level is 'loud'; it takes debug, info, warn, error, fatal"
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "message"),
+    [
+        (["--fetch-interval", "often"], 2, "fetch interval: 'often' is not a duration; write one"),
+        (["--ros-args", "-p", "fetch_interval:=-3"], 2, "fetch interval: '-3' is not a duration"),
+        (["--ros-args", "-p", "log_level:=loud"], 2, LOG_LEVEL),
+        (["--webhook", "0.0.0.0:0"], 1, "error: --webhook: '0.0.0.0:0' can be reached from other"),
+        (
+            ["--webhook", "127.0.0.1:0", "--webhook-secret-file", "/nowhere/secret"],
+            1,
+            "error: /nowhere/secret: cannot be read: No such file",
+        ),
+        (["--signing-key", "/no/such/key"], 1, "signing key /no/such/key is not a file"),
+    ],
+)
+def test_what_cannot_be_served_is_refused_with_a_reason(
+    bare: Path, demandops: Run, args: list[str], code: int, message: str
+) -> None:
+    refused = demandops("serve", "--state-repo", bare, *args)
+    assert refused.code == code
+    assert message in " ".join(refused.err.split())
+
+
+def test_a_missing_state_repo_is_refused_with_the_remedy(tmp_path: Path, demandops: Run) -> None:
+    refused = demandops("serve", "--state-repo", tmp_path / "nowhere")
+    assert refused.code == 1
+    assert refused.err == (
+        f"error: {tmp_path}/nowhere does not exist; make a state repo with "
+        f"`demandops init {tmp_path}/nowhere --bare`\n"
+    )
