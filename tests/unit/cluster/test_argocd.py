@@ -128,7 +128,7 @@ BAD = condition("Progressing", "False", "timed out")
 @pytest.mark.parametrize(
     ("child", "made", "state", "reason", "failing"),
     [
-        (None, None, "reconciled", "is not there yet", False),
+        (None, None, "reconciled", "does not exist yet", False),
         (application(NEW), None, "reconciled", "has not been compared yet", False),
         (application(NEW, sync="Synced", at="b"), None, "healthy", "", False),
         # Healthy as it was before the change
@@ -145,7 +145,7 @@ BAD = condition("Progressing", "False", "timed out")
          "its health is Missing", False),
         # what it is made of says more, and sooner
         (application(NEW, sync="Synced", at="b", resources=MADE), None, "reconciled",
-         "is not there yet", False),
+         "does not exist yet", False),
         (application(NEW, sync="Synced", at="b", resources=MADE), deployment("x"), "healthy", "",
          False),
         (application(NEW, sync="Synced", at="b", resources=MADE),

@@ -32,7 +32,7 @@ def release(*conditions: Any, generation: int = 2, observed: int = 2) -> dict[st
 @pytest.mark.parametrize(
     ("found", "state", "reason", "failing"),
     [
-        (None, "waiting", "is not there; apply bootstrap/", False),
+        (None, "waiting", "does not exist; apply bootstrap/", False),
         (kustomization("a", "a"), "waiting", "has not applied the commit yet", False),
         (kustomization("b", "b"), "reconciled", "", False),
         (kustomization("c", "c"), "reconciled", "", False),
@@ -67,7 +67,7 @@ READY = condition("Ready", "True", "installed")
 @pytest.mark.parametrize(
     ("objects", "state", "reason", "failing"),
     [
-        ({}, "reconciled", "is not there yet", False),
+        ({}, "reconciled", "does not exist yet", False),
         ({"r": release()}, "reconciled", "is being installed", False),
         ({"r": release(READY, observed=1)}, "reconciled", "installed", False),
         ({"r": release(condition("Ready", "False", "no lidar"))}, "reconciled", "no lidar", True),
