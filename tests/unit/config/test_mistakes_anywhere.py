@@ -70,7 +70,7 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(
     document = loader.document(file)
     assert loader.faults(file, document) == []
     problems = []
-    for mutation in mutations.mutations(document):
+    for mutation in mutations.mutations(document, form_of(file).limits()):
         found = loader.faults(file, mutation.document)
         if file == DOMAINS:  # an invalid domain has no nodes, which overrides then report too
             found = [one for one in found if one.file == file or "access domain" not in one.message]

@@ -19,6 +19,7 @@ FREE = {"GoalApplication.parameters", "DemandGoal.lease"}
 FREE_PLACES = ("applications[0].parameters", "applications[1].parameters_json")
 ELSEWHERE = {
     "connections[0].source_topics": "connections[0].target_topics",  # one has more topics then
+    "shutdown": "apps[0].header.id",  # the shutdown finds no claim
     "connections[0].type": "connections[0].",  # another type has other rules
     "applications[0].parameters.rate": "parameters.rate",  # when it is merged, without its place
     "applications[1].parameters_json.": "applications[1].parameters.",
@@ -33,7 +34,7 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(valid: Callable[[], Goal], f
     repo = MemoryRepo(rich.rich())
     assert not isinstance(repo.copy().take(valid()), Refused)
     problems = []
-    for mutation in mutations.mutations(valid()):
+    for mutation in mutations.mutations(valid(), form.limits()):
         taken = repo.copy().take(mutation.document)
         place = mutations.path(mutation.place)
         also = tuple(field for start, field in ELSEWHERE.items() if place.startswith(start))
