@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 from demandops import strict_yaml
-from demandops.cli.repo.schema import SCHEMAS
 from demandops.config.load import load
 from demandops.errors import Fault, InvalidInput
 
@@ -15,14 +14,7 @@ from tests.kit import mutations, rich
 from tests.kit.mutations import Form
 
 DOMAINS = "policy/access-domains.yaml"
-FORMS = {
-    file.replace("<name>", "object-detection-fusion" if "appdefs" in file else "values"): Form(
-        model.model_json_schema()
-    )
-    for model, file in SCHEMAS.values()
-    if " " not in file
-}
-"""The schema of each file of a state repo."""
+FORMS = {file: Form(model.model_json_schema()) for file, model in rich.CONFIG_MODELS.items()}
 DOCUMENTS = [
     *((rich.rich, file) for file in FORMS),
     *((rich.rich, f"overrides/{name}.yaml") for name in ("hold", "deny", "keep")),

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from demandops.demand.demand_goal import DemandGoal
-from demandops.demand.deployment_request_goal import WireGoal
 from demandops.errors import Refused
 
 from tests.kit import mutations, rich
@@ -14,7 +12,7 @@ from tests.kit.goals import Goal
 from tests.kit.memory import MemoryRepo
 from tests.kit.mutations import Form
 
-REFERENCE, OWN = Form(WireGoal.model_json_schema()), Form(DemandGoal.model_json_schema())
+REFERENCE, OWN = (Form(model.model_json_schema()) for model in rich.GOAL_MODELS)
 FREE = {"GoalApplication.parameters", "DemandGoal.lease"}
 FREE_PLACES = ("applications[0].parameters", "applications[1].parameters_json")
 ELSEWHERE = {

@@ -7,11 +7,11 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from demandops.cli.repo.schema import SCHEMAS
 from demandops.errors import Fault, Refused
 
 from tests.kit.config import edited
 from tests.kit.memory import MemoryRepo
+from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS
 from tests.unit.config import test_config_mistakes as of_config
 from tests.unit.demand import test_refused as of_goals
 from tests.unit.demand import test_wrong_types as of_form
@@ -57,7 +57,7 @@ def _messages(cases: Iterable[tuple[str, Iterable[Fault]]]) -> Iterator[str]:
 
 def _fields() -> Iterator[str]:
     """Yield each field of each file and goal with its JSON schema."""
-    for model, _ in SCHEMAS.values():
+    for model in (*CONFIG_MODELS.values(), *GOAL_MODELS):
         schema = model.model_json_schema()
         for part in (schema, *schema.get("$defs", {}).values()):
             for name, field in part.get("properties", {}).items():
