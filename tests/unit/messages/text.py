@@ -60,6 +60,8 @@ def _fields() -> Iterator[str]:
     for model in (*CONFIG_MODELS.values(), *GOAL_MODELS):
         schema = model.model_json_schema()
         for part in (schema, *schema.get("$defs", {}).values()):
+            if part.get("additionalProperties", True) is False:
+                yield f"{part['title']}: no other fields"
             for name, field in part.get("properties", {}).items():
                 form = {key: value for key, value in field.items() if key != "title"}
                 needed = "required " if name in part.get("required", ()) else ""
