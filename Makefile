@@ -90,6 +90,7 @@ format: setup  ## Format the code and mend what the linter can
 
 golden: setup  ## Write the golden folders anew; review the diff
 	@$(PY) -m tests.golden.write
+	@$(PY) -m tests.unit.messages
 
 bench: setup  ## Measure what a commit costs, beside the floor
 	@$(PY) -m tests.benchmarks.commits

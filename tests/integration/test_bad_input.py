@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.cli.repo.schema import SCHEMAS
+from demandops.cluster.access import AccessFile
 
 from tests.kit.config import FAST, brokers
 from tests.kit.goals import (
@@ -28,7 +30,9 @@ from tests.kit.goals import (
     goal,
     perception,
 )
+from tests.kit.mutations import Form, mutations
 from tests.kit.repo import git
+from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS, own_goal, reference_goal
 
 EXPERIMENT = Path(__file__).parents[2] / "examples" / "experiment"
 
@@ -128,36 +132,20 @@ class TestDefectsOfTheReference:
         ]
 
     @pytest.mark.parametrize(
-        ("asked", "field", "message"),
+        ("asked", "field"),
         [
-            (
-                goal([], [connection(type=0, broker="")]),
-                "connections[0].type",
-                "0 (ROS) needs an image 'dds-router'; add it to registry/images.yaml",
-            ),
-            (
-                goal([], [connection(type=2, broker="")]),
-                "connections[0].type",
-                "2 (ZENOH) needs an image 'zenoh-bridge'; add it to registry/images.yaml",
-            ),
-            (
-                goal([], [connection(type=7)]),
-                "connections[0].type",
-                "7 is not a connection type; known: 0 (ROS), 1 (MQTT), 2 (ZENOH)",
-            ),
-            (
-                goal([application(type=7)]),
-                "apps[0].type",
-                "7 is not a known application type; known: 1 (object-detection-fusion)",
-            ),
+            (goal([], [connection(type=0, broker="")]), "connections[0].type"),
+            (goal([], [connection(type=2, broker="")]), "connections[0].type"),
+            (goal([], [connection(type=7)]), "connections[0].type"),
+            (goal([application(type=7)]), "apps[0].type"),
         ],
         ids=["ROS", "Zenoh", "an unknown connection", "an unknown application"],
     )
     def test_03_a_type_that_is_not_carried_out_is_refused(
-        self, request_json: Send, state: Any, asked: dict[str, Any], field: str, message: str
+        self, request_json: Send, state: Any, asked: dict[str, Any], field: str
     ) -> None:
         before = state.tip
-        assert (field, message) in refused(request_json(asked))
+        assert field in [place for place, _ in refused(request_json(asked))]
         assert state.tip == before
         booked(request_json(perception()))
 
@@ -171,15 +159,12 @@ class TestDefectsOfTheReference:
 
     def test_04_the_content_of_a_request_is_checked(self, request_json: Send) -> None:
         asked = goal([application("..", who=[], node="egde")], [connection(topics=["/a b"])])
-        assert sorted(refused(request_json(asked))) == [
-            ("apps[0].header.id", "'..' holds '..'; choose an id without it"),
-            (
-                "apps[0].header.node_id",
-                "'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",
-            ),
-            (f"{BODY}.requester_ids", "is empty; list at least one requester"),
-            ("connections[0].source_topics[0]", f"'/a b' {ROS_NAMES}"),
-            ("connections[0].target_topics[0]", f"'/a b' {ROS_NAMES}"),
+        assert sorted(field for field, _ in refused(request_json(asked))) == [
+            "apps[0].header.id",
+            "apps[0].header.node_id",
+            f"{BODY}.requester_ids",
+            "connections[0].source_topics[0]",
+            "connections[0].target_topics[0]",
         ]
 
     def test_05_a_shutdown_of_what_does_not_run_creates_nothing(
@@ -219,8 +204,11 @@ class TestDefectsOfTheReference:
         ]
         assert sorted(found) == sorted([CLOUD[0], rear[0]])
 
-    def test_08_text_of_a_demand_reaches_no_shell(self, request_json: Send, state: Any) -> None:
-        evil = "$(touch /tmp/demandops-pwned);`id`'\"{{ 7*7 }}"
+    def test_08_text_of_a_demand_reaches_no_shell(
+        self, request_json: Send, state: Any, tmp_path: Path
+    ) -> None:
+        trace = tmp_path / "trace"
+        evil = f"$(touch {trace});`id`'\"{{{{ 7*7 }}}}"
         booked(request_json(goal([application(evil, who=[evil])], [connection(evil)], id=evil)))
         for text in state.manifests().values():
             for document in yaml.load_all(text, Loader=FAST):
@@ -228,10 +216,10 @@ class TestDefectsOfTheReference:
                     words = [*container.get("command", ()), *container.get("args", ())]
                     assert "-c" not in words
                     assert not [word for word in words if set(word) & set("$`;'\"{}()*")]
-        assert not Path("/tmp/demandops-pwned").exists()
+        assert not trace.exists()
 
     def test_08_a_topic_with_a_command_in_it_is_refused(self, request_json: Send) -> None:
-        topic = "/points$(touch /tmp/demandops-pwned)"
+        topic = "/points$(touch trace)"
         assert refused(request_json(goal([application(clouds=[(topic, "vehicle00")])]))) == [
             (f"{BODY}.pointcloud_topics[0].topic_name", f"'{topic}' {ROS_NAMES}")
         ]
@@ -425,6 +413,26 @@ class TestWhatPeopleBreak:
 class TestRefusals:
     """No commit, nothing lost, the next demand works."""
 
+    @pytest.mark.parametrize(
+        ("valid", "model"), list(zip((reference_goal, own_goal), GOAL_MODELS, strict=True))
+    )
+    def test_a_mistake_anywhere_in_a_goal_changes_nothing(
+        self, request_json: Send, state: Any, data_home: Path, valid: Any, model: Any
+    ) -> None:
+        """A sample; ``tests/unit/demand/test_mistakes_in_goals.py`` tries every mistake."""
+        form, before = Form(model.model_json_schema()), state.tip
+        wrong = [m for m in mutations(valid()) if form.forbids(m.document)]
+        for mutation in wrong[:: len(wrong) // 10]:
+            fields = [field for field, _ in refused(request_json(mutation.document))]
+            assert any(map(mutation.is_at, fields)), (mutation.place, mutation.kind, fields)
+            assert state.tip == before
+        booked(request_json(perception()))
+        assert list(data_home.rglob("outbox.jsonl")), "the journal, which the fixture reads"
+
+    def test_the_schemas_of_files_and_goals_are_the_tried_ones(self) -> None:
+        shown = {model for model, _ in SCHEMAS.values()} - {AccessFile}
+        assert shown == {*CONFIG_MODELS.values(), *GOAL_MODELS}
+
     def test_what_is_refused_does_not_stop_what_comes_after(
         self, request_json: Send, state: Any
     ) -> None:
@@ -460,17 +468,6 @@ class TestRefusals:
         ran = request_json(perception(), other)
         assert [row["outcome"] for row in ran.json()] == ["booked", "refused"]
         assert len(state.commits()) == 2
-
-    def test_faults_of_form_and_content_are_told_together(self, request_json: Send) -> None:
-        asked = goal([application(node="egde", type=300)], [connection("..")])
-        assert sorted(refused(request_json(asked))) == [
-            (
-                "apps[0].header.node_id",
-                "'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",
-            ),
-            ("apps[0].type", "input should be less than or equal to 255, not 300"),
-            ("connections[0].id", "'..' holds '..'; choose an id without it"),
-        ]
 
     @pytest.mark.parametrize("who", ["\\", "\\\\", ".", "<>", '"', "'", "#", "-"])
     def test_a_requester_with_an_odd_name_can_be_the_author_of_a_commit(
@@ -512,6 +509,7 @@ class TestRefusals:
         git(state, "fsck", "--strict", "--full")
 
 
+# the file, and how the message starts: the words of libyaml and pydantic are left out
 ATTACKS: dict[str, tuple[str | bytes, str]] = {
     "empty": ("", "error: no request in {file}\n"),
     "only a comment": ("# nothing\n", "error: no request in {file}\n"),
@@ -558,65 +556,40 @@ ATTACKS: dict[str, tuple[str | bytes, str]] = {
     "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "error: {file}: is not UTF-8 text\n"),
     "a tab": (
         "id: a\n\tapps: []\n",
-        "error: {file}: line 2, column 1: not valid YAML: found a tab character that violates "
-        "indentation\n",
+        "error: {file}: line 2, column 1: not valid YAML: ",
     ),
     "an open quote": (
         'id: "a\n',
-        "error: {file}: line 2, column 1: not valid YAML: found unexpected end of stream\n",
+        "error: {file}: line 2, column 1: not valid YAML: ",
     ),
     "an open bracket": (
         "apps: [\n",
-        "error: {file}: line 2, column 1: not valid YAML: did not find expected node content\n",
+        "error: {file}: line 2, column 1: not valid YAML: ",
     ),
     "a tag of Python": (
-        'id: !!python/object/apply:os.system ["touch /tmp/demandops-pwned"]\n',
-        "error: {file}: line 1, column 5: not valid YAML: could not determine a constructor for "
-        "the tag 'tag:yaml.org,2002:python/object/apply:os.system'\n",
+        'id: !!python/object/apply:os.system ["touch {trace}"]\n',
+        "error: {file}: line 1, column 5: not valid YAML: ",
     ),
     "half of a character": (
         'id: "\\ud800"\n',
-        "error: {file}: line 1, column 8: not valid YAML: found invalid Unicode character escape "
-        "code\n",
+        "error: {file}: line 1, column 8: not valid YAML: ",
     ),
     "a list for a key": (
         "? [a, b]\n: c\n",
         "error: {file}: line 1, column 3: not valid YAML: the key ['a', 'b'] must be text; put it "
         "in quotes\n",
     ),
-    "a number for text": (
-        "id: 5\n",
-        "{file}: request 0 '' refused\n  id: must be text, not 5; put it in quotes\n",
-    ),
     "a number that YAML 1.1 reads into a time": (
         "id: 12:30:45\n",
         "{file}: request 0 '' refused\n  id: must be text, not 45045; put it in quotes\n",
     ),
-    "a truth for text": (
-        "id: yes\n",
-        "{file}: request 0 '' refused\n  id: must be text, not True; put it in quotes\n",
-    ),
     "a number beyond a byte": (
         "connections: [{id: c, type: " + "9" * 4000 + "}]\n",
-        "{file}: request 0 '' refused\n  connections[0].type: input should be less than or equal "
-        "to 255, not " + "9" * 57 + "…\n",
+        "{file}: request 0 '' refused\n  connections[0].type: ",
     ),
     "an infinite number": (
         "connections: [{id: c, type: .inf}]\n",
         "{file}: request 0 '' refused\n  connections[0].type: must be a whole number, not inf\n",
-    ),
-    "a text for a truth": (
-        'shutdown: "yes"\n',
-        "{file}: request 0 '' refused\n  shutdown: must be true or false, not 'yes'\n",
-    ),
-    "a date for a truth": (
-        "shutdown: 2026-01-31\n",
-        "{file}: request 0 '' refused\n  shutdown: must be true or false, not '2026-01-31'\n",
-    ),
-    "a misspelt field": (
-        "shutdwon: true\n",
-        "{file}: request 0 '' refused\n  shutdwon: is not a field here; remove it or correct its "
-        "spelling; did you mean 'shutdown'?\n",
     ),
 }
 
@@ -630,20 +603,20 @@ class TestYamlAttacks:
     ) -> None:
         content, expected = ATTACKS[name]
         file = tmp_path / "request.yaml"
-        file.write_bytes(content if isinstance(content, bytes) else content.encode())
+        if isinstance(content, str):
+            content = content.replace("{trace}", str(tmp_path / "trace")).encode()
+        file.write_bytes(content)
         before = state.tip
         ran = demandops("request", file, "--state-repo", state.path)
         assert (ran.code, ran.out) == (1, "")
-        first, *rest = ran.err.splitlines(keepends=True)
-        wanted, *more = expected.format(file=file).splitlines(keepends=True)
-        assert first == wanted
-        assert set(more) <= set(rest)
+        assert ran.err.startswith(expected.format(file=file))
         assert state.tip == before
-        assert not Path("/tmp/demandops-pwned").exists()
+        assert not (tmp_path / "trace").exists()
 
-    @pytest.mark.parametrize(
-        "content",
-        [
+    def test_whatever_stands_in_a_file_ends_in_a_message(
+        self, demandops: Send, state: Any, tmp_path: Path
+    ) -> None:
+        contents = [
             "~: x\n",
             "5: x\n",
             "true: x\n",
@@ -683,22 +656,20 @@ class TestYamlAttacks:
             "a" * 100_000,
             "? " * 500,
             "\n" * 10_000 + "&a b",
-        ],
-        ids=lambda text: repr(text[:24]),
-    )
-    def test_whatever_stands_in_a_file_ends_in_a_message(
-        self, demandops: Send, state: Any, tmp_path: Path, content: str
-    ) -> None:
+        ]
         file = tmp_path / "request.yaml"
-        file.write_text(content)
-        before, start = state.tip, time.monotonic()
-        ran = demandops("request", file, "--state-repo", state.path)
-        assert (ran.code, ran.out) == (1, ""), ran.err
-        assert str(file) in ran.err
-        assert "fault of" not in ran.err, "it is the user's to mend"
-        assert len(ran.err) < 5000, "a message that nobody reads"
-        assert state.tip == before
-        assert time.monotonic() - start < 5
+        before = state.tip
+        for content in contents:
+            file.write_text(content)
+            start = time.monotonic()
+            ran = demandops("request", file, "--state-repo", state.path)
+            taken_s, shown = time.monotonic() - start, repr(content[:24])
+            assert (ran.code, ran.out) == (1, ""), (shown, ran.err)
+            assert str(file) in ran.err, shown
+            assert "fault of" not in ran.err, f"{shown} is the user's to mend"
+            assert len(ran.err) < 5000, f"{shown}: a message that nobody reads"
+            assert state.tip == before, shown
+            assert taken_s < 5, shown
 
     @pytest.mark.parametrize("bracket", ["[]", "{}"])
     def test_brackets_without_end_crash_nothing(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jsonschema_rs
@@ -59,11 +59,15 @@ class Mutation(NamedTuple):
         return names
 
 
-def mutations(document: Any) -> Iterator[Mutation]:
-    """Yield the document with each mistake at each place."""
+def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
+    """Yield the document with each mistake at each place; ``limits`` replace whole numbers."""
     for place in places(document):
         value = _at(document, place)
         wrong = {kind: new for kind, new in _WRONG_TYPES.items() if kind != _SAME.get(type(value))}
+        if isinstance(value, bool):
+            wrong["the opposite"] = not value
+        elif isinstance(value, int):
+            wrong |= {f"{limit}": limit for limit in limits}
         if isinstance(value, str):
             wrong |= {"reversed text": f"{value}\u202eb", "a bell": f"{value}\ab"}
         else:
@@ -83,6 +87,11 @@ def mutations(document: Any) -> Iterator[Mutation]:
             renamed = {k if k != place[-1] else "Zz?": v for k, v in holder.items()}
             changed, now = _replaced(document, place[:-1], renamed), (*place[:-1], "Zz?")
             yield Mutation(place, "misspelt", changed, value, now)
+            own = re.sub("[A-Z]", lambda capital: f"_{capital[0].lower()}", place[-1])
+            if own != place[-1]:
+                renamed = {k if k != place[-1] else own: v for k, v in holder.items()}
+                changed, now = _replaced(document, place[:-1], renamed), (*place[:-1], own)
+                yield Mutation(place, "the program's own name", changed, value, now)
 
 
 def places(document: Any, place: Place = ()) -> Iterator[Place]:
@@ -123,6 +132,11 @@ def _is_around(field: str, place: str) -> bool:
     return (long.startswith(short) and (long[len(short) :] or ".")[0] in ".[") or not short
 
 
+def places_of_faults(faults: Iterable[Fault]) -> list[str]:
+    """Return the field of each fault, with its code unless that is the usual one."""
+    return [one.field + (f" [{one.code}]" if one.code != "invalid" else "") for one in faults]
+
+
 def problem(
     mutation: Mutation, faults: Sequence[Fault], form: Form, *, free: Container[str], file: str = ""
 ) -> str:
@@ -137,6 +151,8 @@ def problem(
     in_free = any(path(mutation.place[:end]) in free for end in range(1, len(mutation.place) + 1))
     if not here and (form.forbids(mutation.document) or (control and not in_free)):
         return f"{place}, {mutation.kind}: no fault there, but {[*map(str, faults)]}"
+    if any(" instance of " in found.message for found in here):
+        return f"{place}, {mutation.kind}: words of Python in {[*map(str, here)]}"
     names = mutation.names()
     astray = [
         str(found)
@@ -160,6 +176,16 @@ class Form:
     def fields(self) -> set[str]:
         """Return all fields of all mappings, as ``Node.id``."""
         return {f"{part['title']}.{name}" for part in self._parts() for name in part["properties"]}
+
+    def limits(self) -> list[int]:
+        """Return the whole numbers just outside the limits of fields."""
+        limits = set()
+        for part in self._parts():
+            for field in part["properties"].values():
+                for option in field.get("anyOf", [field]):
+                    limits |= {option[key] - 1 for key in ("minimum",) if key in option}
+                    limits |= {option[key] + 1 for key in ("maximum",) if key in option}
+        return sorted(limits)
 
     def free(self) -> set[str]:
         """Return the fields that may have any value, or a mapping of any keys and values."""

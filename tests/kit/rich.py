@@ -5,11 +5,32 @@ from __future__ import annotations
 from typing import Any
 
 import yaml
+from demandops.config.appdef import ApplicationDefinition
+from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
+from demandops.config.override import OverrideFile
+from demandops.config.policy import AccessDomainsFile
+from demandops.config.registry import ChartsFile, ImagesFile
+from demandops.config.repo_settings import RepoSettings
+from demandops.demand.demand_goal import DemandGoal
+from demandops.demand.deployment_request_goal import WireGoal
+from pydantic import BaseModel
 
 from tests.kit.config import configuration, override
 from tests.kit.goals import CLOUD, EGO, Goal, application, connection, goal
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+CONFIG_MODELS: dict[str, type[BaseModel]] = {
+    "demandops.yaml": RepoSettings,
+    "inventory/brokers.yaml": BrokersFile,
+    "inventory/clusters.yaml": ClustersFile,
+    "inventory/nodes.yaml": NodesFile,
+    "policy/access-domains.yaml": AccessDomainsFile,
+    "registry/charts.yaml": ChartsFile,
+    "registry/images.yaml": ImagesFile,
+    APPDEF: ApplicationDefinition,
+    "overrides/values.yaml": OverrideFile,
+}
+GOAL_MODELS: tuple[type[BaseModel], ...] = (WireGoal, DemandGoal)
 _FOLDER = "appdefs/object-detection-fusion/charts"
 _DIGEST = "sha256:" + "0" * 64
 

@@ -1,7 +1,8 @@
-"""What people mistype in a state repo, and the message that names file, field and remedy.
+"""What people mistype in a state repo, and the place that the faults name.
 
-Each case is one edit of a file of the skeleton. In an expected message ``{at}`` stands for the line
-of the edit, ``{next}`` for the one after it, and ``…`` at the end for a remedy in whatever words.
+Each case is one edit of a file of the skeleton. In an expected place ``{at}`` stands for the line
+of the edit and ``{next}`` for the one after it. The messages are in ``tests/unit/messages``, and
+``test_mistakes_anywhere`` tries every mistake that a JSON schema knows.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from collections.abc import Mapping
 
 import pytest
 from demandops.config.load import load
-from demandops.errors import InvalidInput
+from demandops.errors import Fault, InvalidInput
 
 from tests.kit.config import brokers, configuration, edited, skeleton
+from tests.kit.mutations import places_of_faults as places
 
 ROOT = "demandops.yaml"
 CLUSTERS = "inventory/clusters.yaml"
@@ -24,444 +26,244 @@ CHARTS = "registry/charts.yaml"
 IMAGES = "registry/images.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"
-LABEL = "^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"
-NAME = "is not a name that can be used here; it must match"
 V1 = "- id: vehicle01\n"
 FOLDER = f"    folder: {CHART}\n"
 
 
-def faults(changed: Mapping[str, str | None]) -> list[str]:
+def refused(changed: Mapping[str, str | None]) -> tuple[Fault, ...]:
     """Return the faults of a configuration that must be refused."""
     with pytest.raises(InvalidInput) as invalid:
         load(configuration(changed))
-    return [str(found) for found in invalid.value.faults]
+    return invalid.value.faults
+
+
+def faults(changed: Mapping[str, str | None]) -> list[str]:
+    """Return the same as text."""
+    return [str(found) for found in refused(changed)]
 
 
 EDITS: dict[str, tuple[str, str, str, list[str]]] = {
     # what any file can get wrong
     "a colon too many": (
         ROOT, "kind: StateRepository", "kind: State: Repository",
-        ["line {at}, column 12: not valid YAML: mapping values are not allowed in this context"],
+        ["line {at}, column 12"],
     ),
     "a tab": (
         CLUSTERS, "  - name: c-its", "\t- name: c-its",
-        ["line {at}, column 1: not valid YAML: found character that cannot start any token"],
+        ["line {at}, column 1"],
     ),
     "a key twice": (
         NODES, "    type: vehicle\n", "    type: vehicle\n    type: edge\n",
-        ["line {next}, column 5: not valid YAML: the key 'type' appears twice"],
+        ["line {next}, column 5"],
     ),
     "an anchor": (
         NODES, "- id: vehicle00", "- id: &v vehicle00",
-        ["line {at}: anchors and aliases (& and *) are not allowed; write the value out"],
+        ["line {at}"],
     ),
     "two documents": (
-        IMAGES, "kind: Images", "---\nkind: Images", ["holds 2 documents; only one is allowed"],
+        IMAGES, "kind: Images", "---\nkind: Images", [""],
     ),
-    "a version that is not known": (
-        NODES, "demandops/v1", "demandops/v2",
-        ["apiVersion: is 'demandops/v2', but must be 'demandops/v1'"],
-    ),
-    "no version": (NODES, "apiVersion: demandops/v1\n", "", ["apiVersion: is missing; add it"]),
-    "another kind": (NODES, "kind: Nodes", "kind: Node", ["kind: is 'Node', but must be 'Nodes'"]),
+    "no version": (NODES, "apiVersion: demandops/v1\n", "", ["apiVersion"]),
+    "another kind": (NODES, "kind: Nodes", "kind: Node", ["kind"]),
     "a field that does not exist": (
         NODES, "nodes:\n  -", "node: []\nnodes:\n  -",
-        ["node: is not a field here; remove it or correct its spelling; did you mean 'nodes'?"],
+        ["node"],
     ),
     "a misspelt field of an item": (
         NODES, "    cluster: c-its\n", "    clutser: c-its\n",
-        [
-            "nodes[0].cluster: is missing; add it",
-            "nodes[0].clutser: is not a field here; remove it or correct its spelling; did you "
-            "mean "
-            "'cluster'?",
-        ],
+        ["nodes[0].cluster", "nodes[0].clutser"],
     ),
     # how nodes reach each other
     "an endpoint that needs certificates": (
         NODES, V1, V1 + "    zenoh: {endpoint: tls/vehicle01:7447}\n",
-        [
-            f"nodes[1].zenoh.endpoint: 'tls/vehicle01:7447' {NAME} "
-            r"^(tcp|udp|ws)/[^\s/#?]+:\d{1,5}$"
-        ],
+        ["nodes[1].zenoh.endpoint"],
     ),
     "listening where nobody connects": (
         NODES, V1, V1 + '    zenoh: {listen: ["tcp/0.0.0.0:7447"]}\n',
-        ["nodes[1].zenoh: listen needs an endpoint, where others reach the node; add it"],
+        ["nodes[1].zenoh"],
     ),
     "two bridges on one host": (
         NODES, V1,
         "- id: twin\n    type: vehicle\n    cluster: c-its\n    zenoh: {}\n"
         "    selector: {host: a}\n  " + V1 + "    zenoh: {}\n    selector: {host: a}\n",
-        [
-            "nodes[2].zenoh: 'twin' already runs a bridge on the same host and ROS domain; "
-            "remove one of them"
-        ],
+        ["nodes[2].zenoh"],
     ),
     "ports in the wrong order": (
         NODES, V1, V1 + "    wan: {host: 192.0.2.1, firstPort: 3000, lastPort: 2000}\n",
-        ["nodes[1].wan: lastPort 2000 is below firstPort 3000; swap them"],
-    ),
-    "a port that only root may open": (
-        NODES, V1, V1 + "    wan: {host: 192.0.2.1, firstPort: 80}\n",
-        ["nodes[1].wan.firstPort: input should be greater than or equal to 1024, not 80"],
+        ["nodes[1].wan"],
     ),
     "a message type without its package": (
         NODES, V1, V1 + "    types: {/a: String}\n",
-        ["nodes[1].types./a: 'String' is not a message type; write it like std_msgs/msg/String"],
+        ["nodes[1].types./a"],
     ),
     "topics that are bridged to a node that does not exist": (
         NODES, V1, V1 + "    bridged: {egde: [/a]}\n",
-        ["nodes[1].bridged.egde: 'egde' is not in nodes.yaml; did you mean 'edge'?"],
+        ["nodes[1].bridged.egde"],
     ),
     "a password in Git": (
         BROKERS, "    port: 1883\n", "    port: 1883\n    credentials: {secret: a, password: b}\n",
-        ["brokers[0].credentials.password: is not a field here; remove it or correct its spelling"],
-    ),
-    "credentials without the Secret that holds them": (
-        BROKERS, "    port: 1883\n", "    port: 1883\n    credentials: {userKey: name}\n",
-        ["brokers[0].credentials.secret: is missing; add it"],
-    ),
-    "a key of a Secret that is a path": (
-        BROKERS, "    port: 1883\n", "    port: 1883\n    tls: {caSecret: a, caKey: ../ca.crt}\n",
-        [f"brokers[0].tls.caKey: '../ca.crt' {NAME} ^[A-Za-z0-9_][A-Za-z0-9_.-]*$"],
+        ["brokers[0].credentials.password"],
     ),
     # demandops.yaml
-    "a controller that is not known": (
-        ROOT, "gitops: flux", "gitops: helm",
-        ["gitops: is 'helm', but must be 'flux' or 'argocd'"],
-    ),
     "a controller without its section": (
         ROOT, "gitops: flux", "gitops: argocd",
-        ["argocd: is missing, but gitops is argocd; add it with the url that the clusters fetch "
-         "this repo from"],
+        ["argocd"],
     ),
     "a newer generator's rendering": (
         ROOT, "renderVersion: 1", "renderVersion: 2",
-        ["renderVersion: is 2, but this generator renders version 1; update the generator"],
-    ),
-    "a rendering that never was": (
-        ROOT, "renderVersion: 1", "renderVersion: 0",
-        ["renderVersion: input should be greater than or equal to 1, not 0"],
-    ),
-    "a version as text": (
-        ROOT, "renderVersion: 1", 'renderVersion: "1"',
-        ["renderVersion: must be a whole number, not '1'"],
+        ["renderVersion"],
     ),
     # inventory/clusters.yaml
     "a cluster twice": (
         CLUSTERS, "  - name: c-its", "  - name: c-its\n  - name: c-its",
-        ["clusters[1].name: 'c-its' appears twice; remove one"],
+        ["clusters[1].name"],
     ),
     "a cluster that is no folder": (
         CLUSTERS, "name: c-its", "name: ../c-its",
-        [f"clusters[0].name: '../c-its' {NAME} {LABEL}"],
+        ["clusters[0].name"],
     ),
     # inventory/nodes.yaml
-    "a kind of node that does not exist": (
-        NODES, "type: vehicle", "type: car",
-        ["nodes[0].type: is 'car', but must be 'vehicle', 'station', 'edge' or 'cloud'"],
-    ),
     "a misspelt cluster": (
         NODES, "cluster: c-its", "cluster: c-it",
-        ["nodes[0].cluster: 'c-it' is not in clusters.yaml; did you mean 'c-its'?"],
+        ["nodes[0].cluster"],
     ),
     "a cluster in capitals": (
-        NODES, "cluster: c-its", "cluster: C-ITS", [f"nodes[0].cluster: 'C-ITS' {NAME} {LABEL}"],
+        NODES, "cluster: c-its", "cluster: C-ITS", ["nodes[0].cluster"],
     ),
     "a node twice": (
         NODES, "id: vehicle01", "id: vehicle00",
-        ["nodes[1].id: 'vehicle00' appears twice; remove one"],
+        ["nodes[1].id"],
     ),
     "a node that is a number": (
-        NODES, "id: vehicle01", "id: 5", ["nodes[1].id: must be text, not 5; put it in quotes"],
-    ),
-    "a selector's truth that should be text": (
-        NODES, V1, f"{V1}    selector: {{ready: yes}}\n",
-        ["nodes[1].selector.ready: must be text, not True; put it in quotes"],
-    ),
-    "a selector's value that is no label": (
-        NODES, V1, f"{V1}    selector: {{ready: a b}}\n",
-        [
-            f"nodes[1].selector.ready: 'a b' {NAME} "
-            "^([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?$"
-        ],
-    ),
-    "an operator that taints do not have": (
-        NODES, V1, f"{V1}    tolerations: [{{key: a, operator: In}}]\n",
-        ["nodes[1].tolerations[0].operator: is 'In', but must be 'Exists' or 'Equal'"],
-    ),
-    "a ROS domain beyond the last": (
-        NODES, V1, f"{V1}    ros: {{domainId: 233}}\n",
-        ["nodes[1].ros.domainId: input should be less than or equal to 232, not 233"],
-    ),
-    "a middleware that does not exist": (
-        NODES, V1, f"{V1}    ros: {{rmw: rmw_dds}}\n",
-        [
-            "nodes[1].ros.rmw: is 'rmw_dds', but must be 'rmw_cyclonedds_cpp', "
-            "'rmw_fastrtps_cpp', 'rmw_connextdds' or 'rmw_zenoh_cpp'"
-        ],
+        NODES, "id: vehicle01", "id: 5", ["nodes[1].id"],
     ),
     "a text for a truth": (
         NODES, V1, f'{V1}    hostNetwork: "yes"\n',
-        ["nodes[1].hostNetwork: must be true or false, not 'yes'"],
+        ["nodes[1].hostNetwork"],
     ),
     # inventory/brokers.yaml
     "a misspelt node of a broker": (
         BROKERS, "node: cloud", "node: clod",
-        ["brokers[0].node: 'clod' is not in nodes.yaml; did you mean 'cloud'?"],
+        ["brokers[0].node"],
     ),
     "two brokers on a node": (
-        BROKERS, "node: cloud", "node: edge", ["brokers[1].node: 'edge' appears twice; remove one"],
-    ),
-    "a port beyond the last": (
-        BROKERS, "port: 1883", "port: 70000",
-        ["brokers[0].port: input should be less than or equal to 65535, not 70000"],
+        BROKERS, "node: cloud", "node: edge", ["brokers[1].node"],
     ),
     "a port as text": (
         BROKERS, "port: 1883", 'port: "1883"',
-        ["brokers[0].port: must be a whole number, not '1883'"],
-    ),
-    "a host that is none": (
-        BROKERS, "service-mqtt-broker-cloud", "my broker",
-        [f"brokers[0].host: 'my broker' {NAME} ^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$"],
-    ),
-    "a broker of another protocol": (
-        BROKERS, "- node: cloud", "- type: kafka\n    node: cloud",
-        ["brokers[0].type: is 'kafka', but must be 'mqtt'"],
+        ["brokers[0].port"],
     ),
     # policy/access-domains.yaml
-    "a namespace in capitals": (
-        DOMAINS, "namespace: perception", "namespace: Perception",
-        [f"domains[0].namespace: 'Perception' {NAME} {LABEL}"],
-    ),
-    "an account that is none": (
-        DOMAINS, "serviceAccount: demandops", "serviceAccount: a_b",
-        [f"domains[0].serviceAccount: 'a_b' {NAME} {LABEL}"],
-    ),
     "two domains in one namespace": (
         DOMAINS, "domains:\n",
         "domains:\n  - name: other\n    namespace: perception\n    nodes: [nobody]\n",
-        [
-            "domains[1].namespace: 'perception' is already the namespace of 'other'; give each "
-            "its own"
-        ],
+        ["domains[1].namespace"],
     ),
     "a domain twice": (
         DOMAINS, "domains:\n",
         "domains:\n  - name: perception\n    namespace: other\n    nodes: [nobody]\n",
-        ["domains[1].name: 'perception' appears twice; remove one"],
+        ["domains[1].name"],
     ),
     # registry/charts.yaml
     "a chart's folder that does not exist": (
         CHARTS, CHART, f"{CHART}s",
-        [
-            f"charts.object-detection.folder: '{CHART}s/Chart.yaml' does not exist; correct the "
-            f"folder"
-        ],
+        ["charts.object-detection.folder"],
     ),
     "a chart outside": (
         CHARTS, CHART, "appdefs/../../x",
-        ["charts.object-detection: folder must stay inside the state repo; remove '..'"],
+        ["charts.object-detection"],
     ),
     "a chart's version that is not the folder's": (
         CHARTS, "version: 0.1.0", "version: 0.1.1",
-        [
-            f"charts.object-detection.version: is 0.1.1, but {CHART}/Chart.yaml says 0.1.0; make "
-            f"them equal"
-        ],
-    ),
-    "a chart's version that is none": (
-        CHARTS, "version: 0.1.0", "version: latest",
-        [
-            f"charts.object-detection.version: 'latest' {NAME} "
-            r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$"
-        ],
-    ),
-    "a chart's version that YAML takes for a number": (
-        CHARTS, "version: 0.1.0", "version: 0.1",
-        ["charts.object-detection.version: must be text, not 0.1; put it in quotes"],
+        ["charts.object-detection.version"],
     ),
     "a chart from two places": (
         CHARTS, FOLDER, f"{FOLDER}    oci: oci://ghcr.io/x\n",
-        [
-            "charts.object-detection: needs exactly one of folder, oci and http, not folder and "
-            "oci"
-        ],
+        ["charts.object-detection"],
     ),
     "a chart from nowhere": (
         CHARTS, FOLDER, "",
-        ["charts.object-detection: needs exactly one of folder, oci and http"],
+        ["charts.object-detection"],
     ),
     "a chart's address with a password": (
         CHARTS, FOLDER, "    http: https://me:secret@charts.example.org\n",
-        [
-            "charts.object-detection: must not contain a user or password; give them to the GitOps "
-            "controller as a Secret"
-        ],
-    ),
-    "an OCI address that is none": (
-        CHARTS, FOLDER, "    oci: https://ghcr.io/x\n",
-        [rf"charts.object-detection.oci: 'https://ghcr.io/x' {NAME} ^oci://[^\s]+$"],
+        ["charts.object-detection"],
     ),
     # registry/images.yaml
     "an image that is not pinned": (
         IMAGES, "    tag: 2025-04\n", "",
-        ["images.object-detection: needs a tag or a digest; without one the image is not pinned"],
-    ),
-    "a digest cut short": (
-        IMAGES, "tag: 2025-04", "digest: sha256:abc",
-        [f"images.object-detection.digest: 'sha256:abc' {NAME} ^sha256:[0-9a-f]{{64}}$"],
-    ),
-    "a repository in capitals": (
-        IMAGES, "docker.io/rwthika/robotkube-object-detection", "Docker.io/X",
-        [f"images.object-detection.repository: 'Docker.io/X' {NAME} ^[a-z0-9][a-z0-9._/:-]*$"],
-    ),
-    "a tag that YAML takes for a number": (
-        IMAGES, "tag: 2025-04", "tag: 2025",
-        ["images.object-detection.tag: must be text, not 2025; put it in quotes"],
+        ["images.object-detection"],
     ),
     "an MQTT client that is missing": (
         IMAGES, "  mqtt-client:", "  mqtt-clint:",
-        ["images: 'mqtt-client' is missing; add it, because MQTT connections run it"],
+        ["images"],
     ),
     # appdefs/*/appdef.yaml
     "an input that does not exist": (
         APPDEF, "each: point_cloud", "each: point_clod",
-        ["services.object-detection.each: 'point_clod' is not an input; did you mean "
-         "'point_cloud'?"],
+        [""],
     ),
     "both each and inputs": (
         APPDEF, "each: point_cloud\n", "each: point_cloud\n    inputs: {ego_data: ego_data}\n",
-        [
-            "services.object-detection: 'each' already names the service's input; remove 'inputs'"
-        ],
+        ["services.object-detection"],
     ),
     "a source for an application": (
         APPDEF, "prefix: of\n", "prefix: of\n    placement: source\n",
-        [
-            "services.object-fusion: placement 'source' needs 'each': an application has no "
-            "single source"
-        ],
+        ["services.object-fusion"],
     ),
     "an output that does not exist": (
         APPDEF, "object-detection.object_list", "object-detection.objects",
-        [
-            "services.object-fusion.inputs.object_list: 'object-detection.objects' is neither an "
-            "input nor an output of a service that runs for each topic; did you mean "
-            "'object-detection.object_list'?"
-        ],
+        [""],
     ),
     "a list of the message for an input that does not exist": (
         APPDEF, "ego_data_topics: ego_data", "ego_data_topics: ego",
-        ["deploymentRequest.inputs: 'ego' is not an input; known: ego_data, point_cloud"],
-    ),
-    "a list that the message does not have": (
-        APPDEF, "ego_data_topics: ego_data", "ego_topics: ego_data",
-        [
-            "deploymentRequest.inputs.ego_topics: is 'ego_topics', but must be 'ego_data_topics' "
-            "or 'pointcloud_topics'"
-        ],
-    ),
-    "a type that ROS's default takes": (
-        APPDEF, "type: 1\n", "type: 0\n",
-        ["deploymentRequest.type: input should be greater than or equal to 1, not 0"],
+        [""],
     ),
     "a prefix that connections have": (
         APPDEF, "prefix: of", "prefix: mqtt",
-        ["services.object-fusion.prefix: 'mqtt' is the prefix of connections; choose another"],
+        ["services.object-fusion.prefix"],
     ),
     "a prefix of two services": (
         APPDEF, "prefix: of", "prefix: od",
-        [
-            "services.object-fusion.prefix: 'od' is used by 'object-detection' already; choose "
-            "another (only identical services with 'each' may share a prefix)"
-        ],
-    ),
-    "a prefix with a dash": (
-        APPDEF, "prefix: of", "prefix: o-f",
-        [f"services.object-fusion.prefix: 'o-f' {NAME} ^[a-z][a-z0-9]{{0,9}}$"],
-    ),
-    "an output that is no topic": (
-        APPDEF, "/{instance}_local_objectlist", "objects",
-        [
-            f"services.object-detection.outputs.object_list: 'objects' {NAME} "
-            r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
-        ],
+        ["services.object-fusion.prefix"],
     ),
     "a chart that is not in the registry": (
         APPDEF, "chart: object-detection", "chart: object-detektion",
-        [
-            "services.object-detection.chart: 'object-detektion' is not in registry/charts.yaml; "
-            "did you mean 'object-detection'?"
-        ],
+        ["services.object-detection.chart"],
     ),
     "an image that is not in the registry": (
         APPDEF, "images: [object-detection]", "images: [object-detektion]",
-        [
-            "services.object-detection.images: 'object-detektion' is not in registry/images.yaml; "
-            "did you mean 'object-detection'?"
-        ],
+        ["services.object-detection.images"],
     ),
     "a template that does not exist": (
         APPDEF, "values/object-detection.yaml.j2", "values/object-detektion.yaml.j2",
-        ["services.object-detection.values: 'values/object-detektion.yaml.j2' does not exist; …"],
+        ["services.object-detection.values"],
     ),
     "a template outside": (
         APPDEF, "values/object-detection.yaml.j2", "../x",
-        [f"services.object-detection.values: '../x' {NAME} ^values/[A-Za-z0-9_.-]+$"],
+        ["services.object-detection.values"],
     ),
     "bounds the wrong way round": (
         APPDEF, "prefix: of\n", "prefix: of\n    scaling: {min: 3, max: 2}\n",
-        [
-            "services.object-fusion.scaling: min 3 is above max 2; lower min or raise max"
-        ],
-    ),
-    "no topic for a replica": (
-        APPDEF, "prefix: of\n", "prefix: of\n    scaling: {topicsPerReplica: 0}\n",
-        [
-            "services.object-fusion.scaling.topicsPerReplica: input should be greater than or "
-            "equal to 1, not 0"
-        ],
-    ),
-    "a merge that does not exist": (
-        APPDEF, "services:\n", "parameters:\n  rate: {merge: avg}\nservices:\n",
-        ["parameters.rate.merge: is 'avg', but must be 'union', 'max', 'min' or 'latest'"],
-    ),
-    "a service in capitals": (
-        APPDEF, "  object-detection:\n", "  Object_Detection:\n",
-        [f"services.Object_Detection: 'Object_Detection' {NAME} {LABEL}"],
+        ["services.object-fusion.scaling"],
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", EDITS)
-def test_a_mistake_is_told_with_file_field_and_remedy(name: str) -> None:
+def test_a_mistake_is_a_fault_with_file_and_place(name: str) -> None:
     path, old, new, expected = EDITS[name]
-    found = faults(edited(path, old, new))
     at = skeleton()[path][: skeleton()[path].index(old)].count("\n") + 1
-    expected = [
-        message.replace("{at}", str(at)).replace("{next}", str(at + 1)) for message in expected
-    ]
-    for index, message in enumerate(expected):
-        if message.endswith("…") and index < len(found):
-            found[index] = found[index][: len(path) + 2 + len(message) - 1] + "…"
-    assert found == [f"{path}: {message}" for message in expected]
+    found = refused(edited(path, old, new))
+    assert [one.file for one in found] == [path] * len(expected)
+    assert places(found) == [place.format(at=at, next=at + 1) for place in expected]
 
 
-@pytest.mark.parametrize("path", [ROOT, CLUSTERS, NODES, BROKERS, DOMAINS, CHARTS, IMAGES])
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "is missing; `demandops init` creates an example"),
-        ("", "must be a mapping that starts with apiVersion: demandops/v1"),
-        ("- a\n", "must be a mapping that starts with apiVersion: demandops/v1"),
-        ("a: [\n", "line 2, column 1: not valid YAML: did not find expected node content"),
-    ],
-    ids=["missing", "empty", "a list", "no YAML"],
-)
-def test_a_file_that_holds_nothing_of_use(path: str, content: str | None, message: str) -> None:
-    assert faults({path: content}) == [f"{path}: {message}"]
+@pytest.mark.parametrize("content", [None, "", "- a\n", "a: [\n"])
+def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
+    for path in (ROOT, CLUSTERS, NODES, BROKERS, DOMAINS, CHARTS, IMAGES):
+        (found,) = refused({path: content})
+        assert found.file == path
 
 
 class TestArgoCd:
@@ -544,21 +346,6 @@ class TestNodes:
         (found,) = faults(edited(NODES, V1, f"{V1}    tolerations: [{taint}]\n"))
         assert found.startswith(f"{NODES}: nodes[1].tolerations[0]")
 
-    @pytest.mark.parametrize(
-        ("field", "name", "meant"),
-        [
-            ("ros: {domain_id: 3}", "nodes[1].ros.domain_id", "domainId"),
-            ("host_network: false", "nodes[1].host_network", "hostNetwork"),
-            ("image_pull_secrets: [x]", "nodes[1].image_pull_secrets", "imagePullSecrets"),
-        ],
-    )
-    def test_a_field_under_the_programs_own_name_is_not_a_field(
-        self, field: str, name: str, meant: str
-    ) -> None:
-        (found,) = faults(edited(NODES, V1, f"{V1}    {field}\n"))
-        message = f"{NODES}: {name}: is not a field here; remove it or correct its spelling"
-        assert found in (message, f"{message}; did you mean '{meant}'?")
-
     def test_every_node_of_an_unknown_cluster_is_told(self) -> None:
         change = {CLUSTERS: "apiVersion: demandops/v1\nkind: Clusters\nclusters: [{name: west}]\n"}
         assert faults(change) == [
@@ -630,9 +417,9 @@ class TestAppdefs:
 
     def test_a_chart_without_metadata_is_told(self) -> None:
         path = f"{CHART}/Chart.yaml"
-        assert faults({path: "version: [\n"}) == [
-            f"{path}: line 2, column 1: not valid YAML: did not find expected node content"
-        ]
+        assert faults({path: "version: [\n"})[0].startswith(
+            f"{path}: line 2, column 1: not valid YAML: "
+        )
 
 
 class TestAllTogether:

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 from demandops import strict_yaml
-from demandops.cli.repo.schema import SCHEMAS
 from demandops.config.load import load
 from demandops.errors import Fault, InvalidInput
 
@@ -15,14 +14,7 @@ from tests.kit import mutations, rich
 from tests.kit.mutations import Form
 
 DOMAINS = "policy/access-domains.yaml"
-FORMS = {
-    file.replace("<name>", "object-detection-fusion" if "appdefs" in file else "values"): Form(
-        model.model_json_schema()
-    )
-    for model, file in SCHEMAS.values()
-    if " " not in file
-}
-"""The schema of each file of a state repo."""
+FORMS = {file: Form(model.model_json_schema()) for file, model in rich.CONFIG_MODELS.items()}
 DOCUMENTS = [
     *((rich.rich, file) for file in FORMS),
     *((rich.rich, f"overrides/{name}.yaml") for name in ("hold", "deny", "keep")),
@@ -70,7 +62,7 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(
     document = loader.document(file)
     assert loader.faults(file, document) == []
     problems = []
-    for mutation in mutations.mutations(document):
+    for mutation in mutations.mutations(document, form_of(file).limits()):
         found = loader.faults(file, mutation.document)
         if file == DOMAINS:  # an invalid domain has no nodes, which overrides then report too
             found = [one for one in found if one.file == file or "access domain" not in one.message]

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from demandops.demand.demand_goal import DemandGoal
-from demandops.demand.deployment_request_goal import WireGoal
 from demandops.errors import Refused
 
 from tests.kit import mutations, rich
@@ -14,11 +12,12 @@ from tests.kit.goals import Goal
 from tests.kit.memory import MemoryRepo
 from tests.kit.mutations import Form
 
-REFERENCE, OWN = Form(WireGoal.model_json_schema()), Form(DemandGoal.model_json_schema())
+REFERENCE, OWN = (Form(model.model_json_schema()) for model in rich.GOAL_MODELS)
 FREE = {"GoalApplication.parameters", "DemandGoal.lease"}
 FREE_PLACES = ("applications[0].parameters", "applications[1].parameters_json")
 ELSEWHERE = {
     "connections[0].source_topics": "connections[0].target_topics",  # one has more topics then
+    "shutdown": "apps[0].header.id",  # the shutdown finds no claim
     "connections[0].type": "connections[0].",  # another type has other rules
     "applications[0].parameters.rate": "parameters.rate",  # when it is merged, without its place
     "applications[1].parameters_json.": "applications[1].parameters.",
@@ -33,7 +32,7 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(valid: Callable[[], Goal], f
     repo = MemoryRepo(rich.rich())
     assert not isinstance(repo.copy().take(valid()), Refused)
     problems = []
-    for mutation in mutations.mutations(valid()):
+    for mutation in mutations.mutations(valid(), form.limits()):
         taken = repo.copy().take(mutation.document)
         place = mutations.path(mutation.place)
         also = tuple(field for start, field in ELSEWHERE.items() if place.startswith(start))

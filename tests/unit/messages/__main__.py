@@ -1,0 +1,5 @@
+"""``make golden``: write the messages anew. Review the diff before you commit it."""
+
+from tests.unit.messages.text import FILE, text
+
+FILE.write_text(text())

@@ -1,0 +1,68 @@
+"""The messages of all tables of mistakes, and the form of every field, as one text."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from demandops.errors import Fault, Refused
+
+from tests.kit.config import edited
+from tests.kit.memory import MemoryRepo
+from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS
+from tests.unit.config import test_config_mistakes as of_config
+from tests.unit.demand import test_refused as of_goals
+from tests.unit.demand import test_wrong_types as of_form
+from tests.unit.overrides import test_override_mistakes as of_overrides
+
+FILE = Path(__file__).with_name("messages.txt")
+_FOREIGN = re.compile(r"(not valid YAML: |input should be )(?!the key|a tag).*?(, not |$)")
+
+
+def text() -> str:
+    """Return the text that ``messages.txt`` must have."""
+    sections = {
+        "configuration": (
+            (name, of_config.refused(edited(path, old, new)))
+            for name, (path, old, new, _) in of_config.EDITS.items()
+        ),
+        "overrides": (
+            (name, of_overrides.refused(tested=of_overrides.text(**changed)))
+            for name, (changed, _) in of_overrides.MISTAKES.items()
+        ),
+        "goals": ((name, _refusal(goal)) for name, (goal, _) in of_goals.REFUSED.items()),
+        "the form of goals": ((name, _refusal(goal)) for name, (goal, _) in of_form.WRONG.items()),
+    }
+    lines = ["Written by `make golden`. Words of pydantic and libyaml are replaced by …", ""]
+    for title, cases in sections.items():
+        lines += [f"# {title}", "", *_messages(cases), ""]
+    return "\n".join([*lines, "# fields", "", *sorted(set(_fields())), ""])
+
+
+def _refusal(goal: object) -> tuple[Fault, ...]:
+    taken = MemoryRepo().take(goal)
+    assert isinstance(taken, Refused)
+    return taken.faults
+
+
+def _messages(cases: Iterable[tuple[str, Iterable[Fault]]]) -> Iterator[str]:
+    for name, faults in cases:
+        yield name
+        for fault in faults:
+            code = "" if fault.code == "invalid" else f" [{fault.code}]"
+            yield f"    {_FOREIGN.sub(lambda match: f'{match[1]}…{match[2]}', str(fault))}{code}"
+
+
+def _fields() -> Iterator[str]:
+    """Yield each field of each file and goal with its JSON schema."""
+    for model in (*CONFIG_MODELS.values(), *GOAL_MODELS):
+        schema = model.model_json_schema()
+        for part in (schema, *schema.get("$defs", {}).values()):
+            if part.get("additionalProperties", True) is False:
+                yield f"{part['title']}: no other fields"
+            for name, field in part.get("properties", {}).items():
+                form = {key: value for key, value in field.items() if key != "title"}
+                needed = "required " if name in part.get("required", ()) else ""
+                yield f"{part['title']}.{name}: {needed}{json.dumps(form, ensure_ascii=False)}"
