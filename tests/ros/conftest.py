@@ -10,7 +10,8 @@ import yaml
 from demandops_ros import DemandClient, DemandError
 
 from tests.kit import sync
-from tests.kit.repo import POLICY, GitRepo, init, read
+from tests.kit.generator import wait_until
+from tests.kit.repo import POLICY, GitRepo, init, read, tip
 from tests.kit.ros import Client, Serve, Served, Servers, reserved
 
 APPDEFS = Path(__file__).parents[1] / "appdefs"
@@ -59,10 +60,12 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     policy = yaml.safe_load(read(bare, POLICY))
     rule = {"name": "known", "requesters": ["vehicle*", "station*", "r*"]}
     policy["domains"][0] |= {"rules": [rule]}
-    GitRepo(bare).commit(_recorder(bare) | {POLICY: yaml.safe_dump(policy)})
+    changed = GitRepo(bare).commit(_recorder(bare) | {POLICY: yaml.safe_dump(policy)})
     with reserved() as domain:
         servers = Servers(folder, domain, DEMANDOPS_DATA_HOME=str(folder / "home"))
-        yield servers.start(str(bare))
+        served = servers.start(str(bare))
+        wait_until(lambda: tip(bare) != changed, "the node has followed the change", 60)
+        yield served
         servers.kill()
 
 

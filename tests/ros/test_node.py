@@ -59,7 +59,7 @@ def test_a_goal_that_cannot_be_honoured_is_aborted_with_code_field_and_remedy(
         "did you mean 'edge'?"
     )
     assert refused.feedback == []
-    assert tip(shared.state_repo) == before
+    assert git(shared.state_repo, "log", "--format=%an: %s%n%b", f"{before}..main") == ""
     assert caller.call(connection(1001)).status == "succeeded"
 
 
