@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from email.message import Message
 from pathlib import Path
 
 import pytest
@@ -15,31 +12,18 @@ from demandops.cluster import access, controller_webhook
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
 from demandops.errors import InvalidInput
 
+from tests.kit.generator import wait_until
 from tests.kit.golden import start
-from tests.kit.http import Answer, Call, serving
+from tests.kit.http import Answer, Server, serving
 
 SECRET = "It's a Secret to Everybody"  # noqa: S105 - of an example
 
 
-@dataclass
-class Heard:
-    """A server's URL, what it was sent, and what it answers."""
-
-    url: str = ""
-    calls: list[tuple[Message, bytes]] = field(default_factory=list)
-    status: int = 200
-
-    def answer(self, call: Call) -> Answer:
-        self.calls.append((call.headers, call.body))
-        return Answer(self.status, headers={"Location": "/elsewhere"})
-
-
 @pytest.fixture
-def hook() -> Iterator[Heard]:
-    heard = Heard()
-    with serving(heard.answer) as server:
-        heard.url = f"{server.url}/hook"
-        yield heard
+def hook() -> Iterator[Server]:
+    with serving() as server:
+        server.url += "/hook"
+        yield server
 
 
 @pytest.fixture
@@ -69,13 +53,13 @@ def woken(case: str, reached: access.ClusterAccess, changed: list[str] | None = 
     waker.close()
 
 
-def test_a_receiver_of_flux_is_called_with_a_signature(hook: Heard, secret_file: Path) -> None:
+def test_a_receiver_of_flux_is_called_with_a_signature(hook: Server, secret_file: Path) -> None:
     woken("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
-    headers, body = hook.calls[0]
-    assert headers["X-Signature"] == by_openssl(body)
+    call = hook.calls[0]
+    assert call.headers["X-Signature"] == by_openssl(call.body)
 
 
-def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Heard, secret_file: Path) -> None:
+def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file: Path) -> None:
     changed = [
         "appdefs/x/charts/x/Chart.yaml",
         "clusters/c-its/perception/edge/a.yaml",
@@ -84,7 +68,7 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Heard, secret_file: 
     ]
     reached = access.ClusterAccess(webhook=hook.url, secret_file=secret_file)
     woken("argocd-experiment", reached, changed)
-    headers, body = hook.calls[0]
+    headers, body = hook.calls[0].headers, hook.calls[0].body
     assert headers["X-Hub-Signature-256"] == by_openssl(body)
     assert (headers["X-GitHub-Event"], headers["Content-Type"]) == ("push", "application/json")
     event = json.loads(body)
@@ -99,14 +83,14 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Heard, secret_file: 
 
 
 def test_where_nothing_is_known_of_what_changed_argo_cd_looks_at_all(
-    hook: Heard, secret_file: Path
+    hook: Server, secret_file: Path
 ) -> None:
     woken("argocd-experiment", access.ClusterAccess(webhook=hook.url, secret_file=secret_file))
-    assert json.loads(hook.calls[0][1])["commits"] == []
+    assert hook.calls[0].json()["commits"] == []
 
 
 def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
-    hook: Heard, secret_file: Path
+    hook: Server, secret_file: Path
 ) -> None:
     asked: list[str] = []
 
@@ -118,30 +102,23 @@ def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
     reached = access.ClusterAccess(webhook=hook.url, secret_file=secret_file)
     waker = ReconcileTrigger({"c-its": reached}, changed)
     try:
-        hook.status = 503
+        hook.answer = lambda call: Answer(503)
         waker(state.config)
-        wait_for(lambda: len(hook.calls) >= 1)
-        hook.status = 200
-        wait_for(lambda: len(hook.calls) >= 2)
+        wait_until(lambda: len(hook.calls) >= 1, "call 1")
+        hook.answer = lambda call: Answer()
+        wait_until(lambda: len(hook.calls) >= 2, "call 2")
         waker(state.config)
-        wait_for(lambda: len(hook.calls) >= 3)
+        wait_until(lambda: len(hook.calls) >= 3, "call 3")
     finally:
         waker.close()
     assert asked[:3] == ["", "", "2"]
 
 
-def wait_for(seen: object) -> None:
-    end = time.monotonic() + 30
-    while not seen():  # type: ignore[operator]
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 @pytest.mark.parametrize("status", [302, 307, 400])
 def test_what_is_not_taken_is_told_and_no_redirection_followed(
-    hook: Heard, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
+    hook: Server, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
 ) -> None:
-    hook.status = status
+    hook.answer = lambda call: Answer(status, headers={"Location": "/elsewhere"})
     woken("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
     assert len(hook.calls) in (1, 2)  # the second, as it is closed
@@ -153,7 +130,7 @@ def test_what_is_not_taken_is_told_and_no_redirection_followed(
     [("experiment", "webhook", "receiver"), ("argocd-experiment", "receiver", "webhook")],
 )
 def test_the_other_controller_s_webhook_is_not_called(
-    hook: Heard, caplog: pytest.LogCaptureFixture, case: str, other: str, needs: str
+    hook: Server, caplog: pytest.LogCaptureFixture, case: str, other: str, needs: str
 ) -> None:
     woken(case, access.ClusterAccess.model_validate({other: hook.url}))
     assert hook.calls == []

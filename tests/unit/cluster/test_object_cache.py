@@ -68,11 +68,9 @@ def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
     assert read.why_unknown([DEPLOYMENTS]) == "it has not been read yet"
 
 
-def test_a_cluster_that_is_away_is_asked_once(api: Api, tmp_path: Path) -> None:
-    nowhere = tmp_path / "nowhere"
-    text = Path(str(api.reached.kubeconfig)).read_text()
-    nowhere.write_text(text.replace(text.split("127.0.0.1:")[1].split('"')[0], "1"))
-    read = ObjectCache("away", ClusterAccess(kubeconfig=nowhere), lambda: None)
+def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:
+    away = ClusterAccess(kubeconfig=kubeconfig(tmp_path, "http://127.0.0.1:1"))
+    read = ObjectCache("away", away, lambda: None)
     read.read_once([OVER, CHILDREN])
     assert read.why_unknown([OVER]).startswith("MaxRetryError")
     assert read.why_unknown([CHILDREN]) == read.why_unknown([OVER])

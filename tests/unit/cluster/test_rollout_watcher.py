@@ -10,20 +10,13 @@ from demandops.cluster.health import ClusterDomain, Target
 from demandops.cluster.rollout_watcher import RolloutWatcher
 
 from tests.kit.cluster import Letters
+from tests.kit.http import kubeconfig
 
-KUBECONFIG = """
-apiVersion: v1
-kind: Config
-clusters: [{name: c, cluster: {server: "http://127.0.0.1:1"}}]
-users: [{name: u, user: {}}]
-contexts: [{name: x, context: {cluster: c, user: u}}]
-current-context: x
-"""
+AWAY = "http://127.0.0.1:1"
 
 
 def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: Path) -> None:
-    file = tmp_path / "kubeconfig"
-    file.write_text(KUBECONFIG)
+    file = kubeconfig(tmp_path, AWAY)
     status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
     try:
         target = Target(ClusterDomain("away", "d", "ns"), "r", by_helm=True)
@@ -50,8 +43,7 @@ def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
 
 
 def test_closing_answers_what_is_still_followed(tmp_path: Path) -> None:
-    file = tmp_path / "kubeconfig"
-    file.write_text(KUBECONFIG)
+    file = kubeconfig(tmp_path, AWAY)
     status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
     target = Target(ClusterDomain("away", "d", "ns"), "r", by_helm=True)
     followed = status.follow("a" * 40, [target], "reconciled", timeout=600)

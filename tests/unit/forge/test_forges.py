@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +12,7 @@ from demandops.config.repo_settings import Proposals
 from demandops.errors import InvalidInput
 from demandops.forge import Forge, ForgeError, PullRequest, forge_for
 
+from tests.kit.config import configuration
 from tests.kit.http import serving
 from tests.unit.forge.replaying import TOKEN, Replay, replaying
 
@@ -182,17 +182,9 @@ def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
     ],
 )
 def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> None:
-    from demandops.staterepo import skeleton
-
-    files = skeleton.files()
-    config = {
-        path: text
-        for path, text in files.items()
-        if path.split("/")[0] not in ("clusters", "bootstrap", "ledger")
-    }
+    config = configuration()
     config["demandops.yaml"] += f"\nproposals: {section}\n"
     with pytest.raises(InvalidInput) as error:
         load(config)
-    assert any(message in str(found) for found in error.value.faults), json.dumps(
-        [str(found) for found in error.value.faults]
-    )
+    faults = [str(found) for found in error.value.faults]
+    assert any(message in found for found in faults), faults

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pygit2
 import pytest
 from demandops.errors import StateRepoError
 from demandops.staterepo.git.address import is_url, without_secrets
@@ -151,7 +152,7 @@ def test_neither_address_nor_error_shows_a_token(tmp_path: Path) -> None:
 
 
 def test_the_clone_keeps_its_address_for_its_owner_alone(tmp_path: Path) -> None:
-    source = _bare_with_main(tmp_path / "state.git")
+    source = _with_main(tmp_path / "state.git")
     connect(source.as_uri(), tmp_path / "data")
     config = tmp_path / "data" / "clone.git" / "config"
     assert source.as_uri() in config.read_text()
@@ -161,7 +162,7 @@ def test_the_clone_keeps_its_address_for_its_owner_alone(tmp_path: Path) -> None
 def test_a_line_break_in_an_address_sets_nothing_in_the_clones_configuration(
     tmp_path: Path,
 ) -> None:
-    source = _bare_with_main(tmp_path / "state.git")
+    source = _with_main(tmp_path / "state.git")
     address = f"{source.as_uri()}\n[core]\n\tsshCommand = touch evil"
     with pytest.raises((StateRepoError, ValueError)):
         connect(address, tmp_path / "data")
@@ -187,8 +188,6 @@ def test_a_folder_that_is_no_repository_is_told_with_the_remedy(tmp_path: Path) 
 
 
 def test_a_repository_without_main_is_told_with_the_remedy(tmp_path: Path) -> None:
-    import pygit2
-
     empty = tmp_path / "empty.git"
     pygit2.init_repository(str(empty), bare=True)
     with pytest.raises(StateRepoError, match="has no branch 'main'"):
@@ -201,12 +200,8 @@ def test_a_repository_without_main_is_told_with_the_remedy(tmp_path: Path) -> No
 
 
 def test_a_checked_out_main_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    import pygit2
-
     work = tmp_path / "work"
-    repo = pygit2.init_repository(str(work), initial_head="main")
-    who = pygit2.Signature("x", "x@example.org", 0, 0)
-    repo.create_commit("refs/heads/main", who, who, "x", repo.TreeBuilder().write(), [])
+    _with_main(work, bare=False)
     with pytest.raises(StateRepoError) as error:
         connect(str(work), tmp_path / "data")
     assert str(error.value) == (
@@ -215,10 +210,8 @@ def test_a_checked_out_main_is_refused_with_the_remedy(tmp_path: Path) -> None:
     )
 
 
-def _bare_with_main(path: Path) -> Path:
-    import pygit2
-
-    repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
+def _with_main(path: Path, *, bare: bool = True) -> Path:
+    repo = pygit2.init_repository(str(path), bare=bare, initial_head="main")
     who = pygit2.Signature("x", "x@example.org", 0, 0)
     repo.create_commit("refs/heads/main", who, who, "x", repo.TreeBuilder().write(), [])
     return path

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-from pathlib import Path
 from typing import Any
 
 import pygit2
@@ -14,15 +13,12 @@ from demandops.render.changes.changeset import ReleaseChange
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log, commit_message
 
-CONNECTION = {
-    "id": "station00/edge",
-    "type": 1,
-    "requester_ids": ["vehicle00"],
-    "source_node_id": "station00",
-    "target_node_id": "edge",
-    "source_topics": ["/stations/station00/pointcloud"],
-    "target_topics": ["/stations/station00/pointcloud"],
-}
+from tests.kit import goals
+from tests.kit.repo import git
+
+CONNECTION = goals.connection(
+    "station00/edge", ends=("station00", "edge"), topics=[goals.STATION_CLOUD[0]], broker=""
+)
 
 
 def test_a_join_says_what_starts_for_whom_and_what_is_missing(desk: Any) -> None:
@@ -91,18 +87,8 @@ def test_a_further_topic_says_what_of_a_release_changes(desk: Any) -> None:
 
 def test_a_release_says_what_stops_and_what_was_not_held(desk: Any) -> None:
     desk.join("vehicle00")
-    goal = {
-        "id": "intersection",
-        "shutdown": True,
-        "apps": [
-            {
-                "header": {"id": "edge/fusion", "node_id": "edge"},
-                "type": 1,
-                "object_detection_fusion_app": {"requester_ids": ["vehicle00"]},
-            }
-        ],
-        "connections": [CONNECTION],
-    }
+    app = goals.application("edge/fusion", clouds=[])
+    goal = goals.goal([app], [CONNECTION], id="intersection", shutdown=True)
     text = commit_message.of_decision(desk.send(goal), "op-3", desk.now)
     assert text == (
         "Release edge/fusion\n"
@@ -227,13 +213,14 @@ def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly
         assert len(who.name) <= 200
         assert commit_log.entry_of(repo[commit].peel(pygit2.Commit)).trailers["Requester"] == [name]
     repo.references.create("refs/heads/main", parents[0])
-    fsck = _git(repo, "fsck", "--strict", "--no-dangling")
+    command = ["git", "-C", repo.path, "fsck", "--strict", "--no-dangling", "--no-progress"]
+    fsck = subprocess.run(command, capture_output=True, text=True, check=False)
     read_back = {
-        name: _git(repo, "log", "-1", "--format=%(trailers:key=Requester,valueonly)", commit)
+        name: git(repo.path, "log", "-1", "--format=%(trailers:key=Requester,valueonly)", commit)
         for name, commit in commits.items()
     }
-    assert read_back == {name: f"{name}\n\n" for name in commits}
-    assert fsck == ""
+    assert read_back == {name: f"{name}\n" for name in commits}
+    assert (fsck.returncode, fsck.stdout, fsck.stderr) == (0, "", "")
     assert failed == []
 
 
@@ -257,13 +244,3 @@ def test_the_author_is_the_requesters_as_listed(
     demand = decision.changes.claims[0].key.demand
     assert who.email == f"{demand}@demandops.invalid"
     assert (who.time, who.offset) == (int(desk.now.timestamp()), 0)
-
-
-def _git(repo: pygit2.Repository, *args: str) -> str:
-    done = subprocess.run(
-        ["git", "-C", str(Path(repo.path)), *args],
-        capture_output=True,
-        check=False,
-        env={"PATH": "/usr/bin:/bin", "GIT_CONFIG_GLOBAL": "/dev/null"},
-    )
-    return (done.stdout + done.stderr).decode()

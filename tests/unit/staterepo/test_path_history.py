@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
 from random import Random
 
@@ -10,6 +9,8 @@ import pygit2
 import pytest
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import path_history
+
+from tests.kit.repo import git
 
 PATH = "clusters/c/d/n/r.yaml"
 
@@ -32,19 +33,10 @@ class History:
         self.made.append(made)
         return made
 
-    def git(self, path: str) -> set[str]:
-        command = [
-            "git",
-            "-C",
-            self.repo.path,
-            "log",
-            "--format=%H",
-            str(self.made[-1]),
-            "--",
-            path,
-        ]
-        said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-        return set(said.split())
+    def by_git(self, path: str) -> set[str]:
+        return set(
+            git(self.repo.path, "log", "--format=%H", str(self.made[-1]), "--", path).split()
+        )
 
     def ours(self, path: str) -> list[str]:
         return [t.entry.commit for t in path_history.changes_to(self.repo, self.made[-1], path)]
@@ -66,7 +58,7 @@ def test_the_same_commits_as_git_log(tmp_path: Path, seed: int) -> None:
         history.commit(text, *chosen)
     for path in (PATH, "clusters/c", "nothing"):
         ours = history.ours(path)
-        assert set(ours) == history.git(path)
+        assert set(ours) == history.by_git(path)
         assert len(ours) == len(set(ours))
 
 

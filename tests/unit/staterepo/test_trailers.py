@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pygit2
@@ -14,6 +11,8 @@ from demandops.staterepo.history import commit_log, commit_message
 from demandops.staterepo.history.commit_log import operations_since, trailers_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+from tests.kit.repo import git
 
 
 @pytest.mark.parametrize(
@@ -71,20 +70,13 @@ def test_every_id_is_read_back_by_git_and_by_us_as_it_was(
     assert ours["Request-Id"] == [request]
     assert ours["Application"] == [application]
     for key, values in ours.items():
-        assert _by_git(Path(repo.path), str(commit), key) == values
+        assert _by_git(repo.path, str(commit), key) == values
 
 
-def _by_git(repo: Path, commit: str, key: str) -> Sequence[str]:
-    shown = subprocess.run(
-        [
-            *("git", "-C", str(repo), "log", "-1", "--encoding=UTF-8"),
-            f"--format=%(trailers:key={key},valueonly)",
-            commit,
-        ],
-        capture_output=True,
-        check=True,
-    )
-    return shown.stdout.decode().removesuffix("\n\n").split("\n")
+def _by_git(repo: str, commit: str, key: str) -> list[str]:
+    form = f"--format=%(trailers:key={key},valueonly)"
+    shown = git(repo, "log", "-1", "--encoding=UTF-8", form, commit)
+    return shown.removesuffix("\n").split("\n")
 
 
 # ---- which demands arrived ----
