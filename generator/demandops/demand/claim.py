@@ -10,9 +10,9 @@ from datetime import datetime
 from enum import Enum
 from types import MappingProxyType
 
+from demandops.connections.route import Route
 from demandops.demand.demand_request import OVERRIDE_PREFIX, ConnectionType, InputTopic
 from demandops.demand.lease import Lease
-from demandops.demand.route import Route
 
 
 class SubjectKind(Enum):

@@ -18,8 +18,8 @@ from demandops.config.config import (
     Config,
 )
 from demandops.config.inventory import Broker, Node
+from demandops.connections.route import Route
 from demandops.demand.demand_request import ConnectionDemand, ConnectionType, DemandRequest
-from demandops.demand.route import Route
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import topic_problem
 

@@ -17,6 +17,7 @@ from pydantic import Field, PlainValidator
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel
 from demandops.config.policy import seconds_of
+from demandops.connections.route import RouteOptions
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -26,7 +27,6 @@ from demandops.demand.demand_request import (
     Operation,
 )
 from demandops.demand.goal_validation import parse_valid_part
-from demandops.demand.route import RouteOptions
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import absolute_topic
 from demandops.settings import API_VERSION

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from enum import Enum
 from types import MappingProxyType
 
-from demandops.demand import route as routes
+from demandops.connections import route as routes
+from demandops.connections.route import Route
 from demandops.demand.lease import LONGEST_S, Term
-from demandops.demand.route import Route
 from demandops.errors import Fault, fault
 from demandops.identifiers import id_problem, topic_problem
 

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.base_model import FrozenModel
+from demandops.connections.route import Route
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
@@ -25,7 +26,6 @@ from demandops.demand.demand_request import (
     Operation,
 )
 from demandops.demand.goal_validation import parse_valid_part
-from demandops.demand.route import Route
 from demandops.errors import Fault, fault
 from demandops.identifiers import absolute_topic
 

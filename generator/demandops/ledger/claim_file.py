@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel, parse
+from demandops.connections.route import Route, RouteOptions
 from demandops.demand.claim import (
     ApplicationClaim,
     Claim,
@@ -27,7 +28,6 @@ from demandops.demand.claim import (
 )
 from demandops.demand.demand_request import ConnectionType, InputTopic
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
-from demandops.demand.route import Route, RouteOptions
 from demandops.errors import InvalidInput, fault
 from demandops.settings import LEDGER_API_VERSION
 

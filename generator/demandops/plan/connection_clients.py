@@ -12,16 +12,16 @@ from functools import lru_cache
 from types import MappingProxyType
 from typing import Literal
 
+from demandops import naming
 from demandops.config.config import Config
 from demandops.config.inventory import Node
-from demandops.demand import route as routes
+from demandops.connections import route as routes
+from demandops.connections.route import Route
 from demandops.demand.claim import ConnectionClaim
 from demandops.demand.connection_type_choice import choose_broker, message_type, route_faults
 from demandops.demand.demand_request import ConnectionType
-from demandops.demand.route import Route
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.ledger import Ledger
-from demandops.plan import naming
 from demandops.plan.release import Address, Bridge, MqttEnd, RosEnd, node_and_domain
 
 Side = Literal["source", "target"]

@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from demandops.config.config import Config
+from demandops.connections.route import Route
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
     DemandRequest,
     InputTopic,
 )
-from demandops.demand.route import Route
 from demandops.identifiers import topic_problem
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import outputs

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from types import MappingProxyType
 
+from demandops import naming
 from demandops.config.appdef import ApplicationDefinition, Parameter, Scaling, Service
 from demandops.config.config import Config
 from demandops.config.override import Override
@@ -16,7 +17,7 @@ from demandops.demand.claim import ApplicationClaim, Subject, SubjectKind
 from demandops.demand.demand_request import InputTopic
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import Ledger
-from demandops.plan import connection_clients, naming, parameters
+from demandops.plan import connection_clients, parameters
 from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.suspended_claims import without_suspended

@@ -13,8 +13,8 @@ from demandops.config.inventory import Broker, Node
 from demandops.config.override import Override
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import ChartSource, Image
+from demandops.connections.route import Route
 from demandops.demand.demand_request import ConnectionType, InputTopic
-from demandops.demand.route import Route
 from demandops.errors import Refused, fault
 
 

@@ -6,8 +6,15 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
+from demandops.connections.route import (
+    Route,
+    RouteOptions,
+    contradictions,
+    faults,
+    merge_routes,
+    parse,
+)
 from demandops.demand import connection_type_choice
-from demandops.demand.route import Route, RouteOptions, contradictions, faults, merge_routes, parse
 
 OPTIONS: dict[str, object] = {
     "type": "std_msgs/msg/String",

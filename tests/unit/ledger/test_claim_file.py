@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import datetime, timedelta, timezone
 from types import MappingProxyType
 
+from demandops.connections.route import Route, merge_routes
 from demandops.demand.claim import (
     ApplicationClaim,
     Claim,
@@ -15,7 +16,6 @@ from demandops.demand.claim import (
     demand_id,
 )
 from demandops.demand.demand_request import ConnectionType, InputTopic, id_problem
-from demandops.demand.route import Route, merge_routes
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from hypothesis import given

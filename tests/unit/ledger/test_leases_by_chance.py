@@ -12,11 +12,11 @@ from types import MappingProxyType
 from typing import Any
 
 from demandops.config.load import load
+from demandops.connections.route import Route, merge_routes
 from demandops.decision import Decision, State
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim
 from demandops.demand.demand_request import ConnectionType, InputTopic
 from demandops.demand.lease import LONGEST_S, Lease
-from demandops.demand.route import Route, merge_routes
 from demandops.identifiers import id_problem
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.connections.route import Route, merge_routes
 from demandops.demand.claim import ConnectionClaim, demand_id
 from demandops.demand.demand_request import (
     ConnectionDemand,
@@ -16,7 +17,6 @@ from demandops.demand.demand_request import (
     DemandRequest,
     Operation,
 )
-from demandops.demand.route import Route, merge_routes
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger import claim_file
 from demandops.ledger.apply import apply

@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import pytest
 import yaml
 from demandops.config.load import load
+from demandops.connections.route import Route
 from demandops.decision import Decision, State, rendered_files
 from demandops.demand.claim import Subject, SubjectKind
-from demandops.demand.route import Route
 from demandops.errors import InvalidInput, Refused
 from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.release_keys import affected_keys

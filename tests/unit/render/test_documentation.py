@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 import yaml
+from demandops.connections.route import RouteOptions
 from demandops.demand import connection_type_choice
-from demandops.demand.route import RouteOptions
 
 from tests.kit.config import skeleton
 from tests.kit.memory import MemoryRepo as Books

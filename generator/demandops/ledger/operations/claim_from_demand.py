@@ -8,7 +8,7 @@ from datetime import datetime
 from types import MappingProxyType
 from typing import TypeVar
 
-from demandops.demand import route as routes
+from demandops.connections import route as routes
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim
 from demandops.demand.demand_request import (
     ApplicationDemand,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from demandops.demand import route as routes
+from demandops.connections import route as routes
+from demandops.connections.route import Route
 from demandops.demand.claim import ApplicationClaim, ConnectionClaim
 from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, ConnectionType
-from demandops.demand.route import Route
 from demandops.errors import Fault, fault
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from demandops.config.config import Config
-from demandops.demand.route import Route
+from demandops.connections.route import Route
 from demandops.errors import Refused
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import ClaimChange, Ledger

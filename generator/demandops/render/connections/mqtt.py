@@ -11,11 +11,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from demandops import strict_yaml
+from demandops import naming, strict_yaml
 from demandops.config.config import MQTT_CLIENT_IMAGE, Config
 from demandops.config.inventory import Broker
-from demandops.demand.route import Route
-from demandops.plan import naming
+from demandops.connections.route import Route
 from demandops.plan.release import MqttEnd
 from demandops.render.connections import client_pod, client_schema
 from demandops.render.engine import Engine

@@ -11,7 +11,7 @@ from typing import Any
 
 from demandops import strict_yaml
 from demandops.config.config import DDS_ROUTER_IMAGE, Config
-from demandops.demand.route import Route
+from demandops.connections.route import Route
 from demandops.plan.release import Address, RosEnd
 from demandops.render.connections import client_pod, client_schema
 from demandops.render.engine import Engine

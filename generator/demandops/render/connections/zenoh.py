@@ -10,8 +10,8 @@ import json
 import re
 from typing import Any
 
+from demandops import naming
 from demandops.config.config import ZENOH_BRIDGE_IMAGE, Config
-from demandops.plan import naming
 from demandops.plan.release import Bridge
 from demandops.render.connections import client_pod, client_schema
 from demandops.render.engine import Engine
