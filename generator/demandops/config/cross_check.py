@@ -13,7 +13,6 @@ from demandops.config.config import (
     CLUSTERS_FILE,
     DOMAINS_FILE,
     IMAGES_FILE,
-    MQTT_CLIENT_IMAGE,
     NODES_FILE,
     Config,
 )
@@ -25,6 +24,7 @@ from demandops.config.registry import ChartSource
 from demandops.errors import InvalidInput, suggestion
 
 _CONNECTION_PREFIXES = ("mqtt", "zenoh", "ros")
+MQTT_CLIENT_IMAGE = "mqtt-client"
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:

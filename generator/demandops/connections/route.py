@@ -58,6 +58,14 @@ class Route:
         """The topic on the node that messages go to."""
         return self.source if self.reverse else self.target
 
+    @property
+    def fact(self) -> str:
+        """The route in words: ``topic /a to /b (qos 1)``."""
+        options = self.options()
+        direction = "from" if options.pop("reverse", False) else "to"
+        listed = ", ".join(f"{name} {value}" for name, value in options.items())
+        return f"topic {self.source} {direction} {self.target}" + (f" ({listed})" if listed else "")
+
     def sender_and_receiver(self, source: str, target: str) -> tuple[str, str]:
         """Return the sending and the receiving node of a connection between two nodes."""
         return (target, source) if self.reverse else (source, target)

@@ -18,9 +18,9 @@ from demandops.config.appdef import ApplicationDefinition
 from demandops.config.base_model import FrozenModel
 from demandops.connections.route import Route
 from demandops.demand.demand_request import (
+    AUTO,
     ApplicationDemand,
     ConnectionDemand,
-    ConnectionType,
     DemandRequest,
     InputTopic,
     Operation,
@@ -199,7 +199,7 @@ def _connection(connection: WireConnection, *, valid_type: bool) -> ConnectionDe
     )
     return ConnectionDemand(
         id=connection.id,
-        type=connection.type if valid_type else ConnectionType.AUTO.value,
+        type=connection.type if valid_type else AUTO,
         source=connection.source_node_id,
         target=connection.target_node_id,
         topics=tuple(

@@ -110,7 +110,7 @@ def _connection(
             route = claim.topics.get(topic)
             ends = (claim.source, claim.target)
             if ends == (source, app.node) and route is not None and not route.reverse:
-                return _demand(app, id, claim.type.value, source, route)
+                return _demand(app, id, claim.type.number, source, route)
     return _demand(app, f"derived/{source}/{app.node}", app.connect, source, Route(topic, topic))
 
 

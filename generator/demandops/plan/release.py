@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass
+from typing import Any
 
 from demandops.config.appdef import Service
-from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
-from demandops.config.inventory import Broker, Node
+from demandops.config.config import Config
+from demandops.config.inventory import Node
 from demandops.config.override import Override
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import ChartSource, Image
-from demandops.connections.route import Route
-from demandops.demand.demand_request import ConnectionType, InputTopic
-from demandops.errors import Refused, fault
+from demandops.connections.communication_client import Client
+from demandops.demand.demand_request import InputTopic
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,98 +85,65 @@ class ServiceRelease:
     requesters: tuple[str, ...]
     shaping: Shaping = UNSHAPED
 
+    @property
+    def images(self) -> tuple[str, ...]:
+        """The registry's names of its images."""
+        return self.service.images
 
-@dataclass(frozen=True, slots=True)
-class ConnectionEnd:
-    """The desired state of one end of a connection: one communication client."""
+    @property
+    def description(self) -> str:
+        """What it is, for commit messages."""
+        return f"{self.key.service} on {self.node.id} for {self.key.source or self.key.application}"
 
-    type: ClassVar[ConnectionType]
-
-    connection: str
-    side: Literal["source", "target"]
-    name: str
-    node: Node
-    peer: str
-    domain: AccessDomain
-    topics: Mapping[str, Route]
-    shaping: Shaping = field(default=UNSHAPED, kw_only=True)
-
-    def reads(self, route: Route) -> bool:
-        """Return whether this end reads the topic from ROS, and the other end publishes it."""
-        return route.reverse is (self.side == "target")
+    def facts(self) -> list[str]:
+        """Return what people should know of it, one line each."""
+        return [
+            *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
+            *(f"{name} = {value}" for name, value in self.parameters.items()),
+            f"replicas {self.replicas}",
+        ]
 
 
 @dataclass(frozen=True, slots=True)
-class MqttEnd(ConnectionEnd):
-    """One end of an MQTT connection."""
+class ClientRelease:
+    """The desired state of one communication client: one file of plain manifests."""
 
-    type = ConnectionType.MQTT
-
-    broker: Broker
-    channel: str
-    """The prefix of this connection's MQTT topics, the same at both ends."""
-
-
-@dataclass(frozen=True, slots=True)
-class RosEnd(ConnectionEnd):
-    """One end of a ROS connection. Every route of ``topics`` has its message type."""
-
-    type = ConnectionType.ROS
-
-    listens: bool
-    address: Address
-    """The address of the end that listens, the same at both ends."""
-
-
-@dataclass(frozen=True, slots=True)
-class Address:
-    """The host and port at which one DDS Router listens for the other."""
-
-    host: str
-    port: int
-    transport: str
-
-
-@dataclass(frozen=True, slots=True)
-class Bridge:
-    """The desired state of a node's Zenoh bridge, which serves all its Zenoh connections.
-
-    ``publishers`` are the topics that it reads from the node's ROS graph, ``subscribers`` those
-    that it publishes there. ``rates`` limits the messages per second of a topic that it reads.
-    """
-
-    name: str
-    node: Node
-    domain: AccessDomain
-    connections: tuple[str, ...]
-    publishers: tuple[str, ...]
-    subscribers: tuple[str, ...]
-    rates: Mapping[str, float]
-    connect: tuple[str, ...]
-    listen: tuple[str, ...]
+    client: Client
     shaping: Shaping = UNSHAPED
 
+    @property
+    def name(self) -> str:
+        """The client's name."""
+        return self.client.name
 
-Release = ServiceRelease | MqttEnd | RosEnd | Bridge
+    @property
+    def node(self) -> Node:
+        """The node that it runs on."""
+        return self.client.node
+
+    @property
+    def domain(self) -> AccessDomain:
+        """The access domain of its node."""
+        return self.client.domain
+
+    @property
+    def connections(self) -> tuple[str, ...]:
+        """The connections that it carries."""
+        return self.client.connections
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """The registry's names of its images."""
+        return (self.client.type.image,)
+
+    @property
+    def description(self) -> str:
+        """What it is, for commit messages."""
+        return self.client.description
+
+    def facts(self) -> list[str]:
+        """Return what people should know of it, one line each."""
+        return self.client.facts()
 
 
-def node_and_domain(config: Config, node_id: str) -> tuple[Node, AccessDomain]:
-    """Return a node and its access domain.
-
-    Raises:
-        Refused: if a node in use was removed from the inventory or its access domain.
-    """
-    node, domain = config.nodes.get(node_id), config.domain_of.get(node_id)
-    if node is None or domain is None:
-        missing = NODES_FILE if node is None else "any access domain"
-        raise Refused(
-            [
-                fault(
-                    "node",
-                    f"'{node_id}' is in use, but not in {missing}; restore it, or release "
-                    f"what it holds: demandops decommission {shlex.quote(node_id)}",
-                    code="unknown-node",
-                ).within(NODES_FILE if node is None else DOMAINS_FILE)
-            ]
-        )
-    return node, domain
+Release = ServiceRelease | ClientRelease

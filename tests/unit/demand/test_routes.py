@@ -6,6 +6,7 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
+from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.route import (
     Route,
     RouteOptions,
@@ -14,7 +15,6 @@ from demandops.connections.route import (
     merge_routes,
     parse,
 )
-from demandops.demand import connection_type_choice
 
 OPTIONS: dict[str, object] = {
     "type": "std_msgs/msg/String",
@@ -54,7 +54,7 @@ def test_options_and_routes_have_the_same_fields_and_defaults() -> None:
 
 
 def test_every_option_does_something_in_some_client() -> None:
-    honoured = set().union(*connection_type_choice.SUPPORTED_OPTIONS.values())
+    honoured = frozenset().union(*(known.options for known in CONNECTION_TYPES))
     assert honoured == RouteOptions.model_fields.keys() - {"type", "reverse"}
 
 

@@ -12,15 +12,17 @@ from typing import Any, ClassVar
 import pytest
 import yaml
 from demandops.config.load import load
+from demandops.connections.communication_client import ClientKey
+from demandops.connections.mqtt import MQTT
+from demandops.connections.ros import dds_type
 from demandops.connections.route import Route
+from demandops.connections.zenoh import ZENOH
 from demandops.decision import Decision, State, rendered_files
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import InvalidInput, Refused
-from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
-from demandops.render.connections import client_schema
-from demandops.render.connections.ros import dds_type
+from demandops.render.connection_client import check_configuration
 
 from tests.kit.carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.config import skeleton
@@ -77,7 +79,7 @@ class TestZenoh:
         world.send(demand("zenoh"))
         subject = Subject(SubjectKind.CONNECTION, "c")
         keys = affected_keys(before, world.state.ledger, world.state.config, [subject])
-        assert keys == (BridgeKey("vehicle00"), BridgeKey("edge"))
+        assert keys == (ClientKey(ZENOH, "vehicle00"), ClientKey(ZENOH, "edge"))
         assert [(found.name, found.change) for found in world.releases] == [
             ("zenoh-vehicle00", "start"),
             ("zenoh-edge", "change"),
@@ -90,7 +92,7 @@ class TestZenoh:
         world.send(demand("mqtt"))
         subject = Subject(SubjectKind.CONNECTION, "c")
         keys = affected_keys(before, world.state.ledger, world.state.config, [subject])
-        assert keys == (EndKey("c", "source"), EndKey("c", "target"))
+        assert keys == (ClientKey(MQTT, "c", "source"), ClientKey(MQTT, "c", "target"))
 
     def test_its_cost_does_not_grow_with_connections_elsewhere(self) -> None:
         world = zenoh_world()
@@ -386,7 +388,7 @@ class TestSchemas:
     )
     def test_it_is_told(self, kind: str, configuration: dict[str, Any], expected: str) -> None:
         with pytest.raises(InvalidInput) as invalid:
-            client_schema.check(kind, configuration, "x")
+            check_configuration(kind, configuration, "x")
         assert expected in [str(found) for found in invalid.value.faults]
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
@@ -397,11 +399,11 @@ class TestSchemas:
         for data in world.clients().values():
             (text,) = data.values()
             whole = yaml.safe_load(text)
-            client_schema.check(kind, whole, "x")
+            check_configuration(kind, whole, "x")
             for spot in _mappings(whole):
                 spot["surplus"] = 1
                 with pytest.raises(InvalidInput):
-                    client_schema.check(kind, whole, "x")
+                    check_configuration(kind, whole, "x")
                 del spot["surplus"]
 
 

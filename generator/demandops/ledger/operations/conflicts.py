@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from demandops.connections import route as routes
 from demandops.connections.route import Route
 from demandops.demand.claim import ApplicationClaim, ConnectionClaim
-from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, ConnectionType
+from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand
 from demandops.errors import Fault, fault
 
 
@@ -50,7 +50,7 @@ def connection_conflicts(
     for claim in existing:
         held = f"'{demanded.id}' is held by {', '.join(claim.requesters)}"
         for name, new, current in (
-            ("type", ConnectionType(demanded.type).name, claim.type.name),
+            ("type", str(demanded.chosen_type), claim.type.name),
             ("source", demanded.source, claim.source),
             ("target", demanded.target, claim.target),
             ("broker", demanded.broker, claim.broker),

@@ -6,14 +6,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from demandops.config.config import (
-    BROKERS_FILE,
     CHARTS_FILE,
-    DDS_ROUTER_IMAGE,
     DOMAINS_FILE,
     IMAGES_FILE,
-    MQTT_CLIENT_IMAGE,
     NODES_FILE,
-    ZENOH_BRIDGE_IMAGE,
     Config,
 )
 from demandops.config.override import OVERRIDES_ROOT, Override
@@ -22,7 +18,7 @@ from demandops.demand.claim import ApplicationClaim, Claim, Subject, demand_id, 
 from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import denied_release, plan
-from demandops.plan.release import Bridge, MqttEnd, Release, ServiceRelease
+from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import all_keys, keys_of
 
 
@@ -67,8 +63,7 @@ def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
         users = (claim for id in release.applications for claim in ledger.application_claims(id))
         claims = [claim for claim in users if _takes(claim, release)]
     else:
-        ids = release.connections if isinstance(release, Bridge) else (release.connection,)
-        claims = [claim for id in ids for claim in ledger.connection_claims(id)]
+        claims = [claim for id in release.connections for claim in ledger.connection_claims(id)]
     return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
 
 
@@ -94,8 +89,15 @@ def how_to_release(claim: Claim) -> str:
 def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
     """Return people's files that decide what a release is and where it runs."""
     found = [ShapingFile(ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}")]
-    of_kind = _service if isinstance(release, ServiceRelease) else _client
-    found += of_kind(release, config)
+    if isinstance(release, ServiceRelease):
+        found += _service_files(release, config)
+    else:
+        found += [ShapingFile(*entry) for entry in release.client.shaping_entries()]
+    found += [
+        ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
+        for image in release.images
+        if image in config.images
+    ]
     found.append(ShapingFile(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))
     domain = release.domain
     return [*found, ShapingFile(DOMAINS_FILE, domain.name, f"namespace {domain.namespace}")]
@@ -121,8 +123,7 @@ def keeping_override(claim: Claim, config: Config) -> Override | None:
     )
 
 
-def _service(release: Release, config: Config) -> Iterator[ShapingFile]:
-    assert isinstance(release, ServiceRelease)  # noqa: S101 - the caller checks the type
+def _service_files(release: ServiceRelease, config: Config) -> Iterator[ShapingFile]:
     folder = f"appdefs/{release.appdef}"
     yield ShapingFile(f"{folder}/appdef.yaml", f"services.{release.key.service}", "what it is")
     yield ShapingFile(
@@ -131,17 +132,3 @@ def _service(release: Release, config: Config) -> Iterator[ShapingFile]:
     chart, name = release.chart, release.service.chart
     where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
     yield ShapingFile(CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}")
-    for image in release.service.images:
-        yield ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
-
-
-def _client(release: Release, config: Config) -> Iterator[ShapingFile]:
-    image = DDS_ROUTER_IMAGE
-    if isinstance(release, Bridge):
-        image = ZENOH_BRIDGE_IMAGE
-    elif isinstance(release, MqttEnd):
-        image = MQTT_CLIENT_IMAGE
-        broker = release.broker
-        yield ShapingFile(BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}")
-    if image in config.images:
-        yield ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
