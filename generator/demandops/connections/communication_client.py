@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from demandops import strict_yaml
 from demandops.config.inventory import Node
+from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
 from demandops.connections.route import Route
 
@@ -46,6 +47,12 @@ class Client(ABC):
     domain: AccessDomain
     connections: tuple[str, ...]
     """The connections that it carries."""
+    shaping: Shaping = field(default=UNSHAPED, kw_only=True)
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """The registry's names of its images."""
+        return (self.type.image,)
 
     @property
     @abstractmethod
@@ -67,10 +74,6 @@ class Client(ABC):
     def needs_restart(self, configuration: dict[str, Any]) -> dict[str, Any]:
         """Return the part of a configuration that the program reads only at its start."""
         return configuration
-
-    def variables(self) -> dict[str, object]:
-        """Return what else the template needs."""
-        return {}
 
     def shaping_entries(self) -> Iterable[tuple[str, str, str]]:
         """Return (file, entry, what it decides) for entries of the configuration that shape it."""

@@ -30,18 +30,6 @@ from demandops.errors import Fault, fault, quoted
 CA_FILE = "/tls/ca.crt"
 """The path where the certificate of the broker's authority is mounted."""
 
-COMPOSE = """\
-import json, os, pathlib
-os.umask(0o077)
-user, password = (
-    pathlib.Path("/secret", name).read_text().rstrip("\\n") for name in ("user", "password")
-)
-broker = {"broker": {"user": user, "pass": password}}
-text = json.dumps({"/**/*": {"ros__parameters": broker}}, ensure_ascii=False)
-pathlib.Path("/credentials/params.yaml").write_text(text)
-"""
-"""The init container's program: it turns the Secret into a ROS parameter file in memory."""
-
 _NO_BROKER = "no-broker"
 
 
@@ -151,10 +139,6 @@ class MqttEnd(End):
             "bridge": bridge,
         }
         return {"/**/*": {"ros__parameters": parameters}}
-
-    def variables(self) -> dict[str, object]:
-        """Return the ROS node's name, and the program that reads the credentials."""
-        return {"ros_node": naming.ros_name(self.name), "compose": COMPOSE}
 
 
 def _broker(broker: Broker) -> dict[str, Any]:

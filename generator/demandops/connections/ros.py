@@ -15,7 +15,7 @@ from typing import Any
 
 from demandops import naming
 from demandops.config.config import NODES_FILE, Config
-from demandops.config.inventory import Node
+from demandops.config.inventory import Node, Wan
 from demandops.connections.communication_client import ClientKey, End
 from demandops.connections.connection_type import (
     UNSUPPORTED,
@@ -27,9 +27,6 @@ from demandops.connections.connection_type import (
 )
 from demandops.connections.route import Route
 from demandops.errors import Fault, fault
-
-RELOAD_SECONDS = 10
-"""How often a router reads its file again: its file watcher misses ConfigMap changes."""
 
 _LOCAL, _WAN = "local", "wan"
 
@@ -83,24 +80,25 @@ class Ros(ConnectionType):
             for name, route in connection.topics.items()
         }
         listener = _listener(connection, config)
-        if listener is None:
+        if listener is None or listener.wan is None:
             message = f"connection '{key.id}' has no end with a wan address any longer; restore one"
             raise unplannable("connections", message)
-        address = _address(key.id, listener)
+        port = _port(key.id, listener.wan)
         for other in connections.at(listener.id):
-            if other == key.id or _address(other, listener) != address:
+            if other == key.id or _port(other, listener.wan) != port:
                 continue
             found = connections.get(other)
             if found is not None and _listener(found, config) is listener:
                 message = (
-                    f"connection '{key.id}' would listen on port {address.port} of "
+                    f"connection '{key.id}' would listen on port {port} of "
                     f"'{listener.id}', as '{other}' does; use another connection id, or widen "
                     "firstPort and lastPort of its wan"
                 )
                 raise unplannable("connections", message)
-        listens = listener.id == (connection.target if key.side == "target" else connection.source)
         connection = replace(connection, topics=MappingProxyType(typed))
-        return make_end(RosEnd, key, connection, config, listens=listens, address=address)
+        return make_end(
+            RosEnd, key, connection, config, listener=listener.id, wan=listener.wan, port=port
+        )
 
 
 ROS = Ros()
@@ -121,21 +119,9 @@ def _listener(ends: Ends, config: Config) -> Node | None:
     return None
 
 
-@dataclass(frozen=True, slots=True)
-class Address:
-    """The host and port at which one DDS Router listens for the other."""
-
-    host: str
-    port: int
-    transport: str
-
-
-def _address(connection: str, listener: Node) -> Address:
-    """Return the address of a connection's routers; its port depends on the connection id only."""
-    wan = listener.wan
-    assert wan is not None  # noqa: S101 - a listener has one
-    ports = wan.last_port - wan.first_port + 1
-    return Address(wan.host, wan.first_port + _number(connection) % ports, wan.transport)
+def _port(connection: str, wan: Wan) -> int:
+    """Return the port of a connection's routers; it depends on the connection id only."""
+    return wan.first_port + _number(connection) % (wan.last_port - wan.first_port + 1)
 
 
 @lru_cache(maxsize=65_536)
@@ -148,14 +134,15 @@ def _number(connection: str) -> int:
 class RosEnd(End):
     """One end of a ROS connection. Every route of ``topics`` has its message type."""
 
-    listens: bool
-    address: Address
-    """The address of the end that listens, the same at both ends."""
+    listener: str
+    """The node that listens, at ``port`` of its address ``wan``."""
+    wan: Wan
+    port: int
 
     @property
     def meeting_point(self) -> str:
         """The address."""
-        return f"address {self.address.host}:{self.address.port}"
+        return f"address {self.wan.host}:{self.port}"
 
     def configuration(self) -> dict[str, Any]:
         """Return the configuration of one end's router.
@@ -173,7 +160,12 @@ class RosEnd(End):
                 tuned.append({**topic, "qos": qos})
             if route.reverse:
                 reverse.append({**topic, "routes": inward if reads else outward})
-        address = "listening-addresses" if self.listens else "connection-addresses"
+        listens = self.node.id == self.listener
+        address = {
+            "ip" if _is_ip(self.wan.host) else "domain": self.wan.host,
+            "port": self.port,
+            "transport": self.wan.transport,
+        }
         return {
             "version": "v5.0",
             "allowlist": topics,
@@ -182,17 +174,17 @@ class RosEnd(End):
             **({"topic-routes": reverse} if reverse else {}),
             "participants": [
                 {"name": _LOCAL, "kind": "local", "domain": self.node.ros.domain_id},
-                {"name": _WAN, "kind": "wan", address: [_address_entry(self.address)]},
+                {
+                    "name": _WAN,
+                    "kind": "wan",
+                    "listening-addresses" if listens else "connection-addresses": [address],
+                },
             ],
         }
 
     def needs_restart(self, configuration: dict[str, Any]) -> dict[str, Any]:
         """Return all except the list of topics."""
         return {name: value for name, value in configuration.items() if name != "allowlist"}
-
-    def variables(self) -> dict[str, object]:
-        """Return how often the router reads its file."""
-        return {"reload_seconds": RELOAD_SECONDS}
 
 
 def dds_type(ros_type: str) -> str:
@@ -220,11 +212,8 @@ def _qos(route: Route, *, reads: bool) -> dict[str, Any]:
     return qos
 
 
-def _address_entry(address: Address) -> dict[str, Any]:
+def _is_ip(host: str) -> bool:
     try:
-        ipaddress.ip_address(address.host)
+        return bool(ipaddress.ip_address(host))
     except ValueError:
-        host = "domain"
-    else:
-        host = "ip"
-    return {host: address.host, "port": address.port, "transport": address.transport}
+        return False

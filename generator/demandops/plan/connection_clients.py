@@ -8,14 +8,13 @@ from types import MappingProxyType
 
 from demandops.config.config import Config
 from demandops.connections import route as routes
-from demandops.connections.communication_client import ClientKey
+from demandops.connections.communication_client import Client, ClientKey
 from demandops.connections.connection_type import Connection, ConnectionType
 from demandops.connections.route import Route
 from demandops.demand.claim import ConnectionClaim
 from demandops.demand.connection_type_choice import route_faults
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
-from demandops.plan.release import ClientRelease
 
 
 def client_keys(ledger: Ledger, connection: str) -> Iterator[ClientKey]:
@@ -24,14 +23,13 @@ def client_keys(ledger: Ledger, connection: str) -> Iterator[ClientKey]:
         yield from claim.type.keys(connection, claim.source, claim.target)
 
 
-def client_release(ledger: Ledger, config: Config, key: ClientKey) -> ClientRelease | None:
+def client_at(ledger: Ledger, config: Config, key: ClientKey) -> Client | None:
     """Return the client at a key, or ``None`` if it carries no topic.
 
     Raises:
         Refused: if claims contradict each other, or the configuration no longer has what they need.
     """
-    client = key.type.client(key, _ClaimedConnections(ledger, config, key.type), config)
-    return ClientRelease(client) if client else None
+    return key.type.client(key, _ClaimedConnections(ledger, config, key.type), config)
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,7 +49,7 @@ def denied_release(
 def _unshaped(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
     if isinstance(key, ServiceKey):
         return _service(ledger, config, key)
-    return connection_clients.client_release(ledger, config, key)
+    return connection_clients.client_at(ledger, config, key)
 
 
 def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease | None:

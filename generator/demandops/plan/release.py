@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from demandops.config.appdef import Service
-from demandops.config.config import Config
 from demandops.config.inventory import Node
-from demandops.config.override import Override
+from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
-from demandops.config.registry import ChartSource, Image
+from demandops.config.registry import ChartSource
 from demandops.connections.communication_client import Client
+from demandops.demand.claim import Claim
 from demandops.demand.demand_request import InputTopic
+from demandops.ledger.ledger import Ledger
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,41 +29,6 @@ class ServiceKey:
     application: str | None = None
     source: str | None = None
     topic: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Shaping:
-    """The overrides that shape a release, with the effects of each; the last one wins."""
-
-    by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
-
-    def image(self, image: str, config: Config) -> Image:
-        """Return an image of the registry, with the pins of overrides."""
-        found = config.images[image]
-        for override, effects in self.by:
-            if "images" in effects and override.images and image in override.images:
-                found = override.images[image].over(found)
-        return found
-
-    @property
-    def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """The files that patch values, and their patches."""
-        return tuple(
-            (override.path, override.values or {})
-            for override, effects in self.by
-            if "values" in effects
-        )
-
-    @property
-    def held(self) -> bool:
-        """Whether a ``hold`` applies that no higher override changes, so the file stays."""
-        held = False
-        for _, effects in self.by:
-            held = "hold" in effects or (held and set(effects) <= {"keep"})
-        return held
-
-
-UNSHAPED = Shaping()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,46 +69,11 @@ class ServiceRelease:
         ]
 
 
-@dataclass(frozen=True, slots=True)
-class ClientRelease:
-    """The desired state of one communication client: one file of plain manifests."""
-
-    client: Client
-    shaping: Shaping = UNSHAPED
-
-    @property
-    def name(self) -> str:
-        """The client's name."""
-        return self.client.name
-
-    @property
-    def node(self) -> Node:
-        """The node that it runs on."""
-        return self.client.node
-
-    @property
-    def domain(self) -> AccessDomain:
-        """The access domain of its node."""
-        return self.client.domain
-
-    @property
-    def connections(self) -> tuple[str, ...]:
-        """The connections that it carries."""
-        return self.client.connections
-
-    @property
-    def images(self) -> tuple[str, ...]:
-        """The registry's names of its images."""
-        return (self.client.type.image,)
-
-    @property
-    def description(self) -> str:
-        """What it is, for commit messages."""
-        return self.client.description
-
-    def facts(self) -> list[str]:
-        """Return what people should know of it, one line each."""
-        return self.client.facts()
+Release = ServiceRelease | Client
 
 
-Release = ServiceRelease | ClientRelease
+def claims_of(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
+    """Return the claims on the applications or connections that a release is for."""
+    if isinstance(release, ServiceRelease):
+        return tuple(c for id in release.applications for c in ledger.application_claims(id))
+    return tuple(c for id in release.connections for c in ledger.connection_claims(id))

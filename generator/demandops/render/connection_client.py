@@ -17,22 +17,21 @@ import jsonschema_rs
 
 from demandops.config.base_model import field_path
 from demandops.config.config import IMAGES_FILE, Config
+from demandops.connections.communication_client import Client
 from demandops.connections.connection_type import unplannable
 from demandops.errors import InvalidInput, fault
-from demandops.plan.release import ClientRelease
 from demandops.render.engine import Engine
 from demandops.settings import data_folder
 
 
-def render(release: ClientRelease, config: Config, engine: Engine) -> str:
+def render(client: Client, config: Config, engine: Engine) -> str:
     """Return the manifests of a client as one YAML text.
 
     Raises:
         InvalidInput: if its configuration has a field that the program does not read.
         Refused: if the registry has no image for the client.
     """
-    client, node = release.client, release.node
-    kind = client.type
+    kind, node = client.type, client.node
     if kind.image not in config.images:
         message = f"'{kind.image}' is in use, but not in {IMAGES_FILE}; add it there"
         raise unplannable("images", message)
@@ -47,8 +46,7 @@ def render(release: ClientRelease, config: Config, engine: Engine) -> str:
         node=node,
         selector=node.labels(),
         tolerations=[item.model_dump(exclude_defaults=True) for item in node.tolerations],
-        image=release.shaping.image(kind.image, config).reference(),
-        **client.variables(),
+        image=client.shaping.image(kind.image, config.images).reference(),
     )
 
 

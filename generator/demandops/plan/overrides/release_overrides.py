@@ -9,13 +9,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from demandops.config.config import Config
-from demandops.config.override import Override
+from demandops.config.override import Override, Shaping
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.selectors import Traits, selects
 from demandops.plan.overrides.suspended_claims import denied_by
-from demandops.plan.release import Release, ServiceRelease, Shaping
+from demandops.plan.release import Release, ServiceRelease, claims_of
 
 
 def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release | None:
@@ -26,7 +26,7 @@ def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release
     """
     if not config.active_overrides:
         return release
-    claims = _claims(release, ledger)
+    claims = claims_of(release, ledger)
     traits = _traits(release, claims)
     if service_denied_by(release, ledger, config) is not None:
         return None
@@ -51,7 +51,7 @@ def service_denied_by(release: Release, ledger: Ledger, config: Config) -> Overr
         one.deny for one in config.active_overrides
     ):
         return None
-    return denied_by(_traits(release, _claims(release, ledger)), config)
+    return denied_by(_traits(release, claims_of(release, ledger)), config)
 
 
 def apply_effects(
@@ -85,14 +85,6 @@ def effects_on(release: Release, override: Override, config: Config) -> tuple[st
         possible |= {"version"} if override.version in known else set()
     possible |= {"images"} if {*release.images} & {*(override.images or ())} else set()
     return tuple(name for name in override.effects() if name in possible)
-
-
-def _claims(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
-    if isinstance(release, ServiceRelease):
-        return tuple(
-            claim for app in release.applications for claim in ledger.application_claims(app)
-        )
-    return tuple(claim for name in release.connections for claim in ledger.connection_claims(name))
 
 
 def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from demandops.config.config import (
@@ -18,7 +18,7 @@ from demandops.demand.claim import ApplicationClaim, Claim, Subject, demand_id, 
 from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import denied_release, plan
-from demandops.plan.release import Release, ServiceRelease
+from demandops.plan.release import Release, ServiceRelease, claims_of
 from demandops.plan.release_keys import all_keys, keys_of
 
 
@@ -58,19 +58,15 @@ def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
         ledger: the ledger without suspended claims.
         release: the release that runs.
     """
-    claims: Iterable[Claim]
-    if isinstance(release, ServiceRelease):
-        users = (claim for id in release.applications for claim in ledger.application_claims(id))
-        claims = [claim for claim in users if _takes(claim, release)]
-    else:
-        claims = [claim for id in release.connections for claim in ledger.connection_claims(id)]
+    claims = (claim for claim in claims_of(release, ledger) if _takes(claim, release))
     return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
 
 
-def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
+def _takes(claim: Claim, release: Release) -> bool:
     """Return whether a claim on an application needs this service of it."""
-    if release.service.each is None:
+    if not isinstance(release, ServiceRelease) or release.service.each is None:
         return True
+    assert isinstance(claim, ApplicationClaim)  # noqa: S101 - a service is for applications
     topics = claim.inputs.get(release.service.each, ())
     return any((t.source, t.topic) == (release.key.source, release.key.topic) for t in topics)
 
@@ -92,7 +88,7 @@ def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
     if isinstance(release, ServiceRelease):
         found += _service_files(release, config)
     else:
-        found += [ShapingFile(*entry) for entry in release.client.shaping_entries()]
+        found += [ShapingFile(*entry) for entry in release.shaping_entries()]
     found += [
         ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
         for image in release.images
