@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 from demandops import naming
 from demandops.config.config import Config
+from demandops.config.config_reader import ConfigReader
 from demandops.connections.communication_client import Client, ClientKey, End
 from demandops.connections.route import Route
 from demandops.errors import Fault, Refused, fault
@@ -90,6 +91,14 @@ class ConnectionType(ABC):
     def label(self) -> str:
         """Its number and name, for messages."""
         return f"{self.number} ({self.name})"
+
+    def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
+        """Yield the faults of a configuration that this type cannot work with."""
+        return iter(())
+
+    def shares_clients(self, config: Config) -> bool:
+        """Return whether a client may carry several connections."""
+        return False
 
     @abstractmethod
     def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:

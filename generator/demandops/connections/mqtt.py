@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from demandops import naming
-from demandops.config.config import BROKERS_FILE, Config
+from demandops.config.config import BROKERS_FILE, IMAGES_FILE, Config
+from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Broker
 from demandops.connections.communication_client import ClientKey, End
 from demandops.connections.connection_type import (
@@ -43,6 +44,12 @@ class Mqtt(ConnectionType):
     renames = True
     takes_broker = True
     speaks_dds = False
+
+    def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
+        """Yield that there is a broker, but no image."""
+        if config.brokers and reader.is_missing(IMAGES_FILE, self.image):
+            message = f"'{self.image}' is missing; add it, because MQTT connections run it"
+            yield fault("images", message).within(IMAGES_FILE)
 
     def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
         """Yield that there is no broker; if none is named, it follows from the ends."""

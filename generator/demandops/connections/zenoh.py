@@ -15,6 +15,7 @@ from typing import Any
 
 from demandops import naming
 from demandops.config.config import NODES_FILE, Config
+from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Node
 from demandops.connections.communication_client import Client, ClientKey
 from demandops.connections.connection_type import (
@@ -34,6 +35,22 @@ class Zenoh(ConnectionType):
     number = 2
     image = "zenoh-bridge"
     options = frozenset({"rate"})
+
+    def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
+        """Yield every second bridge on one host."""
+        hosts: dict[tuple[object, ...], str] = {}
+        for node in config.nodes.values():
+            host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
+            if node.zenoh and (other := hosts.setdefault(host, node.id)) != node.id:
+                yield fault(
+                    f"nodes[{reader.index_of(NODES_FILE, node.id)}].zenoh",
+                    f"'{other}' already runs a bridge on the same host and ROS domain; remove one "
+                    "of them",
+                ).within(NODES_FILE)
+
+    def shares_clients(self, config: Config) -> bool:
+        """Return whether any node has a bridge."""
+        return any(node.zenoh for node in config.nodes.values())
 
     def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
         """Yield that a node has no bridge, or that neither bridge can reach the other."""
