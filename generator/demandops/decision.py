@@ -28,7 +28,7 @@ from demandops.demand.claim import Subject
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, InvalidInput, Refused
 from demandops.ledger.apply import apply
-from demandops.ledger.ledger import Changes, Ledger
+from demandops.ledger.ledger import Changes, Ledger, changes_on
 from demandops.ledger.operations import restoration
 from demandops.ledger.operations.restoration import Restoration
 from demandops.plan import implied_connections
@@ -133,7 +133,7 @@ def decide(
     on_stage("admitted")
     try:
         ledger, changes = _book(state, request, now)
-        keys = affected_keys(state.ledger, ledger, state.config, changes.subjects())
+        keys = affected_keys(state.ledger, ledger, state.config, changes.claims)
         rendered = changeset.build_changeset(
             state.ledger, ledger, changes.claims, keys, (state.config, state.engine, read)
         )
@@ -226,7 +226,9 @@ def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
     """Return the changes to rendered files that follow when a person changes claims."""
-    keys = affected_keys(before, state.ledger, state.config, subjects)
+    keys = affected_keys(
+        before, state.ledger, state.config, changes_on(before, state.ledger, subjects)
+    )
     return changeset.build_changeset(
         before, state.ledger, (), keys, (state.config, state.engine, read)
     )

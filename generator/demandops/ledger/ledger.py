@@ -23,8 +23,27 @@ from demandops.demand.claim import (
 from demandops.demand.demand_request import ConnectionType
 from demandops.demand.lease import UNSTARTED
 
-Claims: TypeAlias = "HashTrieMap[str, Claim]"
-"""The claims of one subject by demand id."""
+
+@dataclass(frozen=True, slots=True)
+class SubjectClaims:
+    """The claims on one subject by demand id.
+
+    ``first`` has the lowest demand id. Claims on one subject agree on where and what it is. If a
+    person writes one that does not, the first one decides.
+    """
+
+    by_demand: HashTrieMap[str, Claim]
+    first: Claim
+
+    def replace(self, demand: str, claim: Claim | None) -> SubjectClaims | None:
+        """Return these claims with ``claim`` at ``demand``, or ``None`` if none is left."""
+        if claim is not None:
+            lowest = claim if demand <= self.first.demand else self.first
+            return SubjectClaims(self.by_demand.insert(demand, claim), lowest)
+        left = self.by_demand.remove(demand)
+        if not left:
+            return None
+        return SubjectClaims(left, left[min(left)] if demand == self.first.demand else self.first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +87,19 @@ class Ledger:
     ``minutes`` are those in which a lease ends. They give the next end without a full scan.
     """
 
-    claims: HashTrieMap[Subject, Claims] = field(default_factory=HashTrieMap)
+    claims: HashTrieMap[Subject, SubjectClaims] = field(default_factory=HashTrieMap)
     index: Index = field(default_factory=HashTrieMap)
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
         held = self.claims.get(subject)
-        return tuple(held[demand] for demand in sorted(held)) if held else ()
+        return tuple(held.by_demand[demand] for demand in sorted(held.by_demand)) if held else ()
+
+    def first_claim(self, subject: Subject) -> Claim | None:
+        """Return the claim on ``subject`` with the lowest demand id, or ``None``."""
+        held = self.claims.get(subject)
+        return held.first if held else None
 
     def application_claims(self, application: str) -> tuple[ApplicationClaim, ...]:
         """Return the claims on an application."""
@@ -89,16 +113,17 @@ class Ledger:
 
     def type_of(self, connection: str) -> ConnectionType | None:
         """Return the type of a connection that a claim holds, or ``None``."""
-        claims = self.connection_claims(connection)
-        return claims[0].type if claims else None
+        first = self.first_claim(Subject(SubjectKind.CONNECTION, connection))
+        return first.type if isinstance(first, ConnectionClaim) else None
 
     def subjects(self, kind: SubjectKind) -> list[str]:
         """Return the ids of all subjects of a kind that have claims, sorted."""
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
-    def applications_taking(self, source: str, topic: str) -> tuple[str, ...]:
-        """Return the applications that have ``topic`` of ``source`` as an input, sorted."""
-        return self._ids("takes", source, topic)
+    def claims_taking(self, source: str, topic: str) -> tuple[ApplicationClaim, ...]:
+        """Return the claims with ``topic`` of ``source`` as an input, by application and demand."""
+        claims = self._claims("takes", source, topic)
+        return tuple(claim for claim in claims if isinstance(claim, ApplicationClaim))
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         """Return the connections that bring ``topic`` to the node ``target``, sorted."""
@@ -148,7 +173,7 @@ class Ledger:
         return tuple(sorted({key.subject.id for key in self.index.get(entry) or ()}))
 
     def _claims(self, *entry: str) -> tuple[Claim, ...]:
-        keys = sorted(self.index.get(entry) or (), key=lambda key: (str(key.subject), key.demand))
+        keys = sorted(self.index.get(entry) or (), key=_order)
         found = (self.get(key) for key in keys)
         return tuple(claim for claim in found if claim is not None)
 
@@ -168,15 +193,17 @@ class Ledger:
     def get(self, key: ClaimKey) -> Claim | None:
         """Return one claim."""
         held = self.claims.get(key.subject)
-        return held.get(key.demand) if held else None
+        return held.by_demand.get(key.demand) if held else None
 
     def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
         """Return the ledger with ``claim`` at ``key``, or with no claim there if it is ``None``."""
-        held = self.claims.get(key.subject, HashTrieMap())
-        old = held.get(key.demand)
+        held, old = self.claims.get(key.subject), self.get(key)
         if old == claim:
             return self
-        held = held.insert(key.demand, claim) if claim else held.remove(key.demand)
+        if held is not None:
+            held = held.replace(key.demand, claim)
+        elif claim is not None:
+            held = SubjectClaims(HashTrieMap({key.demand: claim}), claim)
         claims = self.claims.insert(key.subject, held) if held else self.claims.remove(key.subject)
         before, after = index_entries(old), index_entries(claim)
         index, minutes = self.index, self.minutes
@@ -208,11 +235,11 @@ class Ledger:
     def __iter__(self) -> Iterator[Claim]:
         """Yield every claim, in no order."""
         for claims in self.claims.values():
-            yield from claims.values()
+            yield from claims.by_demand.values()
 
     def __len__(self) -> int:
         """Return how many claims there are."""
-        return sum(len(claims) for claims in self.claims.values())
+        return sum(len(claims.by_demand) for claims in self.claims.values())
 
 
 def index_entries(claim: Claim | None) -> set[Entry]:
@@ -238,9 +265,26 @@ def index_entries(claim: Claim | None) -> set[Entry]:
     return found
 
 
+def _order(key: ClaimKey) -> tuple[str, str, str]:
+    return key.subject.kind.value, key.subject.id, key.demand
+
+
 def _minute(moment: datetime) -> str:
     """Return the minute of a time, in UTC, as a text that sorts like the time."""
     return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
+
+
+def changes_on(
+    before: Ledger, after: Ledger, subjects: Iterable[Subject]
+) -> tuple[ClaimChange, ...]:
+    """Return the claims on these subjects that differ between two ledgers."""
+    claims = (
+        claim
+        for subject in subjects
+        for ledger in (before, after)
+        for claim in ledger.claims_on(subject)
+    )
+    return claim_changes(before, after, (claim.key for claim in claims))
 
 
 def claim_changes(

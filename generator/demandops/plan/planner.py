@@ -12,7 +12,7 @@ from demandops.config.appdef import ApplicationDefinition, Parameter, Scaling, S
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.config.registry import ChartSource
-from demandops.demand.claim import ApplicationClaim, Subject, SubjectKind
+from demandops.demand.claim import ApplicationClaim
 from demandops.demand.demand_request import InputTopic
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import Ledger
@@ -21,7 +21,12 @@ from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.suspended_claims import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease, node_and_domain
-from demandops.plan.release_keys import ReleaseKey, appdef_of, keys_of
+from demandops.plan.release_keys import (
+    ReleaseKey,
+    appdef_of,
+    claims_needing,
+    deciding_claim,
+)
 
 
 def plan(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
@@ -55,20 +60,14 @@ def _unshaped(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None
 
 
 def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease | None:
-    named = (key.application,) if key.application is not None else None
-    users = tuple(  # skip applications that moved or changed their definition
-        application
-        for application in named or ledger.applications_taking(str(key.source), str(key.topic))
-        if key in keys_of(ledger, config, Subject(SubjectKind.APPLICATION, application))
-    )
-    claims = tuple(claim for user in users for claim in ledger.application_claims(user))
+    claims = claims_needing(ledger, config, key)
     if not claims:
         return None
-    appdef = appdef_of(config, claims[0].appdef)
+    users = tuple(dict.fromkeys(claim.application for claim in claims))
+    appdef = appdef_of(config, deciding_claim(ledger, users[0]).appdef)
     service = appdef.services[key.service]
     node, domain = node_and_domain(config, key.node)
     if service.each is not None:
-        claims = tuple(claim for claim in claims if _takes(claim, service.each, key))
         inputs = {service.each: _shared_input(claims, service.each, key)}
     else:
         inputs = _application_inputs(config, appdef, service, claims)
@@ -120,23 +119,12 @@ def _requesters(claims: Iterable[ApplicationClaim]) -> tuple[str, ...]:
     return tuple(sorted({who for claim in claims for who in claim.requesters}))
 
 
-def _takes(claim: ApplicationClaim, role: str, key: ServiceKey) -> bool:
-    return any(
-        (topic.source, topic.topic) == (key.source, key.topic)
-        for topic in claim.inputs.get(role, ())
-    )
-
-
 def _shared_input(
     claims: Iterable[ApplicationClaim], role: str, key: ServiceKey
 ) -> tuple[InputTopic, ...]:
-    types = {
-        topic.type
-        for claim in claims
-        for topic in claim.inputs.get(role, ())
-        if (topic.source, topic.topic) == (key.source, key.topic) and topic.type
-    }
-    return (InputTopic(str(key.topic), str(key.source), min(types, default="")),)
+    source, topic = str(key.source), str(key.topic)
+    inputs = (one for claim in claims for one in claim.inputs_from(role, source, topic))
+    return (InputTopic(topic, source, min((one.type for one in inputs if one.type), default="")),)
 
 
 def _application_inputs(

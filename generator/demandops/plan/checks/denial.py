@@ -18,7 +18,7 @@ from demandops.ledger.ledger import Changes, Ledger
 from demandops.plan.overrides.selectors import Traits, fits, has_labels, traits_of
 from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.plan.release import ServiceKey
-from demandops.plan.release_keys import keys_including_suspended
+from demandops.plan.release_keys import keys_of_claims
 
 
 def faults(
@@ -66,7 +66,7 @@ def _service_traits(
     """Yield the traits of the services that an application needs."""
     if not isinstance(demanded, ApplicationDemand):
         return
-    for key in keys_including_suspended(after, config, subject):
+    for key in keys_of_claims(after, config, after.claims_on(subject)):
         if isinstance(key, ServiceKey):
             yield Traits(
                 (key.node,),
