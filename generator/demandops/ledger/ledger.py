@@ -19,6 +19,7 @@ from demandops.demand.claim import (
     ConnectionClaim,
     Subject,
     SubjectKind,
+    is_override_claim,
 )
 from demandops.demand.demand_request import ConnectionType
 from demandops.demand.lease import UNSTARTED
@@ -137,6 +138,15 @@ class Ledger:
         """Return the claims of one demand, sorted by subject."""
         return self._claims("demand", demand)
 
+    def kept_claims(self, subject: Subject | None = None) -> tuple[Claim, ...]:
+        """Return the claims that overrides keep, on one subject or on all."""
+        return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
+
+    def is_only_kept(self, subject: Subject) -> bool:
+        """Return whether no demand holds ``subject``: at most overrides keep it."""
+        held = self.claims.get(subject)
+        return held is None or len(held.by_demand) == len(self.kept_claims(subject))
+
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
         """Return the claims of a requester, sorted by subject and demand."""
         return self._claims("requester", requester)
@@ -248,6 +258,8 @@ def index_entries(claim: Claim | None) -> set[Entry]:
         return set()
     found: set[Entry] = {("demand", claim.demand)}
     found |= {("requester", requester) for requester in claim.requesters}
+    if is_override_claim(claim):
+        found |= {("kept",), ("kept", claim.subject.kind.value, claim.subject.id)}
     if claim.lease is not None:
         found.add((_ENDS, _minute(claim.lease.expires_at)))
     if isinstance(claim, ApplicationClaim):

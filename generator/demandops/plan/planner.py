@@ -140,12 +140,14 @@ def _application_inputs(
             inputs[role] = _united(claims, origin)
             continue
         producer = appdef.services[producer_name]
-        found = set()
-        for topic in _united(claims, str(producer.each)):
-            node = topic.source if producer.placement == "source" else claims[0].node
-            key = ServiceKey(producer_name, node, source=topic.source, topic=topic.topic)
-            found.add(InputTopic(outputs(config, producer, key)[output], topic.source))
-        inputs[role] = tuple(sorted(found))
+        pattern, each = producer.outputs[output], str(producer.each)
+        topics = {(one.source, one.topic) for claim in claims for one in claim.inputs.get(each, ())}
+        inputs[role] = tuple(
+            sorted(
+                InputTopic(_of_instance(pattern, config, producer, source, topic), source)
+                for source, topic in topics
+            )
+        )
     return inputs
 
 
@@ -178,16 +180,17 @@ def _is_usual(config: Config, service: Service, source: str, topic: str) -> bool
 
 def outputs(config: Config, service: Service, key: ServiceKey) -> dict[str, str]:
     """Return the topics that a service instance publishes, by the names of the appdef's outputs."""
-    if key.application is not None:
-        instance = naming.topic_part(key.application)
-    elif _is_usual(config, service, str(key.source), str(key.topic)):
-        instance = naming.topic_part(str(key.source))
-    else:
-        instance = naming.topic_part(str(key.source), str(key.topic))
+    own = (key.application, "") if key.application is not None else (key.source, key.topic)
+    source, topic = map(str, own)
     return {
-        name: pattern.replace("{instance}", instance)
+        name: _of_instance(pattern, config, service, source, topic)
         for name, pattern in sorted(service.outputs.items())
     }
+
+
+def _of_instance(pattern: str, config: Config, service: Service, source: str, topic: str) -> str:
+    extra = "" if _is_usual(config, service, source, topic) else topic
+    return pattern.replace("{instance}", naming.topic_part(source, extra))
 
 
 def _replicas(scaling: Scaling, topics: int) -> int:

@@ -152,8 +152,8 @@ def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
         requesters = set(request.requesters())
         near = [
             f"{claim.subject} for {', '.join(claim.requesters)}"
-            for claim in sorted(ledger, key=lambda claim: (str(claim.subject), claim.demand))
-            if requesters & set(claim.requesters)
+            for requester in sorted(requesters)
+            for claim in ledger.claims_of_requester(requester)
         ]
     shown = "; ".join(dict.fromkeys(near[:5])) or "none"
     return fault(

@@ -120,6 +120,8 @@ def _message(override: Override) -> str:
 
 def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
     """Yield a warning for each claim of a demand that an override suspends."""
+    if not any(override.deny for override in config.active_overrides):
+        return
     subjects = dict.fromkeys(subject for subject, _, _ in _listed(request))
     claims = [
         *ledger.claims_of_demand(request.demand),
@@ -127,7 +129,7 @@ def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator
     ]
     seen = set()
     requesters = set(request.requesters())
-    for claim in claims if config.active_overrides else ():
+    for claim in claims:
         override = suspended_by(claim, config)
         if override is None or claim.key in seen or not requesters & set(claim.requesters):
             continue
