@@ -142,12 +142,8 @@ def _application_inputs(
         producer = appdef.services[producer_name]
         pattern, each = producer.outputs[output], str(producer.each)
         topics = {(one.source, one.topic) for claim in claims for one in claim.inputs.get(each, ())}
-        inputs[role] = tuple(
-            sorted(
-                InputTopic(_of_instance(pattern, config, producer, source, topic), source)
-                for source, topic in topics
-            )
-        )
+        names = {(_of_instance(pattern, config, producer, *one), one[0]) for one in topics}
+        inputs[role] = tuple(InputTopic(*name) for name in sorted(names))
     return inputs
 
 
