@@ -151,6 +151,10 @@ class Ledger:
         """Return the claims of a requester, sorted by subject and demand."""
         return self._claims("requester", requester)
 
+    def count_of_requester(self, requester: str) -> int:
+        """Return how many claims a requester has."""
+        return len(self.index.get(("requester", requester)) or ())
+
     def applications_at(self, node: str) -> tuple[str, ...]:
         """Return the applications that run on a node or have an input from it, sorted."""
         return self._ids("node", node)
