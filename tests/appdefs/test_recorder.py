@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
+from demandops.demand.demand_request import ApplicationDemand, DemandRequest, Operation
+from demandops.demand.application import InputTopic
 from demandops.errors import Refused
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger

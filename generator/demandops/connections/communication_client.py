@@ -86,7 +86,7 @@ class End(Client):
 
     side: Side
     peer: str
-    topics: Mapping[str, Route]
+    topics: tuple[Route, ...]
 
     @property
     def connection(self) -> str:
@@ -100,7 +100,7 @@ class End(Client):
 
     def facts(self) -> list[str]:
         """Return the topics, and how the ends meet."""
-        return [*(route.fact for route in self.topics.values()), self.meeting_point]
+        return [*(route.fact for route in self.topics), self.meeting_point]
 
     @property
     @abstractmethod

@@ -8,16 +8,11 @@ from types import MappingProxyType
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.mqtt import MQTT
 from demandops.connections.route import Route, merge_routes
-from demandops.demand.claim import (
-    ApplicationClaim,
-    Claim,
-    ClaimKey,
-    ConnectionClaim,
-    Subject,
-    SubjectKind,
-    demand_id,
-)
-from demandops.demand.demand_request import InputTopic, id_problem
+from demandops.demand.claim import ApplicationClaim, Claim, ClaimKey, ConnectionClaim, demand_id
+from demandops.subject import Subject
+from demandops.subject import SubjectKind
+from demandops.demand.demand_request import id_problem
+from demandops.demand.application import InputTopic
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from hypothesis import given

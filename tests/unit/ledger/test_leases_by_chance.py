@@ -16,7 +16,7 @@ from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.route import Route, merge_routes
 from demandops.decision import Decision, State
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim
-from demandops.demand.demand_request import InputTopic
+from demandops.demand.application import InputTopic
 from demandops.demand.lease import LONGEST_S, Lease
 from demandops.identifiers import id_problem
 from demandops.ledger import claim_file

@@ -13,8 +13,10 @@ from typing import Any
 import pytest
 import yaml
 from demandops.decision import decide, rendered_files
-from demandops.demand.claim import Subject, SubjectKind
-from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest, Operation
+from demandops.subject import Subject
+from demandops.subject import SubjectKind
+from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.errors import InvalidInput, Refused
 from demandops.plan.views.bookkeeping import bookkeeping
 from hypothesis import given, settings

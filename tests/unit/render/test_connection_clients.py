@@ -18,7 +18,8 @@ from demandops.connections.ros import dds_type
 from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH
 from demandops.decision import Decision, State, rendered_files
-from demandops.demand.claim import Subject, SubjectKind
+from demandops.subject import Subject
+from demandops.subject import SubjectKind
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger.ledger import changes_on
 from demandops.plan.release_keys import affected_keys
