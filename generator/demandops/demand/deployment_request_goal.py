@@ -17,6 +17,7 @@ from pydantic import Field
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.base_model import FrozenModel
 from demandops.connections.connection import Connection
+from demandops.connections.connection_type import ConnectionType
 from demandops.connections.connection_types import by_number, type_numbered
 from demandops.connections.route import Route
 from demandops.demand.application import Application, InputTopic
@@ -147,8 +148,10 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
     ]
     for index, connection in enumerate(goal.connections):
         where = f"connections[{index}]"
-        demanded.append(_connection(where, connection))
-        if type_numbered(connection.type) is None and f"{where}.type" not in faulty:
+        # without a valid type, none is assumed, so that no type's rules apply
+        kind = type_numbered(connection.type) if f"{where}.type" not in faulty else None
+        demanded.append(_connection(where, connection, kind))
+        if kind is None and f"{where}.type" not in faulty:
             known = ", ".join(known.label for known in by_number())
             message = f"{connection.type} is not a connection type; known: {known}"
             faults.append(fault(f"{where}.type", message, code="unknown-connection-type"))
@@ -216,7 +219,7 @@ def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
     )
 
 
-def _connection(where: str, connection: WireConnection) -> Demanded:
+def _connection(where: str, connection: WireConnection, kind: ConnectionType | None) -> Demanded:
     sources, targets = connection.source_topics, connection.target_topics
     # the caller reports lists of unequal length; names of the longer fill the shorter
     pairs = zip(
@@ -225,7 +228,7 @@ def _connection(where: str, connection: WireConnection) -> Demanded:
     return Demanded(
         Connection(
             id=connection.id,
-            type=type_numbered(connection.type),
+            type=kind,
             source=connection.source_node_id,
             target=connection.target_node_id,
             topics=tuple(

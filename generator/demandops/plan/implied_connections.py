@@ -23,11 +23,11 @@ from demandops.plan.release import ServiceKey
 
 
 class _InputPlace(Place):
-    """The input that needs a connection: its field is that of each fault of the connection."""
+    """The input that needs a connection: faults of the connection are faults of the input."""
 
     def at(self, path: str) -> str:
-        """Return the input's field."""
-        return self.field
+        """Return the input's field, or that of the demand's requesters."""
+        return path if path.startswith("requesters") else self.field
 
 
 def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:

@@ -18,13 +18,12 @@ from demandops.connections.ros import dds_type
 from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH
 from demandops.decision import Decision, State, rendered_files
-from demandops.subject import Subject
-from demandops.subject import SubjectKind
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger.ledger import changes_on
 from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connection_client import check_configuration
+from demandops.subject import Subject, SubjectKind
 
 from tests.kit.carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.config import skeleton
@@ -104,7 +103,7 @@ class TestZenoh:
             world.send(demand("zenoh", id=f"c{number}", source="vehicle01"))
         world.send(demand("zenoh", target="vehicle00", source="edge"))
         assert world.state.ledger.connections_at(
-            world.state.ledger.connection_claims("c")[0].type, "vehicle00"
+            world.state.ledger.connection_claims("c")[0].connection.known_type, "vehicle00"
         ) == ("c",)
 
     def test_topics_match_whole_names_and_nothing_else(self) -> None:
@@ -339,7 +338,7 @@ class TestWhatPeopleDidInGit:
         world = World(state(**self.NODES))
         world.send(demand(kind))
         (claim,) = world.state.ledger.connection_claims("c")
-        edited = replace(claim, topics={route.source: route})
+        edited = replace(claim, held=replace(claim.connection, topics=(route,)))
         books = world.state.ledger.replace(claim.key, edited)
         with pytest.raises(Refused) as refused:
             rendered_files(replace(state(**(self.NODES | nodes)), ledger=books))
