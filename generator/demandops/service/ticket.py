@@ -105,12 +105,10 @@ class Ticket:
         if not self.maybe_published:
             self.base, self.maybe_published = base, True
 
-    def journal_entry(self) -> JournalEntry:
+    def journal_entry(self, proposal: ProposalRecord | None = None) -> JournalEntry:
         """Return what the journal keeps of the demand."""
-        proposal = asdict(self.proposal) if self.proposal else None
-        return JournalEntry(
-            self.operation, self.goal, self.received.isoformat(), self.base, proposal
-        )
+        record = asdict(proposal) if proposal else None
+        return JournalEntry(self.operation, self.goal, self.received.isoformat(), self.base, record)
 
 
 def new_ticket(goal: object, operation: str | None, listener: Listener) -> Ticket:
