@@ -137,20 +137,22 @@ class Journal:
 
     def _rewrite(self) -> None:
         """Replace the file by one with the pending demands only."""
-        self._is_broken = True
         text, chain = _sealed([entry.record() for entry in self.pending.values()], "")
-        fresh = self._path.with_suffix(".new")
-        if not text:
-            self._file.truncate(0)  # unlike another file, it needs no room on a full disk
-            os.fdatasync(self._file.fileno())
-        else:
-            with fresh.open("wb") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
+        if text:
+            fresh = self._path.with_suffix(".new")
+            with fresh.open("wb") as writing:
+                writing.write(text)
+                writing.flush()
+                os.fsync(writing.fileno())
+            file = fresh.open("ab", buffering=0)
+            self._is_broken = True
             fresh.replace(self._path)
             self._file.close()
-            self._file = self._path.open("ab", buffering=0)
+            self._file = file
+        else:
+            self._is_broken = True
+            self._file.truncate(0)  # unlike another file, it needs no room on a full disk
+            os.fdatasync(self._file.fileno())
         sync_folder(self._path.parent)
         self._is_broken, self._chain, self._size = False, chain, len(text)
         self._limit = max(_MOST_BYTES, 2 * len(text))
