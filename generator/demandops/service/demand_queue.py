@@ -136,11 +136,11 @@ class DemandQueue:
         A demand that awaits approval can still be withdrawn.
         """
         with self._changed:
-            if ticket.state == "withdrawn":
+            if not ticket.can_become("proposed"):
                 return False
             self._journal.append([ticket.journal_entry(record)])
-            ticket.state, ticket.proposal = "waiting", record
-        return True
+            ticket.proposal = record
+            return ticket.become("proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
         """Queue demands again that no longer need approval."""
@@ -148,6 +148,7 @@ class DemandQueue:
             for ticket in tickets:
                 self._journal.append([ticket.journal_entry()])
                 ticket.proposal = None
+                ticket.become("waiting")
                 self._queue.append(ticket)
             self._changed.notify()
 
@@ -162,17 +163,17 @@ class DemandQueue:
         """Withdraw a demand; return False if it is too late or impossible."""
         with self._changed:
             ticket = self._tickets.get(operation)
-            if ticket is None or ticket.state != "waiting":
+            if ticket is None or not ticket.can_become("withdrawn"):
                 return ticket is not None and ticket.state == "withdrawn"
             try:
-                if ticket.proposal is not None:
+                if ticket.state == "proposed":
                     self._withdraw_proposed(ticket, TAKEN_BACK)
                     return True
                 self._journal.mark_done([operation], durably=True)  # a restart must not resume it
             except StateRepoError as error:
                 log.error("demand %s cannot be withdrawn: %s", operation, error)
                 return False
-            ticket.state = "withdrawn"
+            ticket.become("withdrawn")
             self._woken = True
             self._changed.notify()  # the worker answers it even while nothing can be published
         return True
@@ -185,20 +186,19 @@ class DemandQueue:
 
     def _withdraw_proposed(self, ticket: Ticket, reason: str) -> None:
         """Keep the demand in the journal until its branch is deleted, so that none merges it."""
-        if ticket.proposal is None or ticket.state != "waiting":
+        if ticket.proposal is None or ticket.state != "proposed":
             return
         record = replace(ticket.proposal, withdrawn=reason)
         self._journal.append([ticket.journal_entry(record)])
-        ticket.state, ticket.proposal = "withdrawn", record
+        ticket.proposal = record
+        ticket.become("withdrawn")
         self._woken = True
         self._changed.notify()
 
     def mark_committed(self, ticket: Ticket) -> bool:
         """Refuse further withdrawals of a demand; return False if it was withdrawn before."""
         with self._changed:
-            if ticket.state != "withdrawn":
-                ticket.state = "committed"
-            return ticket.state == "committed"
+            return ticket.become("committed")
 
     def answer_withdrawn(self, batch: list[Ticket]) -> None:
         """Answer withdrawn demands at once, because the remote may be unreachable for long.
@@ -207,20 +207,27 @@ class DemandQueue:
         """
         with self._changed:
             withdrawn = [ticket for ticket in [*batch, *self._queue] if _is_withdrawn(ticket)]
-            if withdrawn:
-                self._queue = deque(t for t in self._queue if not _is_withdrawn(t))
-                batch[:] = [ticket for ticket in batch if not _is_withdrawn(ticket)]
-        for ticket in withdrawn:
-            self._forget(ticket)
-            ticket.future.set_exception(Withdrawn(TAKEN_BACK))
+            if not withdrawn:
+                return
+            self._queue = deque(t for t in self._queue if not _is_withdrawn(t))
+            batch[:] = [ticket for ticket in batch if not _is_withdrawn(ticket)]
+        self.fail(withdrawn, Withdrawn(TAKEN_BACK))
 
-    def answer(self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]]) -> None:
-        """Answer each demand with its result and remove it from the journal."""
-        results = list(results)
+    def answer(
+        self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
+    ) -> None:
+        """Answer each demand with its result and remove it from the journal, unless ``keep``.
+
+        A demand is answered once: a later result is dropped.
+        """
         with self._changed:
-            self._journal.mark_done(ticket.operation for ticket, _ in results)
+            results = [(ticket, result) for ticket, result in results if ticket.can_become("done")]
+            if not keep:
+                self._journal.mark_done(ticket.operation for ticket, _ in results)
+            for ticket, _ in results:
+                ticket.become("done")
+                self._tickets.pop(ticket.operation, None)
         for ticket, result in results:
-            self._forget(ticket)
             if isinstance(result, Receipt):
                 ticket.notify("pushed", f"pushed {result.commit}")
                 ticket.future.set_result(result)
@@ -228,19 +235,8 @@ class DemandQueue:
                 ticket.future.set_exception(result)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
-        """Answer every demand of a batch with an error; ``keep`` leaves them in the journal."""
-        batch = list(batch)
-        if not keep:
-            with self._changed:
-                self._journal.mark_done(ticket.operation for ticket in batch)
-        for ticket in batch:
-            self._forget(ticket)
-            ticket.future.set_exception(error)
-
-    def _forget(self, ticket: Ticket) -> None:
-        with self._changed:
-            ticket.state = "done"
-            self._tickets.pop(ticket.operation, None)
+        """Answer every demand of a batch with an error."""
+        self.answer([(ticket, error) for ticket in batch], keep)
 
 
 def _is_withdrawn(ticket: Ticket) -> bool:
