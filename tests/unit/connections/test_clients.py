@@ -24,8 +24,8 @@ from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connection_client import check_configuration
 
-from tests.kit.carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.config import skeleton
+from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.memory import MemoryRepo
 
 
