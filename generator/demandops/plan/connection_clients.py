@@ -11,7 +11,7 @@ from demandops.connections import route as routes
 from demandops.connections.communication_client import Client, ClientKey
 from demandops.connections.connection_type import Connection, ConnectionType
 from demandops.connections.route import Route
-from demandops.demand.claim import ConnectionClaim
+from demandops.demand.claim import ConnectionClaim, Subject, SubjectKind
 from demandops.demand.connection_type_choice import route_faults
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
@@ -19,8 +19,9 @@ from demandops.ledger.ledger import Ledger
 
 def client_keys(ledger: Ledger, connection: str) -> Iterator[ClientKey]:
     """Yield the keys of the clients that a connection needs."""
-    for claim in ledger.connection_claims(connection)[:1]:
-        yield from claim.type.keys(connection, claim.source, claim.target)
+    first = ledger.first_claim(Subject(SubjectKind.CONNECTION, connection))
+    if isinstance(first, ConnectionClaim):
+        yield from first.type.keys(connection, first.source, first.target)
 
 
 def client_at(ledger: Ledger, config: Config, key: ClientKey) -> Client | None:

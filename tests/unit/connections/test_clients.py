@@ -20,6 +20,7 @@ from demandops.connections.zenoh import ZENOH
 from demandops.decision import Decision, State, rendered_files
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import InvalidInput, Refused
+from demandops.ledger.ledger import changes_on
 from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connection_client import check_configuration
@@ -78,7 +79,8 @@ class TestZenoh:
         world.send(demand("zenoh", {"/b": "/b"}, id="other", source="vehicle01"))
         world.send(demand("zenoh"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected_keys(before, world.state.ledger, world.state.config, [subject])
+        changes = changes_on(before, world.state.ledger, [subject])
+        keys = affected_keys(before, world.state.ledger, world.state.config, changes)
         assert keys == (ClientKey(ZENOH, "vehicle00"), ClientKey(ZENOH, "edge"))
         assert [(found.name, found.change) for found in world.releases] == [
             ("zenoh-vehicle00", "start"),
@@ -91,7 +93,8 @@ class TestZenoh:
         before = world.state.ledger
         world.send(demand("mqtt"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected_keys(before, world.state.ledger, world.state.config, [subject])
+        changes = changes_on(before, world.state.ledger, [subject])
+        keys = affected_keys(before, world.state.ledger, world.state.config, changes)
         assert keys == (ClientKey(MQTT, "c", "source"), ClientKey(MQTT, "c", "target"))
 
     def test_its_cost_does_not_grow_with_connections_elsewhere(self) -> None:
