@@ -99,13 +99,8 @@ class End(Client):
         return f"{self.type.name} {self.side} of connection {self.connection} on {self.node.id}"
 
     def facts(self) -> list[str]:
-        """Return the topics, and how the ends meet."""
-        return [*(route.fact for route in self.topics.values()), self.meeting_point]
-
-    @property
-    @abstractmethod
-    def meeting_point(self) -> str:
-        """Where the two ends meet: ``broker edge``."""
+        """Return the topics."""
+        return [route.fact for route in self.topics.values()]
 
     def reads(self, route: Route) -> bool:
         """Return whether this end reads the topic from ROS, and the other end publishes it."""

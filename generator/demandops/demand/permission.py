@@ -40,7 +40,9 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         if home is not None:
             yield from _too_long(request, home)
     for index, connection in enumerate(request.connections):
-        yield from _connection(f"connections[{index}]", connection, config)
+        where = f"connections[{index}]"
+        for domain, access in access_of_connection(connection, connection.chosen_type, config):
+            yield from _not_allowed(where, connection.requesters, domain, access)
         home = config.domain_of.get(connection.target)
         if home is not None:
             yield from _too_long(request, home)
@@ -63,11 +65,6 @@ def _service_nodes(app: ApplicationDemand | ApplicationClaim, config: Config) ->
     roles = [service.each for service in services if service.placement == "source"]
     sources = (topic.source for role in roles for topic in app.inputs.get(str(role), ()))
     return dict.fromkeys((app.node, *sources))
-
-
-def _connection(where: str, connection: ConnectionDemand, config: Config) -> Iterator[Fault]:
-    for domain, access in access_of_connection(connection, connection.chosen_type, config):
-        yield from _not_allowed(where, connection.requesters, domain, access)
 
 
 def access_of_connection(

@@ -31,24 +31,15 @@ class ShapingFile:
     what: str
 
 
+def releases(ledger: Ledger, config: Config, subject: Subject | None = None) -> Iterator[Release]:
+    """Yield the releases that run, all or those that claims on ``subject`` need."""
+    keys = keys_of(ledger, config, subject) if subject else all_keys(ledger, config)
+    yield from filter(None, (plan(ledger, config, key) for key in dict.fromkeys(keys)))
+
+
 def release_named(ledger: Ledger, config: Config, name: str) -> Release | None:
     """Return the release with a name, or ``None`` if none runs."""
-    releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
-    return next((release for release in releases if release and release.name == name), None)
-
-
-def release_names(ledger: Ledger, config: Config) -> list[str]:
-    """Return the names of all releases that run."""
-    releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
-    return [release.name for release in releases if release]
-
-
-def releases_of(ledger: Ledger, config: Config, subject: Subject) -> list[Release]:
-    """Return the releases that run because of claims on an application or a connection."""
-    releases = (
-        plan(ledger, config, key) for key in dict.fromkeys(keys_of(ledger, config, subject))
-    )
-    return [release for release in releases if release]
+    return next((one for one in releases(ledger, config) if one.name == name), None)
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
@@ -74,9 +65,8 @@ def _takes(claim: Claim, release: Release) -> bool:
 def how_to_release(claim: Claim) -> str:
     """Return how the requesters release a claim."""
     if is_override_claim(claim):
-        return (
-            f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(OVERRIDE_PREFIX)}.yaml"
-        )
+        name = claim.demand.removeprefix(OVERRIDE_PREFIX)
+        return f"remove keep from {OVERRIDES_ROOT}/{name}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):
         return f"send request '{claim.request}' again with shutdown: true"
     return f"send operation: release for demand '{claim.demand}'"
@@ -103,20 +93,14 @@ def denied_release_named(
     ledger: Ledger, config: Config, name: str
 ) -> tuple[Release, Override] | None:
     """Return the denied release with a name and the override that denies it, or ``None``."""
-    for key in all_keys(ledger, config):
-        found = denied_release(ledger, config, key)
-        if found is not None and found[0].name == name:
-            return found
-    return None
+    denied = (denied_release(ledger, config, key) for key in all_keys(ledger, config))
+    return next((found for found in denied if found and found[0].name == name), None)
 
 
 def keeping_override(claim: Claim, config: Config) -> Override | None:
     """Return the override that keeps this claim, or ``None`` if a demand holds it."""
-    return (
-        config.overrides.get(claim.demand.removeprefix(OVERRIDE_PREFIX))
-        if is_override_claim(claim)
-        else None
-    )
+    name = claim.demand.removeprefix(OVERRIDE_PREFIX)
+    return config.overrides.get(name) if is_override_claim(claim) else None
 
 
 def _service_files(release: ServiceRelease, config: Config) -> Iterator[ShapingFile]:
