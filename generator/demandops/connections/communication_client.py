@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from demandops import strict_yaml
+from demandops.config.config import Config
 from demandops.config.inventory import Node
 from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
@@ -75,7 +76,7 @@ class Client(ABC):
         """Return the part of a configuration that the program reads only at its start."""
         return configuration
 
-    def shaping_entries(self) -> Iterable[tuple[str, str, str]]:
+    def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
         """Return (file, entry, what it decides) for entries of the configuration that shape it."""
         return ()
 

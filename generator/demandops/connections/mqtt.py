@@ -110,7 +110,7 @@ class MqttEnd(End):
         """Return the topics and the broker."""
         return [*End.facts(self), f"broker {self.broker.node}"]
 
-    def shaping_entries(self) -> Iterable[tuple[str, str, str]]:
+    def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
         """Return the broker's entry."""
         broker = self.broker
         yield BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}"

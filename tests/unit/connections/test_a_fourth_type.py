@@ -114,7 +114,7 @@ class Relay(Client):
     def facts(self) -> list[str]:
         return [f"fetches {topic} as {name}" for topic, name in self.fetch.items()]
 
-    def shaping_entries(self) -> Iterable[tuple[str, str, str]]:
+    def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
         yield NODES_FILE, f"{self.node.id}.wan", "where it can be reached"
 
     def configuration(self) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from demandops.config.config import (
-    CHARTS_FILE,
     DOMAINS_FILE,
     IMAGES_FILE,
     NODES_FILE,
@@ -74,19 +73,16 @@ def how_to_release(claim: Claim) -> str:
 
 def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
     """Return people's files that decide what a release is and where it runs."""
-    found = [ShapingFile(ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}")]
-    if isinstance(release, ServiceRelease):
-        found += _service_files(release, config)
-    else:
-        found += [ShapingFile(*entry) for entry in release.shaping_entries()]
-    found += [
-        ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
-        for image in release.images
-        if image in config.images
+    images = [image for image in release.images if image in config.images]
+    node, domain = release.node, release.domain
+    entries = [
+        (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
+        *release.shaping_entries(config),
+        *((IMAGES_FILE, f"images.{name}", config.images[name].reference()) for name in images),
+        (NODES_FILE, node.id, f"in cluster {node.cluster}"),
+        (DOMAINS_FILE, domain.name, f"namespace {domain.namespace}"),
     ]
-    found.append(ShapingFile(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))
-    domain = release.domain
-    return [*found, ShapingFile(DOMAINS_FILE, domain.name, f"namespace {domain.namespace}")]
+    return [ShapingFile(*entry) for entry in entries]
 
 
 def denied_release_named(
@@ -101,14 +97,3 @@ def keeping_override(claim: Claim, config: Config) -> Override | None:
     """Return the override that keeps this claim, or ``None`` if a demand holds it."""
     name = claim.demand.removeprefix(OVERRIDE_PREFIX)
     return config.overrides.get(name) if is_override_claim(claim) else None
-
-
-def _service_files(release: ServiceRelease, config: Config) -> Iterator[ShapingFile]:
-    folder = f"appdefs/{release.appdef}"
-    yield ShapingFile(f"{folder}/appdef.yaml", f"services.{release.key.service}", "what it is")
-    yield ShapingFile(
-        config.values_template(release.appdef, release.service), "", "its Helm values"
-    )
-    chart, name = release.chart, release.service.chart
-    where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
-    yield ShapingFile(CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}")
