@@ -90,14 +90,10 @@ class End(Client):
     topics: Mapping[str, Route]
 
     @property
-    def connection(self) -> str:
-        """The connection that it is an end of."""
-        return self.connections[0]
-
-    @property
     def description(self) -> str:
         """Name type, side, connection and node."""
-        return f"{self.type.name} {self.side} of connection {self.connection} on {self.node.id}"
+        (connection,) = self.connections
+        return f"{self.type.name} {self.side} of connection {connection} on {self.node.id}"
 
     def facts(self) -> list[str]:
         """Return the topics."""
