@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from demandops import strict_yaml
+from demandops.config.config import Config
 from demandops.config.inventory import Node
 from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
@@ -75,7 +76,7 @@ class Client(ABC):
         """Return the part of a configuration that the program reads only at its start."""
         return configuration
 
-    def shaping_entries(self) -> Iterable[tuple[str, str, str]]:
+    def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
         """Return (file, entry, what it decides) for entries of the configuration that shape it."""
         return ()
 
@@ -89,23 +90,14 @@ class End(Client):
     topics: tuple[Route, ...]
 
     @property
-    def connection(self) -> str:
-        """The connection that it is an end of."""
-        return self.connections[0]
-
-    @property
     def description(self) -> str:
         """Name type, side, connection and node."""
-        return f"{self.type.name} {self.side} of connection {self.connection} on {self.node.id}"
+        (connection,) = self.connections
+        return f"{self.type.name} {self.side} of connection {connection} on {self.node.id}"
 
     def facts(self) -> list[str]:
-        """Return the topics, and how the ends meet."""
-        return [*(route.fact for route in self.topics), self.meeting_point]
-
-    @property
-    @abstractmethod
-    def meeting_point(self) -> str:
-        """Where the two ends meet: ``broker edge``."""
+        """Return the topics."""
+        return [route.fact for route in self.topics]
 
     def reads(self, route: Route) -> bool:
         """Return whether this end reads the topic from ROS, and the other end publishes it."""

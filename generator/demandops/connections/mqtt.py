@@ -111,12 +111,11 @@ class MqttEnd(End):
     channel: str
     """The prefix of this connection's MQTT topics, the same at both ends."""
 
-    @property
-    def meeting_point(self) -> str:
-        """The broker."""
-        return f"broker {self.broker.node}"
+    def facts(self) -> list[str]:
+        """Return the topics and the broker."""
+        return [*End.facts(self), f"broker {self.broker.node}"]
 
-    def shaping_entries(self) -> Iterable[tuple[str, str, str]]:
+    def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
         """Return the broker's entry."""
         broker = self.broker
         yield BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}"

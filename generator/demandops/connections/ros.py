@@ -136,10 +136,9 @@ class RosEnd(End):
     wan: Wan
     port: int
 
-    @property
-    def meeting_point(self) -> str:
-        """The address."""
-        return f"address {self.wan.host}:{self.port}"
+    def facts(self) -> list[str]:
+        """Return the topics and the address."""
+        return [*End.facts(self), f"address {self.wan.host}:{self.port}"]
 
     def configuration(self) -> dict[str, Any]:
         """Return the configuration of one end's router.

@@ -12,9 +12,9 @@ from typing import TypeAlias
 
 from rpds import HashTrieMap, HashTrieSet
 
+from demandops.connections import connection_types
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import ConnectionType
-from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import UNSTARTED
@@ -195,7 +195,11 @@ class Ledger:
 
     def connections_needing(self, node: str) -> tuple[str, ...]:
         """Return the connections that end at a node or name its broker, sorted."""
-        found = {id for kind in CONNECTION_TYPES for id in self.connections_at(kind, node)}
+        found = {
+            id
+            for kind in connection_types.CONNECTION_TYPES
+            for id in self.connections_at(kind, node)
+        }
         return tuple(sorted(found | set(self._ids("broker", node))))
 
     def indexed_names(self, entry: str) -> set[str]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from demandops.config.appdef import Service
+from demandops.config.config import CHARTS_FILE, Config
 from demandops.config.inventory import Node
 from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
@@ -67,6 +68,15 @@ class ServiceRelease:
             *(f"{name} = {value}" for name, value in self.parameters.items()),
             f"replicas {self.replicas}",
         ]
+
+    def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
+        """Yield (file, entry, what it decides) for entries of the configuration that shape it."""
+        folder = f"appdefs/{self.appdef}"
+        yield f"{folder}/appdef.yaml", f"services.{self.key.service}", "what it is"
+        yield config.values_template(self.appdef, self.service), "", "its Helm values"
+        chart, name = self.chart, self.service.chart
+        where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
+        yield CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}"
 
 
 Release = ServiceRelease | Client

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from demandops.config.config import (
-    CHARTS_FILE,
     DOMAINS_FILE,
     IMAGES_FILE,
     NODES_FILE,
@@ -31,24 +30,15 @@ class ShapingFile:
     what: str
 
 
+def releases(ledger: Ledger, config: Config, subject: Subject | None = None) -> Iterator[Release]:
+    """Yield the releases that run, all or those that claims on ``subject`` need."""
+    keys = keys_of(ledger, config, subject) if subject else all_keys(ledger, config)
+    yield from filter(None, (plan(ledger, config, key) for key in dict.fromkeys(keys)))
+
+
 def release_named(ledger: Ledger, config: Config, name: str) -> Release | None:
     """Return the release with a name, or ``None`` if none runs."""
-    releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
-    return next((release for release in releases if release and release.name == name), None)
-
-
-def release_names(ledger: Ledger, config: Config) -> list[str]:
-    """Return the names of all releases that run."""
-    releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
-    return [release.name for release in releases if release]
-
-
-def releases_of(ledger: Ledger, config: Config, subject: Subject) -> list[Release]:
-    """Return the releases that run because of claims on an application or a connection."""
-    releases = (
-        plan(ledger, config, key) for key in dict.fromkeys(keys_of(ledger, config, subject))
-    )
-    return [release for release in releases if release]
+    return next((one for one in releases(ledger, config) if one.name == name), None)
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
@@ -81,43 +71,26 @@ def how_to_release(claim: Claim) -> str:
 
 def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
     """Return people's files that decide what a release is and where it runs."""
-    found = [ShapingFile(ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}")]
-    if isinstance(release, ServiceRelease):
-        found += _service_files(release, config)
-    else:
-        found += [ShapingFile(*entry) for entry in release.shaping_entries()]
-    found += [
-        ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
-        for image in release.images
-        if image in config.images
+    images = [image for image in release.images if image in config.images]
+    node, domain = release.node, release.domain
+    entries = [
+        (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
+        *release.shaping_entries(config),
+        *((IMAGES_FILE, f"images.{name}", config.images[name].reference()) for name in images),
+        (NODES_FILE, node.id, f"in cluster {node.cluster}"),
+        (DOMAINS_FILE, domain.name, f"namespace {domain.namespace}"),
     ]
-    found.append(ShapingFile(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))
-    domain = release.domain
-    return [*found, ShapingFile(DOMAINS_FILE, domain.name, f"namespace {domain.namespace}")]
+    return [ShapingFile(*entry) for entry in entries]
 
 
 def denied_release_named(
     ledger: Ledger, config: Config, name: str
 ) -> tuple[Release, Override] | None:
     """Return the denied release with a name and the override that denies it, or ``None``."""
-    for key in all_keys(ledger, config):
-        found = denied_release(ledger, config, key)
-        if found is not None and found[0].name == name:
-            return found
-    return None
+    denied = (denied_release(ledger, config, key) for key in all_keys(ledger, config))
+    return next((found for found in denied if found and found[0].name == name), None)
 
 
 def keeping_override(claim: Claim, config: Config) -> Override | None:
     """Return the override that keeps this claim, or ``None`` if a demand holds it."""
     return config.overrides.get(claim.keeping_override or "")
-
-
-def _service_files(release: ServiceRelease, config: Config) -> Iterator[ShapingFile]:
-    folder = f"appdefs/{release.appdef}"
-    yield ShapingFile(f"{folder}/appdef.yaml", f"services.{release.key.service}", "what it is")
-    yield ShapingFile(
-        config.values_template(release.appdef, release.service), "", "its Helm values"
-    )
-    chart, name = release.chart, release.service.chart
-    where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
-    yield ShapingFile(CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}")

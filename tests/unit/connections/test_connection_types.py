@@ -13,7 +13,7 @@ from demandops.decision import State
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 
-from tests.kit.carriers import (
+from tests.kit.connections import (
     REACHABLE,
     SPEAKS,
     TYPED,

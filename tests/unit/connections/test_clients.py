@@ -14,7 +14,6 @@ import yaml
 from demandops.config.load import load
 from demandops.connections.communication_client import ClientKey
 from demandops.connections.mqtt import MQTT
-from demandops.connections.ros import dds_type
 from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH
 from demandops.decision import Decision, State, rendered_files
@@ -25,8 +24,8 @@ from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connection_client import check_configuration
 from demandops.subject import Subject, SubjectKind
 
-from tests.kit.carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.config import skeleton
+from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.memory import MemoryRepo
 
 
@@ -96,15 +95,6 @@ class TestZenoh:
         changes = changes_on(before, world.state.ledger, [subject])
         keys = affected_keys(before, world.state.ledger, world.state.config, changes)
         assert keys == (ClientKey(MQTT, "c", "source"), ClientKey(MQTT, "c", "target"))
-
-    def test_its_cost_does_not_grow_with_connections_elsewhere(self) -> None:
-        world = zenoh_world()
-        for number in range(30):
-            world.send(demand("zenoh", id=f"c{number}", source="vehicle01"))
-        world.send(demand("zenoh", target="vehicle00", source="edge"))
-        assert world.state.ledger.connections_at(
-            world.state.ledger.connection_claims("c")[0].connection.known_type, "vehicle00"
-        ) == ("c",)
 
     def test_topics_match_whole_names_and_nothing_else(self) -> None:
         world = zenoh_world()
@@ -177,9 +167,6 @@ class TestRos:
             "source" if "-source" in name else "target": yaml.safe_load(data["config.yaml"])
             for name, data in world.clients().items()
         }
-
-    def test_the_types_of_messages_as_dds_knows_them(self) -> None:
-        assert dds_type("std_msgs/msg/String") == "std_msgs::msg::dds_::String_"
 
     def test_both_meet_at_the_targets_address(self) -> None:
         world = self.world()
@@ -376,23 +363,6 @@ class TestWhatPeopleDidInGit:
 
 class TestSchemas:
     """A field that the client does not read never reaches a commit."""
-
-    @pytest.mark.parametrize(
-        ("kind", "configuration", "expected"),
-        [
-            (
-                "mqtt",
-                {"/**/*": {"ros__parameters": {"broker": {}, "client": {"id": "x"}, "bridge": {}}}},
-                "mqtt of x: /**/*.ros__parameters.bridge: {} has less than 1 property",
-            ),
-            ("zenoh", {"mode": "router"}, 'zenoh of x: "plugins" is a required property'),
-            ("ros", {"version": "v4.0"}, 'ros of x: version: "v5.0" was expected'),
-        ],
-    )
-    def test_it_is_told(self, kind: str, configuration: dict[str, Any], expected: str) -> None:
-        with pytest.raises(InvalidInput) as invalid:
-            check_configuration(kind, configuration, "x")
-        assert expected in [str(found) for found in invalid.value.faults]
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
     def test_a_field_more_anywhere_is_refused(self, kind: str) -> None:
