@@ -8,8 +8,6 @@ from datetime import datetime, timezone
 from itertools import islice
 from pathlib import Path
 
-from pygit2 import Commit
-
 from demandops import settings
 from demandops.config.config import Config
 from demandops.errors import Fault, InvalidInput, StateRepoError
@@ -22,13 +20,15 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.address import is_url
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.history import authorship, commit_log, path_history, revisions
+from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.history.path_history import PathHistory
 from demandops.staterepo.load import (
-    in_force_trailers,
     last_valid_config,
+    ledger_files,
     problem_report,
     rollback_target,
+    state_in_effect,
 )
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
@@ -105,18 +105,10 @@ class Reader:
         Raises:
             InvalidInput, StateRepoError: the commit is not a valid state repo.
         """
-        commit = trees.commit_of(self._repository.objects, self.commit(revision))
-        record = self._generator_record(commit)
-        if record is not None and record.first("In-Force"):
-            return in_force_trailers.snapshot_at(self._repository.objects, commit, record)
-        return snapshots.load(self._repository.objects, commit.id, progress)
-
-    def _generator_record(self, commit: Commit) -> LogEntry | None:
-        """Return the generator's newest commit up to this one, which records what is in effect."""
-        base = commit_log.last_generator_commit(self._repository.objects, commit.id)
-        if base is None:
-            return None
-        return commit_log.entry_of(trees.commit_of(self._repository.objects, base))
+        objects, commit = self._repository.objects, self.commit(revision)
+        if state_in_effect.record_at(objects, commit).first("In-Force"):
+            return state_in_effect.state_at(objects, commit, progress)
+        return snapshots.load(objects, commit, progress)
 
     def problems(self) -> tuple[problem_report.Problem, ...]:
         """Return the problems that the generator reports at the newest commit."""
@@ -140,7 +132,7 @@ class Reader:
         try:
             return self.snapshot(revision, progress)
         except InvalidInput:
-            return snapshots.load_last_valid(self._repository.objects, revision, progress)
+            return state_in_effect.state_at(self._repository.objects, revision, progress)
 
     def file_reader(self, revision: str | None = None) -> FileReader:
         """Return a function that returns the text of a file at a commit."""
@@ -173,11 +165,8 @@ class Reader:
     def commits_changing(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield the commits of :meth:`log` that changed a file or folder."""
         since, until = self._sides(spec or "")
-        objects = self._repository.objects
-        known = {one.commit for one in commit_log.walk(objects, until, since)} if since else None
-        for change in path_history.changes_to(objects, until, path):
-            if known is None or change.entry.commit in known:
-                yield change.entry
+        for change in path_history.changes_to(self._repository.objects, until, path, since):
+            yield change.entry
 
     def revisions(self, spec: str | None) -> list[str]:
         """Return the commits that ``REV`` or ``A..B`` names, oldest first.
@@ -237,21 +226,21 @@ class Reader:
     def changed_files(self, before: str, after: str, root: str) -> dict[str, bool]:
         """Return the files of a folder that differ between two commits: path → exists after."""
         objects = self._repository.objects
-        sides = [trees.commit_of(objects, revision).tree for revision in (before, after)]
-        changed = trees.differences_below(objects, sides[0], sides[1], root)
+        old, new = (trees.commit_of(objects, revision).tree for revision in (before, after))
+        changed = trees.differences(old, new, (root,))
         return {path: blob is not None for path, blob in changed}
 
     def changes_node(self, commit: str, node: str) -> bool:
         """Return whether a commit changed what runs on a node, or a claim that names it."""
-        return path_history.changes_node(self._repository.objects, commit, node)
+        return ledger_files.changes_node(self._repository.objects, commit, node)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
         """Return the commits by people that a follow commit renders, newest first."""
         since, follows = entry.first("Since"), entry.first("Follows")
         if not (since and follows):
             return []
-        walked = commit_log.walk(self._repository.objects, follows, since)
-        return list(islice((one for one in walked if not one.by_generator), most))
+        people = commit_log.person_commits(self._repository.objects, follows, since)
+        return [commit_log.entry_of(commit) for commit in islice(people, most)]
 
     def restoration(self, to: str, **more: object) -> Restoration:
         """Return the request to roll back to a commit."""
@@ -263,9 +252,9 @@ class Reader:
             self._repository.objects, commit, self._tip
         )
 
-    def git_user(self) -> tuple[str, str]:
-        """Return the name and e-mail address of the person who runs this program."""
-        return authorship.git_user(self._repository.objects)
+    def operator(self) -> Person:
+        """Return the person who runs this program."""
+        return authorship.operator(self._repository.objects.path)
 
 
 @contextmanager

@@ -14,8 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-import pygit2
-from pygit2 import Repository, Signature
+from pygit2 import Oid, Repository, Signature
 
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS, Config
@@ -23,7 +22,6 @@ from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State
 from demandops.errors import InvalidInput, StateRepoError, fault
-from demandops.ledger import ended_override_file
 from demandops.plan.overrides.lifecycle import LedgerUpdate, update_ledger
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import planned_releases
@@ -33,10 +31,10 @@ from demandops.staterepo import reader
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import Signer
-from demandops.staterepo.history import commit_log, commit_message
-from demandops.staterepo.load import last_valid_config
+from demandops.staterepo.history import authorship, commit_message
+from demandops.staterepo.load import last_valid_config, state_in_effect
 from demandops.staterepo.load import snapshot as snapshots
-from demandops.staterepo.load.snapshot import Progress, Snapshot
+from demandops.staterepo.load.snapshot import Progress
 from demandops.staterepo.write.commit_batch import CommitBatch
 
 _ATTEMPTS = 10
@@ -111,11 +109,10 @@ def upgrade(
             made, batch, applied = _plan_upgrade(repository, request, now, progress)
             if not made.files:
                 return made
-            author = _person(repository.objects, now)
+            who = authorship.operator(repository.objects.path)
+            author = Signature(who.name, who.email, int(now.timestamp()), 0)
             state = replace(batch.head.state, ledger=applied.ledger, config=applied.config)
-            commit = batch.commit_files(
-                made.files, state, _message(made, applied), author, now, applied.keys
-            )
+            commit = batch.commit_files(made.files, state, _message(made, applied), author, now)
             if batch.publish():
                 return Upgrade(commit, made.old, made.new, made.files)
             time.sleep(_PAUSE_S * attempt * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
@@ -136,10 +133,9 @@ def _plan_upgrade(
     files = trees.texts(tree, CONFIG_ROOTS)
     before = files[ROOT_FILE]
     files[ROOT_FILE] = _root(before, old, request)
-    marked = last_valid_config.end_markers_at(tree)
-    config = load(files).with_ended_overrides(ended_override_file.read(marked))
+    config = load(files).with_ended_overrides(last_valid_config.ended_overrides_at(tree))
     state = State.of(config, snapshot.state.ledger)
-    applied = _with_changes_by_people(repository, snapshot, state, marked, now)
+    applied = _with_changes_by_people(objects, tip, state, now)
     state = replace(state, ledger=applied.ledger, config=applied.config)
     if old.repo_settings.gitops != config.repo_settings.gitops:
         _refuse_held(state)
@@ -150,21 +146,14 @@ def _plan_upgrade(
 
 
 def _with_changes_by_people(
-    repository: StateRepository,
-    tip: Snapshot,
-    state: State,
-    marked: Mapping[str, str],
-    now: datetime,
+    objects: Repository, tip: Oid, new: State, now: datetime
 ) -> LedgerUpdate:
     """Return the state with what people changed since the generator's last commit."""
-    objects = repository.objects
-    last = commit_log.last_generator_commit(objects, tip.commit)
-    before = tip.state if last is None else snapshots.load_last_valid(objects, last).state
-    after = state.ledger
-    keys = {claim.key for ledger in (before.ledger, after) for claim in ledger}
-    subjects = {key.subject for key in keys if before.ledger.get(key) != after.get(key)}
-    old = (before.ledger, before.config)
-    return update_ledger(old, (after, state.config), sorted(subjects, key=str), marked, now)
+    old = state_in_effect.start_at(objects, tip).state
+    keys = {claim.key for state in (old, new) for claim in state.ledger}
+    subjects = {key.subject for key in keys if old.ledger.get(key) != new.ledger.get(key)}
+    marked = last_valid_config.end_markers_at(trees.commit_of(objects, tip).tree)
+    return update_ledger(old, new, sorted(subjects, key=str), marked, now)
 
 
 def _refuse_held(state: State) -> None:
@@ -204,15 +193,6 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
     except InvalidInput as error:
         raise InvalidInput(strict_yaml.faults_in(error, ROOT_FILE)) from None
     return text
-
-
-def _person(objects: Repository, now: datetime) -> Signature:
-    """Return the person who runs the command, from git's configuration; else the generator."""
-    try:
-        who = objects.default_signature
-    except (KeyError, ValueError, pygit2.GitError):
-        return commit_message.generator_signature(now)
-    return Signature(who.name, who.email, int(now.timestamp()), 0)
 
 
 def _message(made: Upgrade, applied: LedgerUpdate) -> str:

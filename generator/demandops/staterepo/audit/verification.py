@@ -17,9 +17,8 @@ from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.decision import State, rendered_files
-from demandops.demand.claim import Claim
 from demandops.errors import InvalidInput
-from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import ClaimChange
 from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.release import Release
@@ -32,7 +31,7 @@ from demandops.staterepo.audit import allowed_changes
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import LogEntry, entry_of
 from demandops.staterepo.history.commit_message import PROPOSAL
-from demandops.staterepo.load import in_force_trailers
+from demandops.staterepo.load import ledger_files, state_in_effect
 
 _CHARTS = "/_charts/"
 
@@ -64,7 +63,6 @@ class _Proof:
 
     tree: Tree
     state: State
-    claims: dict[str, Claim]
     plan: IncrementalPlan
     planned: dict[ReleaseKey, tuple[str, Oid]]
     held: dict[ReleaseKey, Release]
@@ -98,8 +96,8 @@ class _Proof:
         wanted = self.undemanded | dict(self.planned.values())
         if before is not None and any(one.hold for one in self.state.config.active_overrides):
             charts = {
-                path: trees.read_text(before, path) or ""
-                for path, _ in _generated_files(before)
+                path: trees.text_of(blob)
+                for path, blob in trees.blobs(before, GENERATED_ROOTS)
                 if _CHARTS in path and path not in wanted
             }
             kept = release_file.kept_charts({}, charts, self.state.config)
@@ -109,7 +107,7 @@ class _Proof:
 
 def _rendered(release: Release, state: State, before: Tree | None) -> tuple[str, Oid]:
     path = path_of(release)
-    current = trees.read_text(before, path) if before is not None else None
+    current = trees.read_text(before, path)
     return path, _blob(release_file.release_text(release, state.config, state.engine, current))
 
 
@@ -127,7 +125,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         if verdict.skipped:
             yield verdict
             continue
-        touched = allowed_changes.disallowed_files(repo, commit, entry)
+        touched = allowed_changes.disallowed_files(commit, entry)
         whole_commit = whole or place == len(commits) or bool(entry.first("In-Force"))
         try:
             differing = proofs.differing(commit, entry, whole=whole_commit)
@@ -163,24 +161,24 @@ class _Proofs:
         """
         proof, self._proof = self._proof, None
         if whole:
-            state = self._loaded(commit, entry)
+            state = self._loaded(entry)
             files = rendered_files(state, _held_from(commit, state.config))
             wanted = {path: _blob(text) for path, text in files.items()}
-            return _differing(wanted, dict(_generated_files(commit.tree)))
+            return _differing(wanted, _generated_files(commit.tree))
         if proof is None or _reconfigured(proof, commit):
-            proof = _prove_whole(self._loaded(commit, entry), commit)
+            proof = _prove_whole(self._loaded(entry), commit)
         else:
             try:
-                changes = _claims_changed(self._repo, proof, commit)
+                changes = _claims_changed(proof, commit)
             except InvalidInput as error:
                 raise _Unreadable(error.faults[0]) from None
-            _advance(self._repo, proof, commit, changes)
+            _advance(proof, commit, changes)
         self._proof = proof  # not reached, and so None, if the commit could not be read
-        return proof.differing(_parent(commit))
+        return proof.differing(trees.parent_tree(commit))
 
-    def _loaded(self, commit: Commit, entry: LogEntry) -> State:
+    def _loaded(self, entry: LogEntry) -> State:
         try:
-            return in_force_trailers.snapshot_at(self._repo, commit, entry).state
+            return state_in_effect.recorded_state(self._repo, entry).state
         except InvalidInput as error:
             raise _Unreadable(error.faults[0]) from None
 
@@ -202,13 +200,9 @@ def _skip_reason(entry: LogEntry) -> str:
     return ""
 
 
-def _parent(commit: Commit) -> Tree | None:
-    return commit.parents[0].tree if commit.parents else None
-
-
 def _held_from(commit: Commit, config: Config) -> dict[str, str]:
     """Return the files of the commit's parent if overrides hold some of them."""
-    before = _parent(commit)
+    before = trees.parent_tree(commit)
     if before is None or not any(override.hold for override in config.active_overrides):
         return {}
     return trees.texts(before, GENERATED_ROOTS)
@@ -217,33 +211,20 @@ def _held_from(commit: Commit, config: Config) -> dict[str, str]:
 def _reconfigured(proof: _Proof, commit: Commit) -> bool:
     """Return whether configuration, ended overrides or the problem report changed."""
 
-    def ids(tree: Tree) -> list[Oid | None]:
-        objects = [trees.child(tree, root) for root in (*CONFIG_ROOTS, NOTES_ROOT)]
-        ledger = trees.child(tree, claim_file.LEDGER_ROOT)
-        if isinstance(ledger, Tree):
-            objects.append(trees.child(ledger, ended_override_file.MARKERS_ROOT.rsplit("/", 1)[-1]))
-        return [entry.id if entry else None for entry in objects]
-
-    return ids(proof.tree) != ids(commit.tree)
+    roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
+    return trees.differ(proof.tree, commit.tree, roots)
 
 
-def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[ClaimChange]:
+def _claims_changed(proof: _Proof, commit: Commit) -> list[ClaimChange]:
     """Return the claims that differ from those of the commit proven before.
 
     Raises:
         InvalidInput: a claim file is not valid.
     """
-    changes = []
-    for path, blob in trees.differences_below(
-        repo, proof.tree, commit.tree, claim_file.LEDGER_ROOT
-    ):
-        if claim_file.kind_of(path) is None:
-            continue
-        known = proof.claims.get(path)
-        claim = claim_file.read(_text(commit, path), path) if blob else None
-        if known or claim:
-            changes.append(ClaimChange(known, claim))
-    return changes
+    return [
+        ClaimChange(*(ledger_files.claim_at(tree, path) for tree in (proof.tree, commit.tree)))
+        for path in ledger_files.changed_files(proof.tree, commit.tree)
+    ]
 
 
 def _prove_whole(state: State, commit: Commit) -> _Proof:
@@ -252,48 +233,31 @@ def _prove_whole(state: State, commit: Commit) -> _Proof:
     proof = _Proof(
         tree=commit.tree,
         state=state,
-        claims={claim_file.path_of(claim.key): claim for claim in state.ledger},
         plan=IncrementalPlan(state.config),
         planned={},
         held={},
         undemanded={path: _blob(text) for path, text in undemanded.items()},
-        committed=dict(_generated_files(commit.tree)),
+        committed=_generated_files(commit.tree),
     )
-    proof.advance(state, (), _parent(commit))
+    proof.advance(state, (), trees.parent_tree(commit))
     return proof
 
 
-def _advance(
-    repo: Repository, proof: _Proof, commit: Commit, changes: Sequence[ClaimChange]
-) -> None:
+def _advance(proof: _Proof, commit: Commit, changes: Sequence[ClaimChange]) -> None:
     """Render what a commit changed in the ledger, and record which files it changed."""
     ledger = proof.state.ledger
     for change in changes:
         ledger = ledger.replace(change.key, change.after)
-        path = claim_file.path_of(change.key)
-        proof.claims.pop(path, None)
-        if change.after is not None:
-            proof.claims[path] = change.after
-    for root in GENERATED_ROOTS:
-        for path, blob in trees.differences_below(repo, proof.tree, commit.tree, root):
-            proof.committed.pop(path, None)
-            if blob is not None:
-                proof.committed[path] = blob
+    for path, blob in trees.differences(proof.tree, commit.tree, GENERATED_ROOTS):
+        proof.committed.pop(path, None)
+        if blob is not None:
+            proof.committed[path] = blob
     proof.tree = commit.tree
-    proof.advance(replace(proof.state, ledger=ledger), changes, _parent(commit))
+    proof.advance(replace(proof.state, ledger=ledger), changes, trees.parent_tree(commit))
 
 
-def _generated_files(tree: Tree) -> Iterator[tuple[str, Oid]]:
-    for root in GENERATED_ROOTS:
-        entry = trees.child(tree, root)
-        if isinstance(entry, Tree):
-            yield from trees.files_below(entry, f"{root}/")
-        elif entry is not None:
-            yield root, entry.id
-
-
-def _text(commit: Commit, path: str) -> str:
-    return trees.read_text(commit.tree, path) or ""
+def _generated_files(tree: Tree) -> dict[str, Oid]:
+    return {path: blob.id for path, blob in trees.blobs(tree, GENERATED_ROOTS)}
 
 
 def _blob(text: str) -> Oid:

@@ -16,6 +16,7 @@ from pygit2 import Oid, Repository
 
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.signing import Signer
 
 MAIN = f"refs/heads/{MAIN_BRANCH}"
@@ -90,8 +91,13 @@ class StateRepository(ABC):
         May be called from any thread.
         """
         objects = Repository(self.objects.path)
-        one, two = (_under(objects, name, path) for name in (commit, other))
-        return one is not None and one == two
+        try:
+            one, two = (trees.commit_of(objects, name).tree for name in (commit, other))
+        except StateRepoError:
+            return False
+        if path in ("", "."):
+            return one.id == two.id
+        return trees.entry(one, path) is not None and not trees.differ(one, two, (path,))
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
         """Return the paths in which two commits differ; None if one is not known here.
@@ -118,15 +124,6 @@ class StateRepository(ABC):
     @abstractmethod
     def always_current(self) -> bool:
         """Whether :meth:`tip` is never out of date (a repository on this disk)."""
-
-
-def _under(objects: Repository, commit: str, path: str) -> Oid | None:
-    """Return the id of the file or folder at a path in a commit, or None."""
-    try:
-        tree = objects[commit].peel(pygit2.Tree)
-        return tree.id if path in ("", ".") else tree[path].id
-    except (pygit2.GitError, KeyError, ValueError):
-        return None
 
 
 def _git(repo: git.Repo, *command: str) -> None:

@@ -14,15 +14,13 @@ from datetime import datetime, timezone
 
 import git
 import pygit2
-from pygit2 import Commit, Oid, Repository, Tree
-from pygit2 import Config as GitConfig
-from pygit2.enums import SortMode
+from pygit2 import Commit, Oid, Repository
 
 from demandops.config.config import CONFIG_ROOTS
 from demandops.ledger.claim_file import LEDGER_ROOT
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history import commit_message
+from demandops.staterepo.history import commit_log, commit_message
 
 _ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _MOST_NAMED = 20
@@ -32,18 +30,24 @@ _EMAIL = re.compile(r"[^\s<>\x00-\x1f\x7f]+")
 
 
 @dataclass(frozen=True, slots=True)
+class Person:
+    """Name and e-mail address of a person; as text ``name <email>``, as git shows it."""
+
+    name: str
+    email: str
+
+    def __str__(self) -> str:
+        """Return ``name <email>``."""
+        return f"{self.name} <{self.email}>"
+
+
+@dataclass(frozen=True, slots=True)
 class PersonCommit:
     """A commit by a person: its id, author and time."""
 
     commit: str
-    name: str
-    email: str
+    who: Person
     time: datetime
-
-    @property
-    def who(self) -> str:
-        """Return ``name <email>``, as git shows it."""
-        return f"{self.name} <{self.email}>"
 
 
 def person_commits_since(repo: Repository, known: Oid, to: Oid) -> tuple[PersonCommit, ...]:
@@ -53,7 +57,7 @@ def person_commits_since(repo: Repository, known: Oid, to: Oid) -> tuple[PersonC
     """
     return tuple(
         person_commit_of(commit)
-        for commit in _person_commits(repo, known, to)
+        for commit in commit_log.person_commits(repo, to, known)
         if _touches(commit, _ROOTS)
     )
 
@@ -62,35 +66,23 @@ class FaultOrigins:
     """Finds the commit by a person since ``known`` that last changed a path."""
 
     def __init__(self, repo: Repository, known: Oid, to: Oid) -> None:
-        self._range = (repo, known, to)
+        self._range = (repo, to, known)
         self._commits: list[Commit] | None = None
 
     def __call__(self, path: str) -> tuple[str, str] | None:
         """Return commit and author of the last change to ``path``, else of any change."""
         if self._commits is None:  # read late: most reports exist already and need no commits
-            self._commits = list(_person_commits(*self._range))
+            self._commits = list(commit_log.person_commits(*self._range))
         for paths in ((path,) if path else (), _ROOTS):
             for commit in self._commits:
                 if _touches(commit, paths):
                     found = person_commit_of(commit)
-                    return found.commit, found.who
+                    return found.commit, str(found.who)
         return None
 
 
-def _person_commits(repo: Repository, known: Oid, to: Oid) -> Iterable[Commit]:
-    walker = repo.walk(to, SortMode.TOPOLOGICAL)
-    walker.hide(known)
-    return (commit for commit in walker if not commit_message.is_by_generator(commit.message))
-
-
 def _touches(commit: Commit, paths: Iterable[str]) -> bool:
-    parent = commit.parents[0].tree if commit.parents else None
-    return any(_entry_id(parent, path) != _entry_id(commit.tree, path) for path in paths)
-
-
-def _entry_id(tree: Tree | None, path: str) -> Oid | None:
-    entry = trees.child(tree, path) if tree is not None else None
-    return entry.id if entry is not None else None
+    return trees.differ(trees.parent_tree(commit), commit.tree, paths)
 
 
 def person_commit_of(commit: Commit) -> PersonCommit:
@@ -98,9 +90,8 @@ def person_commit_of(commit: Commit) -> PersonCommit:
     name = _UNFIT.sub("", commit.author.name).strip(" .,:;\"'\\") or "unnamed"
     email = commit.author.email if _EMAIL.fullmatch(commit.author.email or "") else ""
     time = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
-    return PersonCommit(
-        str(commit.id), name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL, time
-    )
+    who = Person(name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL)
+    return PersonCommit(str(commit.id), who, time)
 
 
 def caused_by_trailers(causes: tuple[PersonCommit, ...]) -> list[tuple[str, str]]:
@@ -119,38 +110,29 @@ def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Sig
     """
     if not causes:
         return commit_message.generator_signature(now)
-    people = list(dict.fromkeys((cause.name, cause.email) for cause in reversed(causes)))
-    name = ", ".join(dict.fromkeys(name for name, _ in people))
+    people = list(dict.fromkeys(cause.who for cause in reversed(causes)))
+    name = ", ".join(dict.fromkeys(one.name for one in people))
     if len(name) > _MOST_AUTHOR:
         name = name[: _MOST_AUTHOR - 1].rstrip(" ,") + "…"
-    email = people[0][1] if len(people) == 1 else commit_message.GENERATOR_EMAIL
+    email = people[0].email if len(people) == 1 else commit_message.GENERATOR_EMAIL
     return pygit2.Signature(name, email, int(causes[0].time.timestamp()), 0)
 
 
-def operator() -> str:
-    """Return ``name <email>`` of the person who runs this program; empty if git does not know."""
+def operator(folder: str | None = None) -> Person:
+    """Return the person who runs this program, from git or else the login.
+
+    Args:
+        folder: a repository whose configuration counts too; by default that of this directory.
+    """
     try:
-        ident = git.Git().execute(
+        ident = git.Git(folder).execute(
             ["git", "-c", "user.useConfigOnly=true", "var", "GIT_AUTHOR_IDENT"]
         )
     except git.GitCommandError:
-        return ""
-    return str(ident).rsplit("> ", 1)[0] + ">"
-
-
-def git_user(repo: Repository) -> tuple[str, str]:
-    """Return the name and e-mail address of this program's user, from git or else the login."""
-    settings = repo.config.snapshot()
-    try:
-        login = getpass.getuser()
-    except (KeyError, OSError):  # a container's user has no passwd entry
-        login = "unknown"
-    name = _setting(settings, "user.name") or login
-    return name, _setting(settings, "user.email") or f"{login}@demandops.invalid"
-
-
-def _setting(settings: GitConfig, key: str) -> str:
-    try:
-        return settings[key] or ""
-    except KeyError:
-        return ""
+        try:
+            login = getpass.getuser()
+        except (KeyError, OSError):  # a container's user has no passwd entry
+            login = "unknown"
+        return Person(login, f"{login}@demandops.invalid")
+    name, _, email = str(ident).rsplit("> ", 1)[0].rpartition(" <")
+    return Person(name, email)

@@ -36,14 +36,6 @@ _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
 
 
-def is_by_generator(message: str) -> bool:
-    """Return whether a commit is the generator's, so that its files match its ledger.
-
-    A proposal does not count: a person merges it, maybe onto other changes, so it is read again.
-    """
-    return "\nRender-Version: " in message and f"\n{PROPOSAL}: " not in message
-
-
 def generator_signature(time: datetime) -> pygit2.Signature:
     """Return the committer of the generator's commits."""
     return pygit2.Signature(GENERATOR_NAME, GENERATOR_EMAIL, int(time.timestamp()), 0)

@@ -32,6 +32,7 @@ from demandops.render.changes.merge_preview import MergePreview
 from demandops.render.changes.override_suggestion import Suggestion
 from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.load import ledger_files
 from demandops.staterepo.pull_request import manual_edits
 from demandops.staterepo.pull_request.worktree import Base, author_of, base_of, files_of
 
@@ -70,13 +71,14 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
     files, faults = files_of(folder)
     start = base_of(folder, base)
     before = start.files if start else files
-    ledger = _ledger(files, faults)
+    claims = ledger_files.read(sorted(files.items()))
+    faults += claims.faults
     result = CheckResult((), base=start.commit if start else None)
     result = replace(result, base_valid=start is None or start.valid)
     edited = manual_edits.changed_paths(files, before)
     try:
         now = now or datetime.now(timezone.utc)
-        state = _state(files, before, ledger, faults, now)
+        state = _state(files, before, claims.ledger(), faults, now)
         changed = [path for path in {*files, *before} if files.get(path) != before.get(path)]
         state = _applied(state, start, changed, files, now)
         current = {
@@ -112,20 +114,6 @@ def _ordered(faults: list[Fault]) -> tuple[Fault, ...]:
 
 def _generated(path: str) -> bool:
     return path.split("/", maxsplit=1)[0] in GENERATED_ROOTS
-
-
-def _ledger(files: Mapping[str, str], faults: list[Fault]) -> Ledger:
-    ledger = Ledger()
-    for path, text in sorted(files.items()):
-        if claim_file.kind_of(path) is None:
-            continue
-        try:
-            claim = claim_file.read(text, path)
-        except InvalidInput as error:
-            faults += error.faults
-        else:
-            ledger = ledger.replace(claim.key, claim)
-    return ledger
 
 
 def _state(
@@ -169,8 +157,7 @@ def _applied(
         for claim in ledger
         if claim_file.path_of(claim.key) in changed
     ]
-    before, after = (old, start.state.config), (new, state.config)
-    applied = update_ledger(before, after, dict.fromkeys(subjects), _marked(files), now)
+    applied = update_ledger(start.state, state, dict.fromkeys(subjects), _marked(files), now)
     return replace(state, ledger=applied.ledger, config=applied.config)
 
 

@@ -15,7 +15,7 @@ from demandops.errors import Fault, InvalidInput, StateRepoError, fault
 from demandops.ledger import claim_file
 from demandops.settings import GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.load import snapshot as snapshots
+from demandops.staterepo.load import state_in_effect
 
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
@@ -88,7 +88,7 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
     commit = _started_from(repo, revision)
     files = trees.texts(commit.tree, _ROOTS)
     try:
-        snapshot = snapshots.load_last_valid(repo, commit.id)
+        snapshot = state_in_effect.state_at(repo, commit.id)
     except (InvalidInput, StateRepoError):
         return Base(str(commit.id), files, None, False)
     return Base(str(commit.id), files, snapshot.state, not snapshot.problems)

@@ -165,10 +165,10 @@ class ProposalBranches:
             return False  # the clone was made again, or `git gc` removed the commit
         now = commit_of(objects, tip).tree
         new = objects[wanted].peel(pygit2.Tree)
-        proposed = dict(trees.differences(objects, old, proposal, ""))
-        if proposed != dict(trees.differences(objects, now, new, "")):
+        proposed = dict(trees.differences(old, proposal))
+        if proposed != dict(trees.differences(now, new)):
             return False
-        moved = dict(trees.differences(objects, old, now, ""))
+        moved = dict(trees.differences(old, now))
         return not set(moved) & set(proposed)
 
 
