@@ -12,22 +12,21 @@ from demandops.errors import Refused, fault
 from demandops.ledger.operations.restoration import Restoration
 from demandops.settings import API_VERSION
 from demandops.staterepo.git.repository import StateRepository
-from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.load.rollback_target import restoration
 from demandops.staterepo.load.snapshot import Snapshot
 
 _KIND = "Rollback"
 
 
-def goal(to: str, *, drop_newer: bool, reason: str, who: Person) -> dict[str, Any]:
-    """Return the goal to go back to a commit; ``who`` asks for it."""
+def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dict[str, Any]:
+    """Return the goal to go back to a commit; ``who`` is the person's name and e-mail address."""
     return {
         "apiVersion": API_VERSION,
         "kind": _KIND,
         "to": to,
         "dropNewer": drop_newer,
         "reason": " ".join(reason.split()),
-        "by": [who.name, who.email],
+        "by": list(who),
     }
 
 

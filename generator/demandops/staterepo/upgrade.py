@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from pygit2 import Oid, Repository, Signature
+from pygit2 import Oid, Repository
 
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS, Config
@@ -110,7 +110,7 @@ def upgrade(
             if not made.files:
                 return made
             who = authorship.operator(repository.objects.path)
-            author = Signature(who.name, who.email, int(now.timestamp()), 0)
+            author = commit_message.signature(who.name, who.email, now)
             state = replace(batch.head.state, ledger=applied.ledger, config=applied.config)
             commit = batch.commit_files(made.files, state, _message(made, applied), author, now)
             if batch.publish():
@@ -207,27 +207,21 @@ def _message(made: Upgrade, applied: LedgerUpdate) -> str:
     if switched:
         why += f", for {_NAMES[new.gitops]} instead of {_NAMES[old.gitops]}"
     counts = Counter("/".join(path.split("/")[:_FOLDER_DEPTH]) for path in made.files)
-    lines = [
-        title,
-        "",
-        f"Why: `demandops upgrade` renders everything {why}.",
-        "",
-        "Files written or removed:",
-        *(f"  {count} in {folder}" for folder, count in sorted(counts.items())),
-        "",
-        "Operation: upgrade",
-        f"From-Render-Version: {old.render_version}",
-        *([f"From-Gitops: {old.gitops}"] if switched else []),
-        f"Gitops: {new.gitops}",
-        *(
-            f"{key}: {path}"
-            for key, path in commit_message.override_trailers(
-                commit_message.keep_override_paths(applied.keys)
-            )
-        ),
-        f"Render-Version: {new.render_version}",
+    trailers = [
+        ("Operation", "upgrade"),
+        ("From-Render-Version", str(old.render_version)),
+        ("From-Gitops", old.gitops if switched else ""),
+        ("Gitops", new.gitops),
+        *commit_message.override_trailers(commit_message.keep_override_paths(applied.keys)),
+        ("Render-Version", str(new.render_version)),
     ]
-    return "\n".join(lines) + "\n"
+    files = [f"  {count} in {folder}" for folder, count in sorted(counts.items())]
+    paragraphs = [
+        [title],
+        [f"Why: `demandops upgrade` renders everything {why}."],
+        ["Files written or removed:", *files],
+    ]
+    return commit_message.compose(paragraphs, trailers)
 
 
 _NAMES = {"flux": "Flux", "argocd": "Argo CD"}

@@ -29,8 +29,7 @@ from demandops.render.gitops.paths import path_of
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.staterepo.audit import allowed_changes
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history.commit_log import LogEntry, entry_of
-from demandops.staterepo.history.commit_message import PROPOSAL
+from demandops.staterepo.history.commit_log import PROPOSAL, LogEntry, entry_of
 from demandops.staterepo.load import ledger_files, state_in_effect
 
 _CHARTS = "/_charts/"
@@ -57,44 +56,72 @@ class Verdict:
     signature: str = ""
 
 
-@dataclass(slots=True)
 class _Proof:
     """A commit that was rendered again, and what the proof of the next one reuses."""
 
-    tree: Tree
-    state: State
-    plan: IncrementalPlan
-    planned: dict[ReleaseKey, tuple[str, Oid]]
-    held: dict[ReleaseKey, Release]
-    """Releases whose files an override holds: they depend on the parent commit."""
-    undemanded: dict[str, Oid]
-    """Files that exist without any demand."""
-    committed: dict[str, Oid]
-    """The commit's files in the generated folders."""
+    def __init__(self, state: State, commit: Commit) -> None:
+        """Render a commit whole."""
+        self.state, self._commit = state, commit
+        self._plan = IncrementalPlan(state.config)
+        self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
+        self._held: dict[ReleaseKey, Release] = {}
+        """Releases whose files an override holds: they depend on the parent commit."""
+        base_files = manifests.base_files(state.config, state.engine)
+        self._undemanded = {path: _blob(text) for path, text in base_files.items()}
+        self._committed = _generated_files(commit.tree)
+        self._render(())
 
-    def advance(self, state: State, changes: Sequence[ClaimChange], before: Tree | None) -> None:
-        """Plan and render what the changes affect.
+    def is_reconfigured(self, commit: Commit) -> bool:
+        """Return whether configuration, ended overrides or the problem report changed."""
+        roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
+        return trees.differ(self._commit.tree, commit.tree, roots)
 
-        Args:
-            state: ledger and configuration after the changes.
-            changes: every claim that changed.
-            before: the commit's parent, whose files overrides may hold.
+    def advance(self, commit: Commit) -> None:
+        """Render what a later commit changed in the ledger, and record which files it changed.
+
+        Raises:
+            _Unreadable: a claim file is not valid.
         """
-        self.state = state
-        for key, release in self.plan.advance(state.ledger, changes).items():
-            self.planned.pop(key, None)
-            self.held.pop(key, None)
-            if release is not None and release.shaping.held:
-                self.held[key] = release
-            elif release is not None:
-                self.planned[key] = _rendered(release, state, None)
-        for key, release in self.held.items():
-            self.planned[key] = _rendered(release, state, before)
+        before, after = self._commit.tree, commit.tree
+        try:
+            changes = [
+                ClaimChange(*(ledger_files.claim_at(tree, path) for tree in (before, after)))
+                for path in ledger_files.changed_files(before, after)
+            ]
+        except InvalidInput as error:
+            raise _Unreadable(error.faults[0]) from None
+        ledger = self.state.ledger
+        for change in changes:
+            ledger = ledger.replace(change.key, change.after)
+        for path, blob in trees.differences(before, after, GENERATED_ROOTS):
+            self._committed.pop(path, None)
+            if blob is not None:
+                self._committed[path] = blob
+        self.state, self._commit = replace(self.state, ledger=ledger), commit
+        self._render(changes)
 
-    def differing(self, before: Tree | None) -> tuple[str, ...]:
+    def _render(self, changes: Sequence[ClaimChange]) -> None:
+        """Plan and render what the changes affect, and what overrides hold."""
+        for key, release in self._plan.advance(self.state.ledger, changes).items():
+            self._planned.pop(key, None)
+            self._held.pop(key, None)
+            if release is not None and release.shaping.held:
+                self._held[key] = release
+            elif release is not None:
+                self._planned[key] = self._rendered(release, None)
+        for key, release in self._held.items():
+            self._planned[key] = self._rendered(release, trees.parent_tree(self._commit))
+
+    def _rendered(self, release: Release, before: Tree | None) -> tuple[str, Oid]:
+        path, state = path_of(release), self.state
+        current = trees.read_text(before, path)
+        return path, _blob(release_file.release_text(release, state.config, state.engine, current))
+
+    def differing(self) -> tuple[str, ...]:
         """Return the files that differ from what was rendered."""
-        wanted = self.undemanded | dict(self.planned.values())
-        if before is not None and any(one.hold for one in self.state.config.active_overrides):
+        wanted = self._undemanded | dict(self._planned.values())
+        before = trees.parent_tree(self._commit)
+        if before is not None and _holds(self.state.config):
             charts = {
                 path: trees.text_of(blob)
                 for path, blob in trees.blobs(before, GENERATED_ROOTS)
@@ -102,13 +129,7 @@ class _Proof:
             }
             kept = release_file.kept_charts({}, charts, self.state.config)
             wanted |= {path: _blob(text) for path, text in kept.items()}
-        return _differing(wanted, self.committed)
-
-
-def _rendered(release: Release, state: State, before: Tree | None) -> tuple[str, Oid]:
-    path = path_of(release)
-    current = trees.read_text(before, path)
-    return path, _blob(release_file.release_text(release, state.config, state.engine, current))
+        return _differing(wanted, self._committed)
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
@@ -162,19 +183,17 @@ class _Proofs:
         proof, self._proof = self._proof, None
         if whole:
             state = self._loaded(entry)
-            files = rendered_files(state, _held_from(commit, state.config))
+            before = trees.parent_tree(commit) if _holds(state.config) else None
+            held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
+            files = rendered_files(state, held)
             wanted = {path: _blob(text) for path, text in files.items()}
             return _differing(wanted, _generated_files(commit.tree))
-        if proof is None or _reconfigured(proof, commit):
-            proof = _prove_whole(self._loaded(entry), commit)
+        if proof is None or proof.is_reconfigured(commit):
+            proof = _Proof(self._loaded(entry), commit)
         else:
-            try:
-                changes = _claims_changed(proof, commit)
-            except InvalidInput as error:
-                raise _Unreadable(error.faults[0]) from None
-            _advance(proof, commit, changes)
+            proof.advance(commit)
         self._proof = proof  # not reached, and so None, if the commit could not be read
-        return proof.differing(trees.parent_tree(commit))
+        return proof.differing()
 
     def _loaded(self, entry: LogEntry) -> State:
         try:
@@ -200,60 +219,8 @@ def _skip_reason(entry: LogEntry) -> str:
     return ""
 
 
-def _held_from(commit: Commit, config: Config) -> dict[str, str]:
-    """Return the files of the commit's parent if overrides hold some of them."""
-    before = trees.parent_tree(commit)
-    if before is None or not any(override.hold for override in config.active_overrides):
-        return {}
-    return trees.texts(before, GENERATED_ROOTS)
-
-
-def _reconfigured(proof: _Proof, commit: Commit) -> bool:
-    """Return whether configuration, ended overrides or the problem report changed."""
-
-    roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
-    return trees.differ(proof.tree, commit.tree, roots)
-
-
-def _claims_changed(proof: _Proof, commit: Commit) -> list[ClaimChange]:
-    """Return the claims that differ from those of the commit proven before.
-
-    Raises:
-        InvalidInput: a claim file is not valid.
-    """
-    return [
-        ClaimChange(*(ledger_files.claim_at(tree, path) for tree in (proof.tree, commit.tree)))
-        for path in ledger_files.changed_files(proof.tree, commit.tree)
-    ]
-
-
-def _prove_whole(state: State, commit: Commit) -> _Proof:
-    """Render a commit whole, so that the next can be proven by its differences."""
-    undemanded = manifests.base_files(state.config, state.engine)
-    proof = _Proof(
-        tree=commit.tree,
-        state=state,
-        plan=IncrementalPlan(state.config),
-        planned={},
-        held={},
-        undemanded={path: _blob(text) for path, text in undemanded.items()},
-        committed=_generated_files(commit.tree),
-    )
-    proof.advance(state, (), trees.parent_tree(commit))
-    return proof
-
-
-def _advance(proof: _Proof, commit: Commit, changes: Sequence[ClaimChange]) -> None:
-    """Render what a commit changed in the ledger, and record which files it changed."""
-    ledger = proof.state.ledger
-    for change in changes:
-        ledger = ledger.replace(change.key, change.after)
-    for path, blob in trees.differences(proof.tree, commit.tree, GENERATED_ROOTS):
-        proof.committed.pop(path, None)
-        if blob is not None:
-            proof.committed[path] = blob
-    proof.tree = commit.tree
-    proof.advance(replace(proof.state, ledger=ledger), changes, trees.parent_tree(commit))
+def _holds(config: Config) -> bool:
+    return any(override.hold for override in config.active_overrides)
 
 
 def _generated_files(tree: Tree) -> dict[str, Oid]:

@@ -7,10 +7,11 @@ A commit is by a person if no generator made it, on any machine.
 from __future__ import annotations
 
 import getpass
+import os
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
-from datetime import datetime, timezone
+from collections.abc import Iterable, Sequence
+from datetime import datetime
+from typing import NamedTuple
 
 import git
 import pygit2
@@ -29,8 +30,7 @@ _UNFIT = re.compile(r"[<>\x00-\x1f\x7f]")
 _EMAIL = re.compile(r"[^\s<>\x00-\x1f\x7f]+")
 
 
-@dataclass(frozen=True, slots=True)
-class Person:
+class Person(NamedTuple):
     """Name and e-mail address of a person; as text ``name <email>``, as git shows it."""
 
     name: str
@@ -41,25 +41,13 @@ class Person:
         return f"{self.name} <{self.email}>"
 
 
-@dataclass(frozen=True, slots=True)
-class PersonCommit:
-    """A commit by a person: its id, author and time."""
-
-    commit: str
-    who: Person
-    time: datetime
-
-
-def person_commits_since(repo: Repository, known: Oid, to: Oid) -> tuple[PersonCommit, ...]:
+def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
     """Return the commits by people up to ``to`` that ``known`` does not include, newest first.
 
     Leaves out commits that change nothing the generator reads (a README).
     """
-    return tuple(
-        person_commit_of(commit)
-        for commit in commit_log.person_commits(repo, to, known)
-        if _touches(commit, _ROOTS)
-    )
+    commits = commit_log.person_commits(repo, to, known)
+    return [commit for commit in commits if _touches(commit, _ROOTS)]
 
 
 class FaultOrigins:
@@ -76,8 +64,7 @@ class FaultOrigins:
         for paths in ((path,) if path else (), _ROOTS):
             for commit in self._commits:
                 if _touches(commit, paths):
-                    found = person_commit_of(commit)
-                    return found.commit, str(found.who)
+                    return str(commit.id), str(author_of(commit))
         return None
 
 
@@ -85,24 +72,22 @@ def _touches(commit: Commit, paths: Iterable[str]) -> bool:
     return trees.differ(trees.parent_tree(commit), commit.tree, paths)
 
 
-def person_commit_of(commit: Commit) -> PersonCommit:
-    """Return a commit and its author, without characters that trailers and signatures forbid."""
+def author_of(commit: Commit) -> Person:
+    """Return the author of a commit, without characters that trailers and signatures forbid."""
     name = _UNFIT.sub("", commit.author.name).strip(" .,:;\"'\\") or "unnamed"
     email = commit.author.email if _EMAIL.fullmatch(commit.author.email or "") else ""
-    time = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
-    who = Person(name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL)
-    return PersonCommit(str(commit.id), who, time)
+    return Person(name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL)
 
 
-def caused_by_trailers(causes: tuple[PersonCommit, ...]) -> list[tuple[str, str]]:
+def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
     """Return ``Caused-By: <commit> <name> <email>`` for each commit, oldest first.
 
     Only the newest are named if there are many; the trailer ``Since`` bounds the others.
     """
-    return [("Caused-By", f"{one.commit} {one.who}") for one in reversed(causes[:_MOST_NAMED])]
+    return [("Caused-By", f"{one.id} {author_of(one)}") for one in reversed(causes[:_MOST_NAMED])]
 
 
-def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Signature:
+def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
     """Return the author of a follow commit: the people whose commits it renders.
 
     One person keeps name and address, so that ``git log --author`` finds both commits. Several
@@ -110,12 +95,12 @@ def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Sig
     """
     if not causes:
         return commit_message.generator_signature(now)
-    people = list(dict.fromkeys(cause.who for cause in reversed(causes)))
+    people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))
     name = ", ".join(dict.fromkeys(one.name for one in people))
     if len(name) > _MOST_AUTHOR:
         name = name[: _MOST_AUTHOR - 1].rstrip(" ,") + "…"
     email = people[0].email if len(people) == 1 else commit_message.GENERATOR_EMAIL
-    return pygit2.Signature(name, email, int(causes[0].time.timestamp()), 0)
+    return pygit2.Signature(name, email, causes[0].commit_time, 0)
 
 
 def operator(folder: str | None = None) -> Person:
@@ -125,14 +110,14 @@ def operator(folder: str | None = None) -> Person:
         folder: a repository whose configuration counts too; by default that of this directory.
     """
     try:
-        ident = git.Git(folder).execute(
-            ["git", "-c", "user.useConfigOnly=true", "var", "GIT_AUTHOR_IDENT"]
-        )
-    except git.GitCommandError:
-        try:
-            login = getpass.getuser()
-        except (KeyError, OSError):  # a container's user has no passwd entry
-            login = "unknown"
-        return Person(login, f"{login}@demandops.invalid")
-    name, _, email = str(ident).rsplit("> ", 1)[0].rpartition(" <")
+        login = getpass.getuser()
+    except (KeyError, OSError):  # a container's user has no passwd entry
+        login = "unknown"
+
+    def known(variable: str, key: str) -> str:
+        setting = git.Git(folder).config("--get", key, with_exceptions=False)
+        return os.environ.get(variable) or str(setting)
+
+    name = known("GIT_AUTHOR_NAME", "user.name") or login
+    email = known("GIT_AUTHOR_EMAIL", "user.email") or f"{login}@demandops.invalid"
     return Person(name, email)

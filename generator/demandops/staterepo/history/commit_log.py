@@ -15,7 +15,9 @@ from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
 from demandops.staterepo.git.tree import commit_of
-from demandops.staterepo.history.commit_message import PROPOSAL
+
+PROPOSAL = "Proposal"
+"""The trailer of a commit that needs approval: the branch that it was proposed on."""
 
 _WHY = "Why: "
 

@@ -35,7 +35,7 @@ from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
-from demandops.staterepo.history import authorship, commit_message
+from demandops.staterepo.history import authorship, commit_log, commit_message
 from demandops.staterepo.load import (
     last_valid_config,
     problem_report,
@@ -88,7 +88,7 @@ class CommitBatch:
         """
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
-            more.append((commit_message.PROPOSAL, proposal))
+            more.append((commit_log.PROPOSAL, proposal))
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
         made = self._write(decision.files, text, commit_message.author(decision, received), now)

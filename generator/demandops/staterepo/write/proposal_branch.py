@@ -23,7 +23,6 @@ from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import MAIN, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
-from demandops.staterepo.history.commit_message import PROPOSAL
 
 PREFIX = "demand/"
 _HEADS = "refs/heads/"
@@ -229,7 +228,7 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
         entries = [
             entry
             for entry in commit_log.walk(repo, repo.references[name].resolve().target, main)
-            if PROPOSAL in entry.trailers
+            if commit_log.PROPOSAL in entry.trailers
         ]
         if entries:
             yield _from_commits(repo, f"{PREFIX}{name.removeprefix(space)}", entries)
