@@ -14,15 +14,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from pygit2 import Oid, Repository
-
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State
+from demandops.demand.claim import ClaimKey
 from demandops.errors import InvalidInput, StateRepoError, fault
-from demandops.plan.overrides.lifecycle import LedgerUpdate, update_ledger
+from demandops.plan.overrides.lifecycle import update_ledger
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import planned_releases
 from demandops.render.gitops.controller_switch import SwitchSteps, switch_steps
@@ -32,7 +31,7 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import authorship, commit_message
-from demandops.staterepo.load import last_valid_config, state_in_effect
+from demandops.staterepo.load import last_valid_config, ledger_files, state_in_effect
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress
 from demandops.staterepo.write.commit_batch import CommitBatch
@@ -66,6 +65,16 @@ class Upgrade:
         return switch_steps(self.old, self.new)
 
 
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """An upgrade, the batch to commit it in, the state after it, and the claims that may change."""
+
+    upgrade: Upgrade
+    batch: CommitBatch
+    state: State
+    keys: tuple[ClaimKey, ...]
+
+
 def plan(
     address: str,
     request: UpgradeRequest,
@@ -79,7 +88,7 @@ def plan(
         StateRepoError: the state repo cannot be read.
     """
     with reader.opened(address) as repo:
-        return _plan_upgrade(repo.repository, request, now, progress)[0]
+        return _plan(repo.repository, request, now, progress).upgrade
 
 
 def upgrade(
@@ -106,15 +115,16 @@ def upgrade(
         repository = repo.repository
         repository.signer = signer
         for attempt in range(1, _ATTEMPTS + 1):
-            made, batch, applied = _plan_upgrade(repository, request, now, progress)
-            if not made.files:
-                return made
+            planned = _plan(repository, request, now, progress)
+            files = planned.upgrade.files
+            if not files:
+                return planned.upgrade
             who = authorship.operator(repository.objects.path)
             author = commit_message.signature(who.name, who.email, now)
-            state = replace(batch.head.state, ledger=applied.ledger, config=applied.config)
-            commit = batch.commit_files(made.files, state, _message(made, applied), author, now)
-            if batch.publish():
-                return Upgrade(commit, made.old, made.new, made.files)
+            text = _message(planned.upgrade, planned.keys)
+            commit = planned.batch.commit_files(files, planned.state, text, author, now)
+            if planned.batch.publish():
+                return replace(planned.upgrade, commit=commit)
             time.sleep(_PAUSE_S * attempt * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
             repository.refresh()
     raise StateRepoError(
@@ -123,9 +133,9 @@ def upgrade(
     )
 
 
-def _plan_upgrade(
+def _plan(
     repository: StateRepository, request: UpgradeRequest, now: datetime, progress: Progress
-) -> tuple[Upgrade, CommitBatch, LedgerUpdate]:
+) -> _Plan:
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
     batch, old = CommitBatch(repository, snapshot), snapshot.state.config
@@ -135,25 +145,18 @@ def _plan_upgrade(
     files[ROOT_FILE] = _root(before, old, request)
     config = load(files).with_ended_overrides(last_valid_config.ended_overrides_at(tree))
     state = State.of(config, snapshot.state.ledger)
-    applied = _with_changes_by_people(objects, tip, state, now)
+    # what people changed since the generator's last commit is carried out too
+    known = state_in_effect.start_at(objects, tip).state
+    subjects = ledger_files.changed_subjects(known.ledger, state.ledger)
+    applied = update_ledger(known, state, subjects, last_valid_config.end_markers_at(tree), now)
     state = replace(state, ledger=applied.ledger, config=applied.config)
     if old.repo_settings.gitops != config.repo_settings.gitops:
         _refuse_held(state)
     changed = dict(batch.render_all(state, applied.files).files)
     if files[ROOT_FILE] != before:
         changed[ROOT_FILE] = files[ROOT_FILE]
-    return Upgrade(str(tip), old, state.config, dict(sorted(changed.items()))), batch, applied
-
-
-def _with_changes_by_people(
-    objects: Repository, tip: Oid, new: State, now: datetime
-) -> LedgerUpdate:
-    """Return the state with what people changed since the generator's last commit."""
-    old = state_in_effect.start_at(objects, tip).state
-    keys = {claim.key for state in (old, new) for claim in state.ledger}
-    subjects = {key.subject for key in keys if old.ledger.get(key) != new.ledger.get(key)}
-    marked = last_valid_config.end_markers_at(trees.commit_of(objects, tip).tree)
-    return update_ledger(old, new, sorted(subjects, key=str), marked, now)
+    upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))
+    return _Plan(upgrade, batch, state, applied.keys)
 
 
 def _refuse_held(state: State) -> None:
@@ -195,7 +198,7 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
     return text
 
 
-def _message(made: Upgrade, applied: LedgerUpdate) -> str:
+def _message(made: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
     old, new = made.old.repo_settings, made.new.repo_settings
     switched = old.gitops != new.gitops
     title = "Render everything again"
@@ -212,7 +215,7 @@ def _message(made: Upgrade, applied: LedgerUpdate) -> str:
         ("From-Render-Version", str(old.render_version)),
         ("From-Gitops", old.gitops if switched else ""),
         ("Gitops", new.gitops),
-        *commit_message.override_trailers(commit_message.keep_override_paths(applied.keys)),
+        *commit_message.override_trailers(commit_message.keep_override_paths(keys)),
         ("Render-Version", str(new.render_version)),
     ]
     files = [f"  {count} in {folder}" for folder, count in sorted(counts.items())]

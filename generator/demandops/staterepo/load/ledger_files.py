@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 from pygit2 import Oid, Repository, Tree
 
-from demandops.demand.claim import ApplicationClaim, Claim, ClaimKey
+from demandops.demand.claim import ApplicationClaim, Claim, ClaimKey, Subject
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan import naming
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history import commit_log
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,32 @@ def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
         return None
     keys = (claim.key for claim in ledger)
     return next((key for key in keys if claim_file.path_of(key) == path), None)
+
+
+def last_valid_claims(
+    repo: Repository, last_valid_commit: Oid, to: Oid, paths: Iterable[str]
+) -> dict[str, Claim | None]:
+    """Return path → the claim as the generator last wrote it, even after a person's edit.
+
+    If it wrote none since the newest commit where all files were valid, that commit's claim counts.
+    """
+    tree = trees.commit_of(repo, last_valid_commit).tree
+    claims = {path: claim_at(tree, path) for path in paths}
+    left = set(claims)
+    for commit, entry in commit_log.commits(repo, to, last_valid_commit) if left else ():
+        before = trees.parent_tree(commit)
+        if before is None or not entry.by_generator:
+            continue
+        for path in [path for path in left if trees.differ(before, commit.tree, (path,))]:
+            claims[path] = claim_at(commit.tree, path)
+            left.remove(path)
+    return claims
+
+
+def changed_subjects(before: Ledger, after: Ledger) -> list[Subject]:
+    """Return the subjects whose claims differ between two ledgers, sorted."""
+    old, new = before.claims, after.claims
+    return sorted((one for one in {*old, *new} if old.get(one) != new.get(one)), key=str)
 
 
 def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:

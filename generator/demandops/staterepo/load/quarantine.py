@@ -1,8 +1,7 @@
 """Claims that a person changed and that cannot be planned: quarantined, file by file.
 
 The edited file stays in the repo, for example a claim that names an unknown node, but the last
-valid version of the claim is in effect. That is the version that the generator wrote last, even
-if it wrote it after the edit.
+valid version of the claim is in effect (:func:`ledger_files.last_valid_claims`).
 """
 
 from __future__ import annotations
@@ -10,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from pygit2 import Oid, Repository, Tree
+from pygit2 import Repository, Tree
 
 from demandops.decision import State, changeset_of_edit
-from demandops.demand.claim import Claim, Subject
+from demandops.demand.claim import Subject
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history import commit_log
 from demandops.staterepo.load import ledger_files
 from demandops.staterepo.load.snapshot import Advance, Snapshot
 
@@ -75,10 +73,11 @@ class Judgement:
             claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
             keys = {claim_file.path_of(claim.key): claim.key for claim in claims}
             problems += _located_in_claim_files(faults[subject], snapshot, before, subject)
-            generated = _claims_by_generator(self.repo, before.commit, snapshot.commit, keys)
+            last_valid = ledger_files.last_valid_claims(
+                self.repo, before.last_valid_commit, snapshot.commit, keys
+            )
             for path, key in keys.items():
-                claim = generated[path] if path in generated else before.state.ledger.get(key)
-                ledger = ledger.replace(key, claim)
+                ledger = ledger.replace(key, last_valid[path])
             quarantined |= dict.fromkeys(keys)
         snapshot = replace(
             snapshot,
@@ -127,19 +126,3 @@ def _located_in_claim_files(
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
     paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]
     return [fault.within(paths[0]) if paths else fault for fault in faults]
-
-
-def _claims_by_generator(
-    repo: Repository, since: Oid, to: Oid, paths: Iterable[str]
-) -> dict[str, Claim | None]:
-    """Return path → the claim that a generator last wrote there after ``since``."""
-    claims: dict[str, Claim | None] = {}
-    left = set(paths)
-    for commit, entry in commit_log.commits(repo, to, since):
-        old = trees.parent_tree(commit)
-        if old is None or not entry.by_generator:
-            continue
-        for path in [path for path in left if trees.differ(old, commit.tree, (path,))]:
-            claims[path] = ledger_files.claim_at(commit.tree, path)
-            left.remove(path)
-    return claims

@@ -15,7 +15,7 @@ from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load as load_config
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, try_configuration
-from demandops.demand.claim import Subject
+from demandops.demand.claim import Claim, Subject
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
@@ -133,15 +133,16 @@ def advance(
     )
     config_changed = config != state.config or _has_manual_edit(repo, before.commit, to)
     state = State.of(config, state.ledger) if known.config else replace(state, config=config)
-    problems, subjects, invalid = list(known.faults), list[Subject](), list[str]()
-    ledger = state.ledger
+    problems, claims, invalid = list(known.faults), dict[str, Claim | None](), list[str]()
     for path in sorted({*ledger_files.changed_files(old, new), *before.quarantined_files}):
         try:
-            claim = ledger_files.claim_at(new, path)
+            claims[path] = ledger_files.claim_at(new, path)
         except InvalidInput as error:
             problems += error.faults
             invalid.append(path)
-            continue
+    claims |= ledger_files.last_valid_claims(repo, before.last_valid_commit, to, invalid)
+    ledger, subjects = state.ledger, list[Subject]()
+    for path, claim in sorted(claims.items(), key=lambda item: item[0]):
         held = claim or ledger_files.valid_claim_at(old, path)
         key = held.key if held else ledger_files.key_of(path, ledger)
         if key is not None and ledger.get(key) != claim:

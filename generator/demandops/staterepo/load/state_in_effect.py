@@ -14,8 +14,10 @@ from urllib.parse import quote, unquote
 from pygit2 import Oid, Repository
 
 from demandops.config.config import CONFIG_ROOTS
+from demandops.decision import rendered_files
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
+from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.history import commit_log
@@ -70,7 +72,14 @@ def state_at(
     if start.commit == commit.id:
         return start
     advance = snapshots.advance(repo, start, commit.id)
-    return quarantine.judge(repo, advance, start, commit.tree).with_new_config().snapshot
+    judgement = quarantine.judge(repo, advance, start, commit.tree)
+    accepted = judgement.with_new_config().snapshot
+    try:
+        if advance.config_changed:
+            rendered_files(accepted.state, trees.texts(commit.tree, GENERATED_ROOTS))
+    except InvalidInput as error:
+        accepted = judgement.with_old_config(error.faults).snapshot
+    return accepted
 
 
 def start_at(

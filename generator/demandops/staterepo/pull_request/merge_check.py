@@ -19,7 +19,7 @@ from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.lifecycle import expired_overrides, update_ledger
 from demandops.plan.views.bookkeeping import bookkeeping
@@ -167,10 +167,8 @@ class _Edit:
         try_configuration(state)
         if self.start is None or self.start.state is None:
             return state
-        old, changed = self.start.state, set(self.changed)
-        claims = (claim for ledger in (old.ledger, ledger) for claim in ledger)
-        edited = (claim for claim in claims if claim_file.path_of(claim.key) in changed)
-        subjects = dict.fromkeys(claim.subject for claim in edited)
+        old = self.start.state
+        subjects = ledger_files.changed_subjects(old.ledger, ledger)
         applied = update_ledger(old, state, subjects, self._markers(), self.now)
         return replace(state, ledger=applied.ledger, config=applied.config)
 
