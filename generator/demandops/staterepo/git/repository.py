@@ -12,7 +12,7 @@ from contextlib import suppress
 
 import git
 import pygit2
-from pygit2 import Oid, Repository
+from pygit2 import Oid, Repository, Tree
 
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
@@ -90,27 +90,27 @@ class StateRepository(ABC):
 
         May be called from any thread.
         """
-        objects = Repository(self.objects.path)
-        try:
-            one, two = (trees.commit_of(objects, name).tree for name in (commit, other))
-        except StateRepoError:
+        found = self._trees(commit, other)
+        if found is None:
             return False
         if path in ("", "."):
-            return one.id == two.id
-        return trees.entry(one, path) is not None and not trees.differ(one, two, (path,))
+            return found[0].id == found[1].id
+        return trees.entry(found[0], path) is not None and not trees.differ(*found, (path,))
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
         """Return the paths in which two commits differ; None if one is not known here.
 
         May be called from any thread.
         """
+        found = self._trees(since, commit)
+        return None if found is None else sorted(path for path, _ in trees.differences(*found))
+
+    def _trees(self, one: str, other: str) -> tuple[Tree, Tree] | None:
         objects = Repository(self.objects.path)
         try:
-            diff = objects.diff(objects[since].id, objects[commit].id)
-        except (pygit2.GitError, KeyError, ValueError):
+            return trees.commit_of(objects, one).tree, trees.commit_of(objects, other).tree
+        except StateRepoError:
             return None
-        ends = (end for delta in diff.deltas for end in (delta.old_file, delta.new_file))
-        return sorted({end.path for end in ends})
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End the running transfer with a remote, if any."""
