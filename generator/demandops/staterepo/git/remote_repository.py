@@ -51,6 +51,9 @@ log = logging.getLogger("demandops")
 class RemoteRepository(StateRepository):
     """A bare clone of a remote; git runs with the user's configuration."""
 
+    always_current = False
+    main_reference = _REMOTE_MAIN
+
     def __init__(self, url: str, folder: Path, notify: Notify, allow_offline: bool) -> None:
         self.address = without_secrets(url)
         self._url = url
@@ -96,12 +99,6 @@ class RemoteRepository(StateRepository):
     def _fetch(self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False) -> None:
         # given here, not configured, so that a push that outlives its generator moves no ref
         self._read(repo, ("fetch", "--no-tags"), f"+{MAIN}:{_REMOTE_MAIN}", urgent=urgent)
-
-    def tip(self) -> Oid:
-        """Return the remote's commit at the last fetch or push."""
-        target = self.objects.references[_REMOTE_MAIN].target
-        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
-        return target
 
     def refresh(self) -> Oid:
         """Fetch and return the remote's commit."""
@@ -242,11 +239,6 @@ class RemoteRepository(StateRepository):
             return PushDenied(f"{self.address} rejects the push: {_last_line(text)}")
         reason = rejected[1] if rejected else _last_line(text)
         return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
-
-    @property
-    def always_current(self) -> bool:
-        """Return false: the remote may have moved since the last fetch."""
-        return False
 
 
 def _wait_for(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:

@@ -43,10 +43,19 @@ class StateRepository(ABC):
     address: str
     signer: Signer | None = None
     """Signs the commits made here; None: they are not signed."""
+    always_current: bool
+    """Whether :meth:`tip` is never out of date (a repository on this disk)."""
+    main_reference = MAIN
+    """The branch, or what was last fetched of it."""
 
-    @abstractmethod
     def tip(self) -> Oid:
-        """Return the newest published commit that is known here; does not ask the remote."""
+        """Return the newest published commit that is known here; does not ask the remote.
+
+        It is read each time because other processes may move it.
+        """
+        target = self.objects.references[self.main_reference].target
+        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
+        return target
 
     @abstractmethod
     def refresh(self) -> Oid:
@@ -119,11 +128,6 @@ class StateRepository(ABC):
         """Have git pack loose objects if there are many."""
         with suppress(git.GitCommandError), git.Repo(self.objects.path) as repo:
             _git(repo, "gc", "--auto", "--quiet")
-
-    @property
-    @abstractmethod
-    def always_current(self) -> bool:
-        """Whether :meth:`tip` is never out of date (a repository on this disk)."""
 
 
 def _git(repo: git.Repo, *command: str) -> None:
