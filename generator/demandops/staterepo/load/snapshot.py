@@ -121,13 +121,7 @@ def advance(
     if recorded is not None:
         known = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
     elif before.problems or trees.differ(old, new, CONFIG_ROOTS):
-        known = last_valid_config.load_last_valid_config(
-            repo,
-            before.config_source,
-            before.last_valid_commit,
-            to,
-            lambda files: _load_and_rehearse(files, state),
-        )
+        known = _last_valid_config(repo, before, to)
     config = (known.config or state.config).with_ended_overrides(
         last_valid_config.ended_overrides_at(new)
     )
@@ -142,7 +136,8 @@ def advance(
             invalid.append(path)
     claims |= ledger_files.last_valid_claims(repo, before.last_valid_commit, to, invalid)
     ledger, subjects = state.ledger, list[Subject]()
-    for path, claim in sorted(claims.items(), key=lambda item: item[0]):
+    for path in sorted(claims):
+        claim = claims[path]
         held = claim or ledger_files.valid_claim_at(old, path)
         key = held.key if held else ledger_files.key_of(path, ledger)
         if key is not None and ledger.get(key) != claim:
@@ -157,6 +152,16 @@ def advance(
         known.source if known.faults or recorded else None,
     )
     return Advance(snapshot, tuple(dict.fromkeys(subjects)), config_changed)
+
+
+def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValidConfig:
+    return last_valid_config.load_last_valid_config(
+        repo,
+        before.config_source,
+        before.last_valid_commit,
+        to,
+        lambda files: _load_and_rehearse(files, before.state),
+    )
 
 
 def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
