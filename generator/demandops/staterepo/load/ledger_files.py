@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from pygit2 import Oid, Repository, Tree
 
+from demandops import naming
 from demandops.demand.claim import ApplicationClaim, Claim, ClaimKey, Subject
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
-from demandops.plan import naming
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
