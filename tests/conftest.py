@@ -13,7 +13,7 @@ import pytest
 import yaml
 from demandops.service import Generator
 
-from tests.kit import repo, sync, templates
+from tests.kit import repo, sync
 from tests.kit.cli import Ran, Run, runner
 from tests.kit.generator import running
 from tests.kit.processes import Drivers
@@ -28,7 +28,6 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     config.addinivalue_line("markers", "synced: force writes to disk, as the program does")
     sync.force(False)
-    templates.compile_once()
 
 
 @pytest.fixture(scope="session", autouse=True)
