@@ -416,7 +416,6 @@ def test_gitlab_is_asked_for_a_merge_request_by_push_options(
     root = git(bare, "show", "main:demandops.yaml")
     text = f"{root}\nproposals: {{forge: gitlab, labels: [demand, its]}}\n"
     petra.change({"demandops.yaml": text})
-    hooked.unlink()
     with rig.running(url) as generator:
         proposed = Proposed(generator, goal(1))
         branch = proposed.branch
