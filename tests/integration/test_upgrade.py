@@ -1,7 +1,7 @@
 """`demandops upgrade`: to another controller, and to a newer program that renders otherwise.
 
 The newer program is this one with its number raised and its label changed, in a folder of its own
-and run as a process of its own.
+and run in a process of its own.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import pty
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +42,23 @@ NEWER = (
 )
 
 
+# Runs each line's command line, with the text that it reads, in one process.
+SERVE = """
+import io, json, os, sys
+from contextlib import redirect_stderr, redirect_stdout
+from demandops.cli.main import run
+commands, answers = sys.stdin, sys.stdout
+for line in commands:
+    args, text, os.environ["DEMANDOPS_DATA_HOME"] = json.loads(line)
+    sys.stdin = io.TextIOWrapper(io.BytesIO(text.encode()), "utf-8")
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        code = run(args)
+    print(json.dumps([code, out.getvalue(), err.getvalue()]), file=answers, flush=True)
+"""
+
+
 @pytest.fixture(scope="session")
-def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subprocess.Popen[str]]:
     """A program of render version 2, whose HelmReleases wait longer."""
     folder = tmp_path_factory.mktemp("newer")
     for part in PARTS:
@@ -55,27 +70,31 @@ def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
         text = (folder / path).read_text()
         assert text.count(old) == 1
         (folder / path).write_text(text.replace(old, new))
-    return folder
+    roots = (folder / "generator", folder / "ros_bridge")
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVE],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, roots))},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        yield process
 
 
 @pytest.fixture
-def newer(newer_program: Path, state: StateRepo, data_home: Path) -> Run:
+def newer(newer_program: subprocess.Popen[str], state: StateRepo, data_home: Path) -> Run:
     """Run a command of the newer program on the state repo."""
 
     def call(*args: str, stdin: str = "") -> Ran:
-        command = [sys.executable, "-m", "demandops.cli.main", *args]
         options = ["--state-repo", str(state.path)] if args[0] != "init" else []
-        roots = (newer_program / "generator", newer_program / "ros_bridge")
-        done = subprocess.run(
-            [*command, *options],
-            cwd=newer_program,
-            input=stdin,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, roots))},
-            capture_output=True,
-            text=True,
-            check=False,
+        assert newer_program.stdin and newer_program.stdout
+        print(
+            json.dumps([[*args, *options], stdin, str(data_home)]),
+            file=newer_program.stdin,
+            flush=True,
         )
-        return Ran(done.returncode, done.stdout, done.stderr)
+        return Ran(*json.loads(newer_program.stdout.readline()))
 
     return call
 
