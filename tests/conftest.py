@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -28,6 +29,11 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     config.addinivalue_line("markers", "synced: force writes to disk, as the program does")
     sync.force(False)
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Start more workers than processors: many tests wait for git, other processes and clocks."""
+    return (os.cpu_count() or 1) * 3 // 2
 
 
 @pytest.fixture(scope="session", autouse=True)
