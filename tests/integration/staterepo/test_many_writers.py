@@ -25,7 +25,7 @@ DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "16"))
 SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
 LANES = 4
 """Requesters that wait for an answer before they send again, at each generator."""
-CUTS = 0.01 if DEMANDS > 100 else 0.03
+CUTS = 0.01
 """The share of requests whose connection is cut, once before and once after they are done."""
 PERSONS_PAUSE_S = (0.5, 3.0) if DEMANDS > 100 else (0.2, 0.8)
 

@@ -19,8 +19,7 @@ from hypothesis import assume, given, note
 from hypothesis import strategies as st
 
 from tests.kit.chance import TIMES, chances, examples, told
-from tests.kit.memory import NOW, outcome
-from tests.kit.memory import MemoryRepo
+from tests.kit.memory import NOW, MemoryRepo, outcome
 from tests.model.books import Books, Demand, Goal
 from tests.model.goals import (
     SKELETON,
