@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from tests.kit.config import FAST
 from tests.kit.goals import APP, CLOUD, application, connection, goal
-from tests.kit.memory import NOW
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import NOW, MemoryRepo
 
 FEW = settings(
     max_examples=100,
@@ -52,7 +51,7 @@ ANYTHING = st.recursive(SCALAR, _nested, max_leaves=25)
 
 
 def outcome(goal: object) -> Decision | tuple[Fault, ...]:
-    books = Books()
+    books = MemoryRepo()
     before = repr(goal)
     try:
         return decide(books.state, goal, NOW, books.files.get)
@@ -143,7 +142,7 @@ def test_any_id_is_refused_or_booked_rendered_committed_and_released(
     id: str, who: str, request: str
 ) -> None:
     asked = goal([application(id, who=[who])], [connection(id, who=[who])], id=request)
-    books = Books()
+    books = MemoryRepo()
     try:
         decision = books.send(asked)
     except InvalidInput as refused:

@@ -20,8 +20,8 @@ from tests.kit.goals import (
     goal,
     perception,
 )
-from tests.kit.memory import MemoryRepo as Books
-from tests.kit.mutations import places_of_faults as places
+from tests.kit.memory import MemoryRepo
+from tests.kit.mutations import places_of_faults
 
 NODES = "cloud, edge, station00, vehicle00, vehicle01, vehicle02, vehicle03"
 TYPES = "known: 0 (ROS), 1 (MQTT), 2 (ZENOH)"
@@ -193,10 +193,10 @@ REFUSED: dict[str, tuple[Goal, list[str]]] = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_demand_is_refused_with_the_field(name: str) -> None:
     demand, expected = REFUSED[name]
-    books = Books()
+    books = MemoryRepo()
     refusal = books.take(demand)
     assert isinstance(refusal, Refused)
-    assert places(refusal.faults) == expected
+    assert places_of_faults(refusal.faults) == expected
     assert books.send(perception()).outcome == "booked", "the next demand works"
 
 
@@ -214,7 +214,7 @@ def test_a_topic_name_that_ros_forbids_is_refused_wherever_it_stands(topic: str)
         [application(ego=[(topic, "vehicle00")], clouds=[(topic, "vehicle00")])],
         [connection(topics=[topic], targets=["/fine"]), connection("2", targets=[topic])],
     )
-    assert Books().faults(asked) == [
+    assert MemoryRepo().faults(asked) == [
         f"{field}: '{shown}' {ROS_NAMES}"
         for field in (
             f"{BODY}.ego_data_topics[0].topic_name",
@@ -226,14 +226,14 @@ def test_a_topic_name_that_ros_forbids_is_refused_wherever_it_stands(topic: str)
 
 
 def test_an_application_without_inputs_is_refused_in_the_words_of_the_wire() -> None:
-    (found,) = Books().faults(goal([application(clouds=[])]))
+    (found,) = MemoryRepo().faults(goal([application(clouds=[])]))
     field, _, message = found.partition(": ")
     assert message == "is empty; list at least one topic of ego_data or point_cloud"
     assert field.startswith("apps[0]."), f"the message has no field {field!r}"
 
 
 def test_without_any_broker_the_file_to_mend_is_told() -> None:
-    (found,) = Books(brokers()).faults(goal([], [connection(broker="")]))
+    (found,) = MemoryRepo(brokers()).faults(goal([], [connection(broker="")]))
     field, _, message = found.partition(": ")
     assert field == "connections[0].broker_node_id"
     assert "name one of" not in message
@@ -241,14 +241,14 @@ def test_without_any_broker_the_file_to_mend_is_told() -> None:
 
 
 def test_a_request_for_nothing_is_refused() -> None:
-    (found,) = Books().faults(goal())
+    (found,) = MemoryRepo().faults(goal())
     assert "the request lists no application and no connection; list at least one" in found
 
 
 def test_a_node_in_no_access_domain_is_refused() -> None:
     path = "policy/access-domains.yaml"
     text = "apiVersion: demandops/v1\nkind: AccessDomains\ndomains:\n  - {name: a, namespace: a, "
-    books = Books({path: text + 'nodes: ["vehicle*", "station*"]}\n'})
+    books = MemoryRepo({path: text + 'nodes: ["vehicle*", "station*"]}\n'})
     remedy = "a platform engineer adds it to policy/access-domains.yaml"
     assert books.faults(perception()) == [
         f"apps[0].header.node_id: 'edge' is not in any access domain; {remedy}",
@@ -260,19 +260,19 @@ class TestContradictions:
     """What stands is kept, and named."""
 
     @pytest.fixture
-    def books(self) -> Books:
-        books = Books()
+    def books(self) -> MemoryRepo:
+        books = MemoryRepo()
         books.send(perception())
         return books
 
-    def test_another_node_for_a_claimed_application(self, books: Books) -> None:
+    def test_another_node_for_a_claimed_application(self, books: MemoryRepo) -> None:
         assert books.faults(goal([application(node="cloud", who=["vehicle01"])])) == [
             f"apps[0].header.node_id: 'cloud' contradicts an existing claim: '{APP}'"
             " is held by vehicle00 on 'edge'; ask for that node, or wait until it is released"
         ]
 
     def test_another_node_for_an_application_that_the_same_demand_claimed(
-        self, books: Books
+        self, books: MemoryRepo
     ) -> None:
         assert len(books.faults(goal([application(node="cloud")]))) == 1
 
@@ -285,14 +285,14 @@ class TestContradictions:
         ],
     )
     def test_other_ends_or_another_broker_of_a_claimed_connection(
-        self, books: Books, changed: dict[str, Any], field: str, wanted: str, stands: str
+        self, books: MemoryRepo, changed: dict[str, Any], field: str, wanted: str, stands: str
     ) -> None:
         assert books.faults(goal([], [connection(who=["vehicle01"], **changed)])) == [
             f"connections[0].{field}: '{wanted}' contradicts an existing claim: 'vehicle00/edge' "
             f"is held by vehicle00 with {stands}; use the same, or another connection id"
         ]
 
-    def test_another_target_for_a_topic_that_is_carried(self, books: Books) -> None:
+    def test_another_target_for_a_topic_that_is_carried(self, books: MemoryRepo) -> None:
         asked = connection(who=["vehicle01"], topics=["/new", CLOUD[0]], targets=["/new", "/other"])
         assert books.faults(goal([], [asked])) == [
             f"connections[0].target_topics[1]: '{CLOUD[0]}' goes to '{CLOUD[0]}' already: "
@@ -300,7 +300,7 @@ class TestContradictions:
             "connection"
         ]
 
-    def test_every_contradiction_of_a_request_is_told(self, books: Books) -> None:
+    def test_every_contradiction_of_a_request_is_told(self, books: MemoryRepo) -> None:
         asked = goal([application(node="cloud")], [connection(broker="cloud")])
         assert [found.split(":")[0] for found in books.faults(asked)] == [
             "apps[0].header.node_id",
@@ -309,12 +309,12 @@ class TestContradictions:
 
     def test_two_nodes_for_one_application_in_one_request(self) -> None:
         asked = goal([application(), application(node="cloud")])
-        assert [found.split(":")[0] for found in Books().faults(asked)] == [
+        assert [found.split(":")[0] for found in MemoryRepo().faults(asked)] == [
             "apps[1].header.node_id"
         ]
 
     def test_an_application_that_a_vehicle_holds_is_not_left_half_booked(
-        self, books: Books
+        self, books: MemoryRepo
     ) -> None:
         asked = goal(
             [application("new", who=["vehicle01"])],
@@ -331,7 +331,7 @@ class TestShutdowns:
     """A shutdown releases what is held, nothing else, and never by guess."""
 
     def test_a_typo_shows_with_the_claims_that_come_near(self) -> None:
-        books = Books()
+        books = MemoryRepo()
         books.send(perception())
         assert books.faults(goal([application(who=["vehicle01"])], shutdown=True)) == [
             "apps[0].header.id: nothing that the shutdown lists is held; similar claims: "
@@ -339,7 +339,7 @@ class TestShutdowns:
         ]
 
     def test_a_misspelt_id_shows_what_the_requester_holds(self) -> None:
-        books = Books()
+        books = MemoryRepo()
         books.send(perception())
         assert books.faults(goal([application("edge/fusion")], shutdown=True)) == [
             "apps[0].header.id: nothing that the shutdown lists is held; similar claims: "
@@ -348,7 +348,7 @@ class TestShutdowns:
         ]
 
     def test_a_shutdown_sent_again_does_no_harm(self) -> None:
-        books = Books()
+        books = MemoryRepo()
         books.send(perception())
         who = ["vehicle01"]
         books.send(goal([application("other", who=who)], [connection(who=who)], id="other"))
@@ -358,7 +358,7 @@ class TestShutdowns:
         assert books.books() == standing
 
     def test_what_was_not_held_is_named_and_the_rest_released(self) -> None:
-        books = Books()
+        books = MemoryRepo()
         books.send(perception())
         asked = goal(
             [application(), application("nothing")],
@@ -374,21 +374,21 @@ class TestShutdowns:
         assert books.books() == {"services": {}, "connections": {}}
 
     def test_an_unknown_requester_on_shutdown_leaves_nothing_half_booked(self) -> None:
-        books = Books()
+        books = MemoryRepo()
         books.send(perception())
         asked = goal([application(who=["nobody"])], [connection(who=["nobody"])], shutdown=True)
         assert len(books.faults(asked)) == 1
         assert books.books()["connections"]["vehicle00/edge"]["requesters"] == ["vehicle00"]
 
     def test_which_of_several_claims_is_meant_is_not_guessed(self) -> None:
-        books = Books()
+        books = MemoryRepo()
         for id in ("one", "two"):
             books.send(goal([application(who=["vehicle00", id])], id=id))
         asked = goal([application()], id="three", shutdown=True)
         assert len(books.faults(asked)) == 1
 
     def test_a_shutdown_by_one_of_the_requesters_releases_the_only_claim_that_has_it(self) -> None:
-        books = Books()
+        books = MemoryRepo()
         books.send(goal([application(who=["vehicle00", "station00"])]))
         asked = goal([application(who=["station00"])], shutdown=True)
         assert books.send(asked).outcome == "released"
@@ -401,7 +401,7 @@ def test_every_fault_of_a_request_is_told_at_once() -> None:
         [connection("", who=[""], ends=("egde", "edge"), topics=["/a"], targets=[], type=5)],
         id="a\nb",
     )
-    assert sorted(Books().faults(asked)) == sorted(
+    assert sorted(MemoryRepo().faults(asked)) == sorted(
         [
             r"id: 'a\nb' holds the control character U+000A; choose an id without it",
             "apps[0].header.id: '..' holds '..'; choose an id without it",
@@ -423,13 +423,13 @@ def test_every_fault_of_a_request_is_told_at_once() -> None:
 
 def test_faults_are_in_the_order_of_the_request() -> None:
     asked = goal([application(who=[]), application("..")], [connection(who=[])], id="\n")
-    fields = [found.split(": ")[0] for found in Books().faults(asked)]
+    fields = [found.split(": ")[0] for found in MemoryRepo().faults(asked)]
     assert fields == ["id", f"{BODY}.requester_ids", "apps[1].header.id", f"{C0}.requester_ids"]
 
 
 def test_a_warning_and_no_refusal_for_an_input_that_no_connection_carries() -> None:
     asked = goal([application(APP, ego=[EGO])], [connection()])
-    assert Books().send(asked).warnings == (
+    assert MemoryRepo().send(asked).warnings == (
         "application 'edge/object_detection_fusion': no connection carries ego_data "
         "/vehicles/vehicle00/ego_data of 'vehicle00' to 'edge'",
     )

@@ -10,7 +10,7 @@ from demandops.config.load import load
 from demandops.errors import Fault, InvalidInput
 
 from tests.kit.config import configuration
-from tests.kit.mutations import places_of_faults as places
+from tests.kit.mutations import places_of_faults
 
 VALID: dict[str, Any] = {
     "apiVersion": "demandops/v1",
@@ -138,7 +138,7 @@ def test_a_mistake_is_a_fault_with_file_and_place(name: str) -> None:
     changed, expected = MISTAKES[name]
     found = refused(tested=text(**changed))
     assert {one.file for one in found} == {"overrides/tested.yaml"}
-    assert places(found) == expected
+    assert places_of_faults(found) == expected
 
 
 @pytest.mark.parametrize("path", ["overrides/a.yml", "overrides/A.yaml", "overrides/b/c.yaml"])
