@@ -95,7 +95,9 @@ def limited(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def bare_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bare state repo as ``demandops init`` makes it; copy it, never write to it."""
-    return repo.init(tmp_path_factory.mktemp("template") / "state.git")
+    made = repo.init(tmp_path_factory.mktemp("template") / "state.git")
+    repo.git(made, "repack", "-adq")  # few files to copy
+    return made
 
 
 @pytest.fixture
