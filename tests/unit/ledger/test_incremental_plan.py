@@ -41,7 +41,7 @@ class Following:
         return len(found)
 
 
-@examples(60)
+@examples(40)
 @given(chances, st.integers(1, 14))
 def test_what_is_brought_forward_is_what_is_made_afresh(random: Random, length: int) -> None:
     repo = MemoryRepo()

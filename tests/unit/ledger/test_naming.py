@@ -90,7 +90,7 @@ def kubernetes_name(subject: Subject) -> str:
     return naming.object_name(*subject)
 
 
-@examples(60)
+@examples(40)
 @given(st.lists(subjects, min_size=1, max_size=12))
 def test_different_subjects_have_different_names_that_kubernetes_takes(
     drawn: list[Subject],
@@ -115,7 +115,7 @@ def topic_instance(subject: Subject) -> str:
     return naming.topic_part(*subject)
 
 
-@examples(80)
+@examples(50)
 @given(st.lists(st.one_of(st.tuples(ids), st.tuples(ids, topics)), min_size=1, max_size=12))
 def test_different_subjects_have_different_derived_topics_that_ros_takes(
     drawn: list[Subject],

@@ -17,9 +17,10 @@ from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest, Operation
 from demandops.errors import InvalidInput, Refused
 from demandops.plan.views.bookkeeping import bookkeeping
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.chance import examples
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal
 from tests.kit.memory import NOW, MemoryRepo
 
@@ -74,7 +75,7 @@ def demands(draw: st.DrawFn) -> tuple[str, Any]:
 
 
 @given(st.lists(demands(), max_size=14))
-@settings(max_examples=25, deadline=None)
+@examples(25)
 def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> None:
     books = MemoryRepo(CROWD)
     for made in sent:
