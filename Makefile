@@ -94,8 +94,9 @@ golden: setup  ## Write the golden folders anew; review the diff
 	@$(PY) -m tests.golden.write
 	@$(PY) -m tests.unit.messages
 
-bench: setup  ## Measure what a commit costs, beside the floor
+bench: setup  ## Measure what a commit costs, beside the floor, and how a demand's cost grows
 	@$(PY) -m tests.benchmarks.commits
+	@$(PY) -m tests.benchmarks.growth
 
 bench-audit: setup  ## Measure what an auditor's questions cost after 10,000 commits
 	@$(PY) -m tests.benchmarks.audit

@@ -28,7 +28,7 @@ from demandops.demand.claim import Subject
 from demandops.demand.demand_request import DemandRequest, Operation
 from demandops.errors import Fault, InvalidInput, Refused
 from demandops.ledger.apply import apply
-from demandops.ledger.ledger import Changes, Ledger
+from demandops.ledger.ledger import Changes, Ledger, changes_on
 from demandops.ledger.operations import restoration
 from demandops.ledger.operations.restoration import Restoration
 from demandops.plan import implied_connections
@@ -133,7 +133,7 @@ def decide(
     on_stage("admitted")
     try:
         ledger, changes = _book(state, request, now)
-        keys = affected_keys(state.ledger, ledger, state.config, changes.subjects())
+        keys = affected_keys(state.ledger, ledger, state.config, changes.claims)
         rendered = changeset.build_changeset(
             state.ledger, ledger, changes.claims, keys, (state.config, state.engine, read)
         )
@@ -200,6 +200,7 @@ def admit(
         request = permission.with_lease_terms(parsed, config)
     request = connection_type_choice.with_chosen_types(request, config, state.ledger.type_of)
     malformed = {found.field for found in faults}
+    around_malformed = {parent for field in malformed for parent in _with_parents(field)}
     content_faults = [*admission.faults(request, config), *permission.faults(request, config)]
     content = _with_goal_fields(content_faults, request, config)
     # do not report as missing what could not be read
@@ -207,7 +208,9 @@ def admit(
     faults += [
         found
         for found in content
-        if not _overlaps(found.field, malformed) and not (unread and found.code == "empty")
+        if found.field not in around_malformed
+        and malformed.isdisjoint(_with_parents(found.field))
+        and not (unread and found.code == "empty")
     ]
     faults = faults or list(throttle(request, config))
     if faults:
@@ -226,7 +229,9 @@ def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
     """Return the changes to rendered files that follow when a person changes claims."""
-    keys = affected_keys(before, state.ledger, state.config, subjects)
+    keys = affected_keys(
+        before, state.ledger, state.config, changes_on(before, state.ledger, subjects)
+    )
     return changeset.build_changeset(
         before, state.ledger, (), keys, (state.config, state.engine, read)
     )
@@ -244,14 +249,11 @@ def rendered_files(
     return changeset.render_all(state.ledger, state.config, state.engine, keys, current)
 
 
-def _overlaps(field: str, others: Iterable[str]) -> bool:
-    """Return whether a field equals, contains or is inside one of the others."""
-    return any(
-        field == other
-        or field.startswith((f"{other}.", f"{other}["))
-        or other.startswith((f"{field}.", f"{field}["))
-        for other in others
-    )
+def _with_parents(field: str) -> Iterator[str]:
+    """Yield a field and every field that contains it."""
+    yield field
+    for match in re.finditer(r"[.\[]", field):
+        yield field[: match.start()]
 
 
 def _subject_of(field: str) -> tuple[str, int]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -61,6 +62,8 @@ def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:  # noqa: AN
 
 
 _StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping)
+# PyYAML resolves each scalar anew; the same words and topics come again and again
+_StrictLoader.resolve = staticmethod(lru_cache(16_384)(yaml.resolver.Resolver().resolve))
 _StrictLoader.add_constructor(
     "tag:yaml.org,2002:timestamp", lambda loader, node: loader.construct_scalar(node)
 )

@@ -36,7 +36,7 @@ def lay_down(folder: Path, releases: int, commits: int) -> Path:
             tickets = []
             for number in range(first, min(first + BATCH, commits)):
                 edge = (number // 2) % laid.edges
-                vehicle = f"{fleet.SPARE}{edge:05d}"
+                vehicle = fleet.spare_id(edge)
                 goal = fleet.goal(fleet.edge_id(edge), vehicle, shutdown=number % 2 == 1)
                 tickets.append(generator.submit(goal))
             for ticket in tickets:
@@ -63,7 +63,7 @@ def measure(repo: Path) -> None:
         often = opened.release_path(f"of-{fleet.edge_id(0)}-fusion", tip) or _fusion(opened, tip)
         timed("history of a file that is as it was at first", lambda: _told(opened, old, tip))
         timed("history of a file that changed often", lambda: _told(opened, often, tip))
-        gone = f"od-{fleet.edge_id(0)}-{fleet.SPARE}00000"
+        gone = f"od-{fleet.edge_id(0)}-{fleet.spare_id(0)}"
         timed("history of a release that stopped", lambda: opened.release_path(gone, tip))
         first = f"{[*opened.log()][-1].time:%Y-%m-%dT%H:%M:%S}"
         timed("a time at the far end", lambda: opened.commit(first)[:10])

@@ -79,7 +79,7 @@ def measure(
         for number in range(ROUNDS + WARM_UP):
             # a newcomer joins, then leaves, each time at another edge
             edge = (number // 2 * 7) % laid.edges
-            vehicle = f"{fleet.SPARE}{edge:05d}"
+            vehicle = fleet.spare_id(edge)
             goal = fleet.goal(fleet.edge_id(edge), vehicle, shutdown=number % 2 == 1)
             start = time.perf_counter()
             receipt = generator.submit(goal).future.result()

@@ -7,6 +7,7 @@ what the generator itself writes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -27,7 +28,6 @@ from tests.kit.config import configuration
 
 VEHICLES_PER_EDGE = 10
 RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
-SPARE = "newcomer"
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,30 @@ def edge_id(number: int) -> str:
     return f"edge{number:05d}"
 
 
-def goal(edge: str, vehicle: str, *, shutdown: bool = False) -> dict[str, Any]:
-    """One vehicle's demand for perception on one edge."""
-    ego, points = f"/{vehicle}/ego_data", f"/{vehicle}/points"
+def vehicle_id(edge: int, number: int) -> str:
+    return f"v{edge:05d}x{number}"
+
+
+def spare_id(edge: int) -> str:
+    """A vehicle that is in the inventory and demands nothing yet."""
+    return f"newcomer{edge:05d}"
+
+
+def goal(
+    edge: str, vehicle: str, *, ego: Sequence[str] = (), shutdown: bool = False
+) -> dict[str, Any]:
+    """One vehicle's demand for perception on one edge; ``ego`` are its topics beside the cloud."""
+    ego, points = ego or [f"/{vehicle}/ego_data"], f"/{vehicle}/points"
     app = goals.application(
-        f"{edge}/fusion", node=edge, who=[vehicle], ego=[(ego, vehicle)], clouds=[(points, vehicle)]
+        f"{edge}/fusion",
+        node=edge,
+        who=[vehicle],
+        ego=[(topic, vehicle) for topic in ego],
+        clouds=[(points, vehicle)],
     )
     ends = vehicle, edge
     link = goals.connection(
-        f"{vehicle}/{edge}", who=[vehicle], ends=ends, topics=[ego, points], broker=""
+        f"{vehicle}/{edge}", who=[vehicle], ends=ends, topics=[*ego, points], broker=""
     )
     return goals.goal([app], [link], id="bench", shutdown=shutdown)
 
@@ -60,7 +75,7 @@ def _region(number: int, edges_per_cluster: int) -> str:
     return f"region{number // edges_per_cluster:04d}"
 
 
-def _nodes(edges: int, edges_per_cluster: int) -> str:
+def _nodes(edges: int, edges_per_cluster: int, vehicles: int) -> str:
     nodes: list[dict[str, str]] = [
         {"id": "cloud", "type": "cloud", "cluster": _region(0, edges_per_cluster)},
     ]
@@ -68,7 +83,7 @@ def _nodes(edges: int, edges_per_cluster: int) -> str:
         edge = edge_id(number)
         region = _region(number, edges_per_cluster)
         nodes.append({"id": edge, "type": "edge", "cluster": region})
-        names = [f"v{number:05d}x{i}" for i in range(VEHICLES_PER_EDGE)] + [f"{SPARE}{number:05d}"]
+        names = [vehicle_id(number, place) for place in range(vehicles)] + [spare_id(number)]
         nodes += [{"id": name, "type": "vehicle", "cluster": region} for name in names]
     return strict_yaml.dump({"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": nodes})
 
@@ -76,8 +91,19 @@ def _nodes(edges: int, edges_per_cluster: int) -> str:
 def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
     """Make a bare state repo with about ``releases`` releases running, by regions."""
     edges = max(1, round(releases / RELEASES_PER_EDGE))
+    _lay_down(path, edges, edges_per_cluster, VEHICLES_PER_EDGE, 0)
+    return Fleet(path, edges, edges * RELEASES_PER_EDGE)
+
+
+def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
+    """Make a bare state repo where vehicles hold one application; ``further`` may join."""
+    _lay_down(path, 1, 1, vehicles, further)
+    return path
+
+
+def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, further: int) -> None:
     files = configuration()
-    files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster)
+    files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster, vehicles + further)
     regions = sorted({_region(number, edges_per_cluster) for number in range(edges)})
     files["inventory/clusters.yaml"] = strict_yaml.dump(
         {
@@ -97,8 +123,8 @@ def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
     state, now = State.of(config, Ledger()), datetime.now(timezone.utc)
     ledger = Ledger()
     for number in range(edges):
-        for place in range(VEHICLES_PER_EDGE):
-            request = admit(state, goal(edge_id(number), f"v{number:05d}x{place}"))
+        for place in range(vehicles):
+            request = admit(state, goal(edge_id(number), vehicle_id(number, place)))
             ledger, _ = apply(ledger, request, now)
     files |= {claim_file.path_of(claim.key): claim_file.text_of(claim) for claim in ledger}
     files |= rendered_files(State(config, state.engine, ledger))
@@ -109,4 +135,3 @@ def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
     text = "A fleet\n\nOperation: init\nRender-Version: 1\n"
     repo.create_commit("refs/heads/main", who, who, text, tree, [])
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
-    return Fleet(path, edges, edges * RELEASES_PER_EDGE)

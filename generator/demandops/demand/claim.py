@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from enum import Enum
+from itertools import islice, takewhile
 from types import MappingProxyType
 
 from demandops.demand.demand_request import OVERRIDE_PREFIX, ConnectionType, InputTopic
@@ -78,6 +80,15 @@ class ApplicationClaim:  # noqa: PLW1641 - claims contain mappings, so they have
     def all_inputs(self) -> Iterable[tuple[str, InputTopic]]:
         """Return every (role, topic)."""
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
+
+    def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
+        """Return the inputs in a role that are ``topic`` of ``source``; they differ by type."""
+        inputs = self.inputs.get(role, ())
+        start = bisect_left(inputs, InputTopic(topic, source))
+        same = takewhile(
+            lambda one: (one.topic, one.source) == (topic, source), islice(inputs, start, None)
+        )
+        return tuple(same)
 
 
 def _exact(values: Mapping[str, object]) -> str:

@@ -6,7 +6,7 @@ can be reported together.
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -38,13 +38,15 @@ def parse_valid_part(
     except ValidationError as error:
         faults += faults_of(error, model)
         for item in error.errors():
-            pruned = _blanked(pruned, item["loc"], lists_of_text)
+            pruned = _blank(pruned, item["loc"], lists_of_text)
         return model.model_validate(pruned), faults
 
 
 def _with_keys_of_text(
-    data: object, location: tuple[int | str, ...], faults: list[Fault]
-) -> object:
+    data: Any,  # noqa: ANN401 - plain data
+    location: tuple[int | str, ...],
+    faults: list[Fault],
+) -> Any:  # noqa: ANN401
     """Return ``data`` without the entries whose key is not text; add a fault for each."""
     if len(location) > _DEEPEST and isinstance(data, dict | list):
         message = f"is nested deeper than {_DEEPEST} levels; make it flatter"
@@ -64,26 +66,27 @@ def _with_keys_of_text(
     return kept
 
 
-def _blanked(
-    data: object,
-    location: tuple[int | str, ...],
-    lists_of_text: Container[str],
-    within: str = "",
-) -> object:
-    """Return ``data`` without the value at ``location``.
+def _blank(
+    data: dict[str, Any], location: Sequence[int | str], lists_of_text: Container[str]
+) -> dict[str, Any]:
+    """Return ``data`` without the value at ``location``; changes it in place.
 
     A field is removed, so that its default applies. An item of a list is replaced by an empty one,
     so that later items keep their positions.
     """
     if not location:  # the fault concerns all of it, for example a key with a lone surrogate
         return {}
-    head, *rest = location
-    if isinstance(data, list) and isinstance(head, int):
-        empty: object = "" if within in lists_of_text else {}
-        item = _blanked(data[head], tuple(rest), lists_of_text, within) if rest else empty
-        return [*data[:head], item, *data[head + 1 :]]
-    if isinstance(data, dict):
-        if rest and head in data:
-            return {**data, head: _blanked(data[head], tuple(rest), lists_of_text, str(head))}
-        return {key: value for key, value in data.items() if key != head}
+    *parents, last = location
+    node: Any = data
+    within = ""
+    for head in parents:
+        if isinstance(node, dict) and head in node:
+            within = str(head)
+        elif not isinstance(node, list) or not isinstance(head, int):
+            return data
+        node = node[head]
+    if isinstance(node, list) and isinstance(last, int):
+        node[last] = "" if within in lists_of_text else {}
+    elif isinstance(node, dict):
+        node.pop(last, None)
     return data

@@ -19,12 +19,32 @@ from demandops.demand.claim import (
     ConnectionClaim,
     Subject,
     SubjectKind,
+    is_override_claim,
 )
 from demandops.demand.demand_request import ConnectionType
 from demandops.demand.lease import UNSTARTED
 
-Claims: TypeAlias = "HashTrieMap[str, Claim]"
-"""The claims of one subject by demand id."""
+
+@dataclass(frozen=True, slots=True)
+class SubjectClaims:
+    """The claims on one subject by demand id.
+
+    ``first`` has the lowest demand id. Claims on one subject agree on where and what it is. If a
+    person writes one that does not, the first one decides.
+    """
+
+    by_demand: HashTrieMap[str, Claim]
+    first: Claim
+
+    def replace(self, demand: str, claim: Claim | None) -> SubjectClaims | None:
+        """Return these claims with ``claim`` at ``demand``, or ``None`` if none is left."""
+        if claim is not None:
+            lowest = claim if demand <= self.first.demand else self.first
+            return SubjectClaims(self.by_demand.insert(demand, claim), lowest)
+        left = self.by_demand.remove(demand)
+        if not left:
+            return None
+        return SubjectClaims(left, left[min(left)] if demand == self.first.demand else self.first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +88,19 @@ class Ledger:
     ``minutes`` are those in which a lease ends. They give the next end without a full scan.
     """
 
-    claims: HashTrieMap[Subject, Claims] = field(default_factory=HashTrieMap)
+    claims: HashTrieMap[Subject, SubjectClaims] = field(default_factory=HashTrieMap)
     index: Index = field(default_factory=HashTrieMap)
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
         held = self.claims.get(subject)
-        return tuple(held[demand] for demand in sorted(held)) if held else ()
+        return tuple(held.by_demand[demand] for demand in sorted(held.by_demand)) if held else ()
+
+    def first_claim(self, subject: Subject) -> Claim | None:
+        """Return the claim on ``subject`` with the lowest demand id, or ``None``."""
+        held = self.claims.get(subject)
+        return held.first if held else None
 
     def application_claims(self, application: str) -> tuple[ApplicationClaim, ...]:
         """Return the claims on an application."""
@@ -89,16 +114,17 @@ class Ledger:
 
     def type_of(self, connection: str) -> ConnectionType | None:
         """Return the type of a connection that a claim holds, or ``None``."""
-        claims = self.connection_claims(connection)
-        return claims[0].type if claims else None
+        first = self.first_claim(Subject(SubjectKind.CONNECTION, connection))
+        return first.type if isinstance(first, ConnectionClaim) else None
 
     def subjects(self, kind: SubjectKind) -> list[str]:
         """Return the ids of all subjects of a kind that have claims, sorted."""
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
-    def applications_taking(self, source: str, topic: str) -> tuple[str, ...]:
-        """Return the applications that have ``topic`` of ``source`` as an input, sorted."""
-        return self._ids("takes", source, topic)
+    def claims_taking(self, source: str, topic: str) -> tuple[ApplicationClaim, ...]:
+        """Return the claims with ``topic`` of ``source`` as an input, by application and demand."""
+        claims = self._claims("takes", source, topic)
+        return tuple(claim for claim in claims if isinstance(claim, ApplicationClaim))
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         """Return the connections that bring ``topic`` to the node ``target``, sorted."""
@@ -112,9 +138,22 @@ class Ledger:
         """Return the claims of one demand, sorted by subject."""
         return self._claims("demand", demand)
 
+    def kept_claims(self, subject: Subject | None = None) -> tuple[Claim, ...]:
+        """Return the claims that overrides keep, on one subject or on all."""
+        return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
+
+    def is_only_kept(self, subject: Subject) -> bool:
+        """Return whether no demand holds ``subject``: at most overrides keep it."""
+        held = self.claims.get(subject)
+        return held is None or len(held.by_demand) == len(self.kept_claims(subject))
+
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
         """Return the claims of a requester, sorted by subject and demand."""
         return self._claims("requester", requester)
+
+    def count_of_requester(self, requester: str) -> int:
+        """Return how many claims a requester has."""
+        return len(self.index.get(("requester", requester)) or ())
 
     def applications_at(self, node: str) -> tuple[str, ...]:
         """Return the applications that run on a node or have an input from it, sorted."""
@@ -148,7 +187,7 @@ class Ledger:
         return tuple(sorted({key.subject.id for key in self.index.get(entry) or ()}))
 
     def _claims(self, *entry: str) -> tuple[Claim, ...]:
-        keys = sorted(self.index.get(entry) or (), key=lambda key: (str(key.subject), key.demand))
+        keys = sorted(self.index.get(entry) or (), key=_order)
         found = (self.get(key) for key in keys)
         return tuple(claim for claim in found if claim is not None)
 
@@ -168,15 +207,17 @@ class Ledger:
     def get(self, key: ClaimKey) -> Claim | None:
         """Return one claim."""
         held = self.claims.get(key.subject)
-        return held.get(key.demand) if held else None
+        return held.by_demand.get(key.demand) if held else None
 
     def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
         """Return the ledger with ``claim`` at ``key``, or with no claim there if it is ``None``."""
-        held = self.claims.get(key.subject, HashTrieMap())
-        old = held.get(key.demand)
+        held, old = self.claims.get(key.subject), self.get(key)
         if old == claim:
             return self
-        held = held.insert(key.demand, claim) if claim else held.remove(key.demand)
+        if held is not None:
+            held = held.replace(key.demand, claim)
+        elif claim is not None:
+            held = SubjectClaims(HashTrieMap({key.demand: claim}), claim)
         claims = self.claims.insert(key.subject, held) if held else self.claims.remove(key.subject)
         before, after = index_entries(old), index_entries(claim)
         index, minutes = self.index, self.minutes
@@ -208,11 +249,11 @@ class Ledger:
     def __iter__(self) -> Iterator[Claim]:
         """Yield every claim, in no order."""
         for claims in self.claims.values():
-            yield from claims.values()
+            yield from claims.by_demand.values()
 
     def __len__(self) -> int:
         """Return how many claims there are."""
-        return sum(len(claims) for claims in self.claims.values())
+        return sum(len(claims.by_demand) for claims in self.claims.values())
 
 
 def index_entries(claim: Claim | None) -> set[Entry]:
@@ -221,6 +262,8 @@ def index_entries(claim: Claim | None) -> set[Entry]:
         return set()
     found: set[Entry] = {("demand", claim.demand)}
     found |= {("requester", requester) for requester in claim.requesters}
+    if is_override_claim(claim):
+        found |= {("kept",), ("kept", claim.subject.kind.value, claim.subject.id)}
     if claim.lease is not None:
         found.add((_ENDS, _minute(claim.lease.expires_at)))
     if isinstance(claim, ApplicationClaim):
@@ -238,9 +281,26 @@ def index_entries(claim: Claim | None) -> set[Entry]:
     return found
 
 
+def _order(key: ClaimKey) -> tuple[str, str, str]:
+    return key.subject.kind.value, key.subject.id, key.demand
+
+
 def _minute(moment: datetime) -> str:
     """Return the minute of a time, in UTC, as a text that sorts like the time."""
     return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
+
+
+def changes_on(
+    before: Ledger, after: Ledger, subjects: Iterable[Subject]
+) -> tuple[ClaimChange, ...]:
+    """Return the claims on these subjects that differ between two ledgers."""
+    claims = (
+        claim
+        for subject in subjects
+        for ledger in (before, after)
+        for claim in ledger.claims_on(subject)
+    )
+    return claim_changes(before, after, (claim.key for claim in claims))
 
 
 def claim_changes(

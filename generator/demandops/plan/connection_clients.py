@@ -15,7 +15,7 @@ from typing import Literal
 from demandops.config.config import Config
 from demandops.config.inventory import Node
 from demandops.demand import route as routes
-from demandops.demand.claim import ConnectionClaim
+from demandops.demand.claim import ConnectionClaim, Subject, SubjectKind
 from demandops.demand.connection_type_choice import choose_broker, message_type, route_faults
 from demandops.demand.demand_request import ConnectionType
 from demandops.demand.route import Route
@@ -44,12 +44,12 @@ class BridgeKey:
 
 def client_keys(ledger: Ledger, connection: str) -> Iterator[EndKey | BridgeKey]:
     """Yield the keys of the clients that a connection needs."""
-    claims = ledger.connection_claims(connection)
-    if not claims:
+    first = ledger.first_claim(Subject(SubjectKind.CONNECTION, connection))
+    if not isinstance(first, ConnectionClaim):
         return
-    if claims[0].type is ConnectionType.ZENOH:
-        yield BridgeKey(claims[0].source)
-        yield BridgeKey(claims[0].target)
+    if first.type is ConnectionType.ZENOH:
+        yield BridgeKey(first.source)
+        yield BridgeKey(first.target)
         return
     yield EndKey(connection, "source")
     yield EndKey(connection, "target")

@@ -30,7 +30,8 @@ def with_implied_connections(
     A connection that already brings the topic is joined. Otherwise the two nodes get a connection
     of their own. A faulty input adds none; admission reports it.
     """
-    connections = list(request.connections)
+    connections: dict[tuple[str, str, str], ConnectionDemand] = {}
+    routes: dict[tuple[str, str, str], dict[Route, None]] = {}
     brought = {
         (route.sender_and_receiver(connection.source, connection.target)[1], route.written_topic)
         for connection in request.connections
@@ -45,15 +46,16 @@ def with_implied_connections(
                 continue
             needed = _connection(app, topic.source, topic.topic, ledger)
             same = (needed.id, needed.source, needed.target)
-            known = next((c for c in connections if (c.id, c.source, c.target) == same), None)
-            if known is None:
-                connections.append(
-                    replace(needed, for_input=f"applications[{index}].{foreign.field}")
-                )
-                continue
-            topics = dict.fromkeys((*known.topics, *needed.topics))
-            connections[connections.index(known)] = replace(known, topics=tuple(topics))
-    return replace(request, connections=tuple(connections))
+            where = f"applications[{index}].{foreign.field}"
+            connections.setdefault(same, replace(needed, for_input=where))
+            routes.setdefault(same, {}).update(dict.fromkeys(needed.topics))
+    listed = []
+    for connection in request.connections:
+        more = routes.pop((connection.id, connection.source, connection.target), {})
+        topics = tuple(dict.fromkeys((*connection.topics, *more)))
+        listed.append(replace(connection, topics=topics) if more else connection)
+    implied = (replace(connections[same], topics=tuple(topics)) for same, topics in routes.items())
+    return replace(request, connections=(*listed, *implied))
 
 
 def _is_valid(app: ApplicationDemand, topic: InputTopic, config: Config) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from functools import lru_cache
 
 MAX_NAME = 53
 _HASH = 12
@@ -46,11 +47,12 @@ def object_name(prefix: str, *ids: str) -> str:
     return f"{readable}-{digest(prefix, *ids)}" if readable else digest(prefix, *ids)
 
 
+@lru_cache(maxsize=65_536)
 def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name (``vehicle00``, ``edge/fusion``).
 
     ``extra`` keeps names with the same id apart, for example two point clouds of one source. It
-    is added as a slug with a hash.
+    is added as a slug with a hash. Cached, because a release names all its inputs each time.
     """
     exact = not extra and len(id) <= _MAX_TOKEN and _TOPIC_PATH.fullmatch(id)
     if exact and not _LOOKS_HASHED.fullmatch(id):

@@ -12,7 +12,7 @@ from demandops.config.appdef import ApplicationDefinition, Parameter, Scaling, S
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.config.registry import ChartSource
-from demandops.demand.claim import ApplicationClaim, Subject, SubjectKind
+from demandops.demand.claim import ApplicationClaim
 from demandops.demand.demand_request import InputTopic
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import Ledger
@@ -21,7 +21,12 @@ from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.suspended_claims import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease, node_and_domain
-from demandops.plan.release_keys import ReleaseKey, appdef_of, keys_of
+from demandops.plan.release_keys import (
+    ReleaseKey,
+    appdef_of,
+    claims_needing,
+    deciding_claim,
+)
 
 
 def plan(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
@@ -55,20 +60,14 @@ def _unshaped(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None
 
 
 def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease | None:
-    named = (key.application,) if key.application is not None else None
-    users = tuple(  # skip applications that moved or changed their definition
-        application
-        for application in named or ledger.applications_taking(str(key.source), str(key.topic))
-        if key in keys_of(ledger, config, Subject(SubjectKind.APPLICATION, application))
-    )
-    claims = tuple(claim for user in users for claim in ledger.application_claims(user))
+    claims = claims_needing(ledger, config, key)
     if not claims:
         return None
-    appdef = appdef_of(config, claims[0].appdef)
+    users = tuple(dict.fromkeys(claim.application for claim in claims))
+    appdef = appdef_of(config, deciding_claim(ledger, users[0]).appdef)
     service = appdef.services[key.service]
     node, domain = node_and_domain(config, key.node)
     if service.each is not None:
-        claims = tuple(claim for claim in claims if _takes(claim, service.each, key))
         inputs = {service.each: _shared_input(claims, service.each, key)}
     else:
         inputs = _application_inputs(config, appdef, service, claims)
@@ -120,23 +119,12 @@ def _requesters(claims: Iterable[ApplicationClaim]) -> tuple[str, ...]:
     return tuple(sorted({who for claim in claims for who in claim.requesters}))
 
 
-def _takes(claim: ApplicationClaim, role: str, key: ServiceKey) -> bool:
-    return any(
-        (topic.source, topic.topic) == (key.source, key.topic)
-        for topic in claim.inputs.get(role, ())
-    )
-
-
 def _shared_input(
     claims: Iterable[ApplicationClaim], role: str, key: ServiceKey
 ) -> tuple[InputTopic, ...]:
-    types = {
-        topic.type
-        for claim in claims
-        for topic in claim.inputs.get(role, ())
-        if (topic.source, topic.topic) == (key.source, key.topic) and topic.type
-    }
-    return (InputTopic(str(key.topic), str(key.source), min(types, default="")),)
+    source, topic = str(key.source), str(key.topic)
+    inputs = (one for claim in claims for one in claim.inputs_from(role, source, topic))
+    return (InputTopic(topic, source, min((one.type for one in inputs if one.type), default="")),)
 
 
 def _application_inputs(
@@ -152,12 +140,10 @@ def _application_inputs(
             inputs[role] = _united(claims, origin)
             continue
         producer = appdef.services[producer_name]
-        found = set()
-        for topic in _united(claims, str(producer.each)):
-            node = topic.source if producer.placement == "source" else claims[0].node
-            key = ServiceKey(producer_name, node, source=topic.source, topic=topic.topic)
-            found.add(InputTopic(outputs(config, producer, key)[output], topic.source))
-        inputs[role] = tuple(sorted(found))
+        pattern, each = producer.outputs[output], str(producer.each)
+        topics = {(one.source, one.topic) for claim in claims for one in claim.inputs.get(each, ())}
+        names = {(_of_instance(pattern, config, producer, *one), one[0]) for one in topics}
+        inputs[role] = tuple(InputTopic(*name) for name in sorted(names))
     return inputs
 
 
@@ -190,16 +176,17 @@ def _is_usual(config: Config, service: Service, source: str, topic: str) -> bool
 
 def outputs(config: Config, service: Service, key: ServiceKey) -> dict[str, str]:
     """Return the topics that a service instance publishes, by the names of the appdef's outputs."""
-    if key.application is not None:
-        instance = naming.topic_part(key.application)
-    elif _is_usual(config, service, str(key.source), str(key.topic)):
-        instance = naming.topic_part(str(key.source))
-    else:
-        instance = naming.topic_part(str(key.source), str(key.topic))
+    own = (key.application, "") if key.application is not None else (key.source, key.topic)
+    source, topic = map(str, own)
     return {
-        name: pattern.replace("{instance}", instance)
+        name: _of_instance(pattern, config, service, source, topic)
         for name, pattern in sorted(service.outputs.items())
     }
+
+
+def _of_instance(pattern: str, config: Config, service: Service, source: str, topic: str) -> str:
+    extra = "" if _is_usual(config, service, source, topic) else topic
+    return pattern.replace("{instance}", naming.topic_part(source, extra))
 
 
 def _replicas(scaling: Scaling, topics: int) -> int:

@@ -22,7 +22,7 @@ def targets_of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...
     keys: dict[ReleaseKey, None] = {}
     for subject in dict.fromkeys(subjects):
         keys |= dict.fromkeys(keys_of(after, config, subject))
-    keys |= dict.fromkeys(affected_keys(before, after, config, decision.changes.subjects()))
+    keys |= dict.fromkeys(affected_keys(before, after, config, decision.changes.claims))
     targets = []
     for key in keys:
         new = plan(after, config, key)

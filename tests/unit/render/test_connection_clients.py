@@ -16,6 +16,7 @@ from demandops.decision import Decision, State, rendered_files
 from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.route import Route
 from demandops.errors import InvalidInput, Refused
+from demandops.ledger.ledger import changes_on
 from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
@@ -76,7 +77,12 @@ class TestZenoh:
         world.send(demand("zenoh", {"/b": "/b"}, id="other", source="vehicle01"))
         world.send(demand("zenoh"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected_keys(before, world.state.ledger, world.state.config, [subject])
+        keys = affected_keys(
+            before,
+            world.state.ledger,
+            world.state.config,
+            changes_on(before, world.state.ledger, [subject]),
+        )
         assert keys == (BridgeKey("vehicle00"), BridgeKey("edge"))
         assert [(found.name, found.change) for found in world.releases] == [
             ("zenoh-vehicle00", "start"),
@@ -89,7 +95,12 @@ class TestZenoh:
         before = world.state.ledger
         world.send(demand("mqtt"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected_keys(before, world.state.ledger, world.state.config, [subject])
+        keys = affected_keys(
+            before,
+            world.state.ledger,
+            world.state.config,
+            changes_on(before, world.state.ledger, [subject]),
+        )
         assert keys == (EndKey("c", "source"), EndKey("c", "target"))
 
     def test_its_cost_does_not_grow_with_connections_elsewhere(self) -> None:

@@ -2,52 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from demandops.demand import route as routes
-from demandops.demand.claim import ApplicationClaim, ConnectionClaim
+from demandops.demand.claim import ApplicationClaim, ConnectionClaim, Subject, SubjectKind
 from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, ConnectionType
 from demandops.demand.route import Route
 from demandops.errors import Fault, fault
+from demandops.ledger.ledger import Ledger
 
 
-def application_conflicts(
-    where: str, app: ApplicationDemand, existing: Iterable[ApplicationClaim]
-) -> Iterator[Fault]:
-    """Yield why a demanded application contradicts existing claims on it."""
-    for claim in existing:
-        held = f"'{app.id}' is held by {', '.join(claim.requesters)}"
-        if claim.node != app.node:
-            yield fault(
-                f"{where}.node",
-                f"'{app.node}' contradicts an existing claim: {held} on '{claim.node}'; ask for "
-                "that node, or wait until it is released",
-                code="conflict",
-            )
-            return
-        if claim.appdef != app.appdef:
-            yield fault(
-                f"{where}.appdef",
-                f"'{app.appdef}' contradicts an existing claim: {held} as '{claim.appdef}'; use "
-                "another application id",
-                code="conflict",
-            )
-            return
-        if claim.version != app.version:
-            yield fault(
-                f"{where}.version",
-                f"'{app.version}' contradicts an existing claim: {held} in version "
-                f"'{claim.version}'; ask for the same, or use another application id",
-                code="conflict",
-            )
-            return
+def application_conflicts(where: str, app: ApplicationDemand, ledger: Ledger) -> Iterator[Fault]:
+    """Yield why a demanded application contradicts the first existing claim on it, if it does."""
+    claim = ledger.first_claim(Subject(SubjectKind.APPLICATION, app.id))
+    if not isinstance(claim, ApplicationClaim):
+        return
+    held = f"'{app.id}' is held by {', '.join(claim.requesters)}"
+    if claim.node != app.node:
+        yield fault(
+            f"{where}.node",
+            f"'{app.node}' contradicts an existing claim: {held} on '{claim.node}'; ask for "
+            "that node, or wait until it is released",
+            code="conflict",
+        )
+    elif claim.appdef != app.appdef:
+        yield fault(
+            f"{where}.appdef",
+            f"'{app.appdef}' contradicts an existing claim: {held} as '{claim.appdef}'; use "
+            "another application id",
+            code="conflict",
+        )
+    elif claim.version != app.version:
+        yield fault(
+            f"{where}.version",
+            f"'{app.version}' contradicts an existing claim: {held} in version "
+            f"'{claim.version}'; ask for the same, or use another application id",
+            code="conflict",
+        )
 
 
-def connection_conflicts(
-    where: str, demanded: ConnectionDemand, existing: Iterable[ConnectionClaim]
-) -> Iterator[Fault]:
+def connection_conflicts(where: str, demanded: ConnectionDemand, ledger: Ledger) -> Iterator[Fault]:
     """Yield why a demanded connection contradicts existing claims on it."""
-    for claim in existing:
+    for claim in ledger.connection_claims(demanded.id):
         held = f"'{demanded.id}' is held by {', '.join(claim.requesters)}"
         for name, new, current in (
             ("type", ConnectionType(demanded.type).name, claim.type.name),

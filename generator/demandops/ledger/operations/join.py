@@ -31,8 +31,7 @@ def join(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger,
     start = ledger
     keys: list[ClaimKey] = []
     for index, app in enumerate(request.applications):
-        same_application = ledger.application_claims(app.id)
-        faults += application_conflicts(f"applications[{index}]", app, same_application)
+        faults += application_conflicts(f"applications[{index}]", app, ledger)
         key = ClaimKey(
             Subject(SubjectKind.APPLICATION, app.id), demand_id(request.id, app.requesters)
         )
@@ -43,8 +42,7 @@ def join(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger,
         ledger = ledger.replace(key, claim)
         keys.append(key)
     for index, connection in enumerate(request.connections):
-        same_connection = ledger.connection_claims(connection.id)
-        faults += connection_conflicts(f"connections[{index}]", connection, same_connection)
+        faults += connection_conflicts(f"connections[{index}]", connection, ledger)
         key = ClaimKey(
             Subject(SubjectKind.CONNECTION, connection.id),
             demand_id(request.id, connection.requesters),

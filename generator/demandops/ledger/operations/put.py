@@ -28,16 +28,14 @@ def put(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, 
     faults: list[Fault] = []
     keys = [claim.key for claim in held]
     for index, app in enumerate(request.applications):
-        same_application = others.application_claims(app.id)
-        faults += application_conflicts(f"applications[{index}]", app, same_application)
+        faults += application_conflicts(f"applications[{index}]", app, others)
         key = ClaimKey(Subject(SubjectKind.APPLICATION, app.id), demand)
         faults += _listed_twice(f"applications[{index}].id", key, ledger)
         claim: Claim = application_claim(app, request.id, demand, start.get(key), now)
         ledger = ledger.replace(key, claim)
         keys.append(key)
     for index, connection in enumerate(request.connections):
-        same_connection = others.connection_claims(connection.id)
-        faults += connection_conflicts(f"connections[{index}]", connection, same_connection)
+        faults += connection_conflicts(f"connections[{index}]", connection, others)
         key = ClaimKey(Subject(SubjectKind.CONNECTION, connection.id), demand)
         faults += _listed_twice(f"connections[{index}].id", key, ledger)
         claim = connection_claim(connection, request.id, demand, start.get(key), now)

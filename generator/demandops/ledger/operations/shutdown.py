@@ -109,9 +109,13 @@ def _subtract_inputs(
     missing = []
     for role in sorted({*claim.inputs, *listed.inputs}):
         held = claim.inputs.get(role, ())
+        by_name: dict[str, list[InputTopic]] = {}
+        for topic in held:
+            by_name.setdefault(topic.topic, []).append(topic)
         gone: set[InputTopic] = set()
         for topic in listed.inputs.get(role, ()):
-            found = {t for t in held if t.topic == topic.topic and topic.source in ("", t.source)}
+            named = by_name.get(topic.topic, ())
+            found = {one for one in named if topic.source in ("", one.source)}
             gone |= found
             if not found:
                 missing.append(f"{role} {topic.topic} of {topic.source}")
@@ -152,8 +156,8 @@ def _nothing_held(ledger: Ledger, request: DemandRequest) -> Fault:
         requesters = set(request.requesters())
         near = [
             f"{claim.subject} for {', '.join(claim.requesters)}"
-            for claim in sorted(ledger, key=lambda claim: (str(claim.subject), claim.demand))
-            if requesters & set(claim.requesters)
+            for requester in sorted(requesters)
+            for claim in ledger.claims_of_requester(requester)
         ]
     shown = "; ".join(dict.fromkeys(near[:5])) or "none"
     return fault(

@@ -18,7 +18,7 @@ from demandops.ledger.ledger import Changes, Ledger
 from demandops.plan.overrides.selectors import Traits, fits, has_labels, traits_of
 from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.plan.release import ServiceKey
-from demandops.plan.release_keys import keys_including_suspended
+from demandops.plan.release_keys import keys_of_claims
 
 
 def faults(
@@ -66,7 +66,7 @@ def _service_traits(
     """Yield the traits of the services that an application needs."""
     if not isinstance(demanded, ApplicationDemand):
         return
-    for key in keys_including_suspended(after, config, subject):
+    for key in keys_of_claims(after, config, after.claims_on(subject)):
         if isinstance(key, ServiceKey):
             yield Traits(
                 (key.node,),
@@ -120,6 +120,8 @@ def _message(override: Override) -> str:
 
 def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
     """Yield a warning for each claim of a demand that an override suspends."""
+    if not any(override.deny for override in config.active_overrides):
+        return
     subjects = dict.fromkeys(subject for subject, _, _ in _listed(request))
     claims = [
         *ledger.claims_of_demand(request.demand),
@@ -127,7 +129,7 @@ def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator
     ]
     seen = set()
     requesters = set(request.requesters())
-    for claim in claims if config.active_overrides else ():
+    for claim in claims:
         override = suspended_by(claim, config)
         if override is None or claim.key in seen or not requesters & set(claim.requesters):
             continue

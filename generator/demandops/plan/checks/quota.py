@@ -33,6 +33,8 @@ def _claims(
     most = domain.quotas.claims_per_requester
     if most is None:
         return
+    if after.count_of_requester(requester) <= most:
+        return  # in all domains together
     count = _held(requester, after, domain, config)
     if count > most and count > _held(requester, before, domain, config):
         yield _exceeded(

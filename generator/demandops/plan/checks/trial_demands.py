@@ -54,7 +54,7 @@ def _services(appdef: ApplicationDefinition, node: str, config: Config) -> Itera
         ),
     )
     ledger, changes = apply(Ledger(), request, _NEVER)
-    for key in affected_keys(Ledger(), ledger, config, changes.subjects()):
+    for key in affected_keys(Ledger(), ledger, config, changes.claims):
         release = plan(ledger, config, key)
         if isinstance(release, ServiceRelease):
             yield release

@@ -31,9 +31,7 @@ def requested_subjects(request: DemandRequest) -> tuple[Subject, ...]:
 def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
     """Return the ledger without the kept claims on these subjects."""
     for subject in subjects:
-        ledger = ledger.without(
-            claim for claim in ledger.claims_on(subject) if is_override_claim(claim)
-        )
+        ledger = ledger.without(ledger.kept_claims(subject))
     return ledger
 
 
@@ -65,13 +63,9 @@ def update_kept_claims(
     """
     keys: list[ClaimKey] = []
     for subject in subjects:
-        existing = [
-            c
-            for c in (*after.claims_on(subject), *before.claims_on(subject))
-            if is_override_claim(c)
-        ]
+        existing = [*after.kept_claims(subject), *before.kept_claims(subject)]
         needed = None
-        if all(is_override_claim(claim) for claim in after.claims_on(subject)):
+        if after.is_only_kept(subject):
             needed = _needed(existing, before.claims_on(subject), config, now)
         keys += [claim.key for claim in existing]
         after = after.without(existing)
@@ -83,8 +77,7 @@ def update_kept_claims(
 
 def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
     """Return every subject with a kept claim, sorted."""
-    found = {claim.subject for claim in ledger if is_override_claim(claim)}
-    return tuple(sorted(found, key=str))
+    return tuple(dict.fromkeys(claim.subject for claim in ledger.kept_claims()))
 
 
 def _needed(

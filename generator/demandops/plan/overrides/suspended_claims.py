@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.demand.claim import Claim, Subject
+from demandops.demand.claim import Claim, ClaimKey, Subject
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.selectors import Traits, fits, traits_of
 
@@ -29,15 +29,25 @@ class UnsuspendedClaims(Ledger):
         """Return the claims on ``subject`` that are not suspended, sorted by demand id."""
         return tuple(claim for claim in Ledger.claims_on(self, subject) if self._is_active(claim))
 
+    def first_claim(self, subject: Subject) -> Claim | None:
+        """Return the first claim on ``subject`` that is not suspended, or ``None``."""
+        first = Ledger.first_claim(self, subject)
+        if first is None or self._is_active(first):
+            return first
+        return next(iter(self.claims_on(subject)), None)
+
+    def get(self, key: ClaimKey) -> Claim | None:
+        """Return one claim, or ``None`` if it is suspended."""
+        claim = Ledger.get(self, key)
+        return claim if claim and self._is_active(claim) else None
+
     def is_carried_to(self, target: str, topic: str) -> bool:
         """Return whether a claimed connection brings ``topic`` to the node ``target``."""
         return bool(self.connections_bringing(target, topic))
 
     def _ids(self, *entry: str) -> tuple[str, ...]:
-        found = ((key, self.get(key)) for key in self.index.get(entry) or ())
-        return tuple(
-            sorted({key.subject.id for key, claim in found if claim and self._is_active(claim)})
-        )
+        keys = self.index.get(entry) or ()
+        return tuple(sorted({key.subject.id for key in keys if self.get(key)}))
 
     def _is_active(self, claim: Claim) -> bool:
         return self.config is None or suspended_by(claim, self.config) is None
