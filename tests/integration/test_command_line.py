@@ -593,45 +593,6 @@ class TestVerify:
         assert ran.out.startswith(f"{joined.tip[:10]} skipped (made by a person)  By hand\n")
 
 
-class TestCheck:
-    @pytest.fixture
-    def folder(self, demandops: Run, tmp_path: Path) -> Path:
-        folder = tmp_path / "checked-out"
-        assert demandops("init", folder).code == 0
-        return folder
-
-    def test_every_fault_is_told(self, demandops: Run, folder: Path) -> None:
-        nodes, images = folder / "inventory/nodes.yaml", folder / "registry/images.yaml"
-        nodes.write_text(nodes.read_text().replace("type: vehicle", "type: car", 1))
-        images.write_text(images.read_text().replace("tag: 2025-04", "tag: 2025", 1))
-        expected = [
-            (
-                "inventory/nodes.yaml",
-                "nodes[0].type",
-                "is 'car', but must be 'vehicle', 'station', 'edge' or 'cloud'",
-            ),
-            (
-                "registry/images.yaml",
-                "images.object-detection.tag",
-                "must be text, not 2025; put it in quotes",
-            ),
-        ]
-        ran = demandops("check", folder)
-        assert (ran.code, ran.out) == (1, "")
-        assert ran.err.splitlines() == [f"error: {': '.join(fault)}" for fault in expected]
-        found = demandops("check", folder, "--output", "json")
-        assert found.code == 1
-        assert [tuple(fault.values()) for fault in found.json()["faults"]] == expected
-
-    def test_a_folder_that_is_no_state_repo(self, demandops: Run, tmp_path: Path) -> None:
-        ran = demandops("check", tmp_path)
-        assert (ran.code, ran.out) == (1, "")
-        assert ran.err == (
-            f"error: {tmp_path} is not a state repo, because it has no demandops.yaml; `demandops "
-            "init` makes one\n"
-        )
-
-
 class TestStateRepo:
     """Which state repo: named by option or environment, and refused with a remedy."""
 
