@@ -652,18 +652,6 @@ class TestStateRepo:
             assert "hunter2" not in path.name
             assert not path.is_file() or "hunter2" not in path.read_text()
 
-    @pytest.mark.parametrize("scheme", ["ftp://", "rsync://", "ext::", "helper::"])
-    def test_an_address_that_git_must_not_follow_is_refused(
-        self, demandops: Run, scheme: str
-    ) -> None:
-        """With two colons it names a program of git's that is run with the rest."""
-        ran = demandops("bookkeeping", "--state-repo", f"{scheme}sh")
-        assert (ran.code, ran.out) == (1, "")
-        assert ran.err == (
-            f"error: a state repo's address cannot start with '{scheme}'; use https, ssh, git or "
-            "file\n"
-        )
-
     def test_what_is_no_state_repo_is_told_with_the_remedy(
         self, demandops: Run, tmp_path: Path
     ) -> None:
