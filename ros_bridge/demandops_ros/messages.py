@@ -9,7 +9,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Duration
 from demandops.config.policy import seconds_of
-from demandops.demand.route import RouteOptions
+from demandops.connections.route import RouteOptions
 from demandops.errors import suggestion
 from demandops.settings import API_VERSION
 from demandops_interfaces import msg as messages

@@ -17,9 +17,9 @@ import rclpy
 from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_watcher import RolloutWatcher
-from demandops.service import Generator
-from demandops.service.push_webhook import PushWebhook, read_secret
+from demandops.service import Generator, push_webhook
 from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
+from demandops.service.web_app import WebApp
 from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
@@ -122,7 +122,7 @@ def serve(
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
         settings = _read_parameters(state_repo, fetch_interval)
-        secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
+        secret = push_webhook.read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
         with progress("reading the ledger") as report:
             generator = Generator(
@@ -135,9 +135,10 @@ def serve(
         trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
         generator.on_publish(trigger)
         trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
-        push_webhook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
+        route = push_webhook.PushWebhook(secret, generator.fetch_now).route
+        web_app = WebApp(webhook, [route], local_only=not secret) if webhook else None
         status = RolloutWatcher(clusters, generator) if clusters else None
-        _run(generator, settings, status, push_webhook)
+        _run(generator, settings, status, web_app)
         trigger.close()
     finally:
         rclpy.try_shutdown()
@@ -193,7 +194,7 @@ def _run(
     generator: Generator,
     settings: dict[str, Any],
     status: RolloutWatcher | None,
-    push_webhook: PushWebhook | None,
+    web_app: WebApp | None,
 ) -> None:
     node = DemandNode(
         generator,
@@ -219,11 +220,11 @@ def _run(
     spinner.start()
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
-    if push_webhook is not None:
-        node.get_logger().info(f"listening for pushes at {push_webhook.url}")
+    if web_app is not None:
+        node.get_logger().info(f"listening for pushes at {web_app.url}{push_webhook.PATH}")
     signals.wait()
-    if push_webhook is not None:
-        push_webhook.close()
+    if web_app is not None:
+        web_app.close()
     _drain(executor, node, generator, status)
     executor.shutdown(timeout_sec=1)
     spinner.join(5)

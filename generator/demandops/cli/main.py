@@ -41,6 +41,10 @@ COMMANDS = {
         "demandops.cli.repo.init:init",
         "Create a state repo.",
     ),
+    "journal": (
+        "demandops.cli.repo.journal:journal",
+        "List the accepted demands that are not published.",
+    ),
     "log": (
         "demandops.cli.views.log:log",
         "List the commits of the state repo, newest first.",

@@ -10,15 +10,13 @@ import hashlib
 import hmac
 import json
 import re
-import urllib.error
-import urllib.request
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from http.client import HTTPMessage
-from typing import IO
 from urllib.parse import quote, urlsplit
 
+from demandops import http_call
 from demandops.cluster.access import NoAccess
+from demandops.http_call import NoAnswer
 from demandops.settings import MAIN_BRANCH
 
 _SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")
@@ -91,27 +89,11 @@ def send(url: str, call: WebhookCall, secret: bytes | None, timeout: float) -> N
     """Send a call.
 
     Raises:
-        HTTPError: if the controller rejects it or redirects, since a redirect would lose the body.
-        OSError: if the controller does not answer.
+        NoAnswer: if the controller does not answer, rejects the call or redirects it.
     """
-    headers = {"Content-Type": "application/json", "User-Agent": "demandops", **call.headers}
+    headers = {"Content-Type": "application/json", **call.headers}
     if secret is not None:
         headers[call.signature_header] = signature(secret, call.body)
-    request = urllib.request.Request(url, data=call.body, headers=headers, method="POST")  # noqa: S310
-    _OPENER.open(request, timeout=timeout).close()
-
-
-class _NoRedirect(urllib.request.HTTPRedirectHandler):
-    def redirect_request(
-        self,
-        req: urllib.request.Request,
-        fp: IO[bytes],
-        code: int,
-        msg: str,
-        headers: HTTPMessage,
-        newurl: str,
-    ) -> None:
-        """Follow no redirect."""
-
-
-_OPENER = urllib.request.build_opener(_NoRedirect)
+    answer = http_call.call("POST", url, headers, call.body, timeout)
+    if not answer.is_success:
+        raise NoAnswer(f"it answered {answer.status}")

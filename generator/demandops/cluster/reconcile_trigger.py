@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-import urllib.error
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime, timezone
 from typing import Any
@@ -19,6 +18,7 @@ from demandops.cluster.access import ClusterAccess, NoAccess
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
 from demandops.config.repo_settings import RepoSettings
+from demandops.http_call import NoAnswer
 from demandops.render.gitops.argocd import project_of
 from demandops.render.gitops.paths import domain_folder, domains_in_use
 
@@ -158,9 +158,7 @@ class ReconcileTrigger:
 
 def _reason(error: Exception) -> str:
     """Return why a cluster was not woken, without URLs or other secrets."""
-    if isinstance(error, urllib.error.HTTPError):
-        return f"it answered {error.code}"
-    return str(error) if isinstance(error, NoAccess) else type(error).__name__
+    return str(error) if isinstance(error, NoAccess | NoAnswer) else type(error).__name__
 
 
 def _domains(cluster: str, config: Config) -> list[AccessDomain]:

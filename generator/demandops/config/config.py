@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -12,6 +13,7 @@ from demandops.config.override import OVERRIDES_ROOT, Override, by_rank, still_a
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import Chart, Image
 from demandops.config.repo_settings import RepoSettings
+from demandops.errors import Refused, fault
 
 CLUSTERS_FILE = "inventory/clusters.yaml"
 NODES_FILE = "inventory/nodes.yaml"
@@ -19,15 +21,6 @@ BROKERS_FILE = "inventory/brokers.yaml"
 DOMAINS_FILE = "policy/access-domains.yaml"
 CHARTS_FILE = "registry/charts.yaml"
 IMAGES_FILE = "registry/images.yaml"
-
-MQTT_CLIENT_IMAGE = "mqtt-client"
-"""The registry image that both ends of an MQTT connection run."""
-
-ZENOH_BRIDGE_IMAGE = "zenoh-bridge"
-"""The registry image that carries a node's Zenoh connections."""
-
-DDS_ROUTER_IMAGE = "dds-router"
-"""The registry image that both ends of a ROS connection run."""
 
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
 """The top-level entries of a state repo that hold the configuration; people own them."""
@@ -71,6 +64,23 @@ class Config:
     def without_overrides(self) -> Config:
         """Return the configuration without any override."""
         return replace(self, overrides={}, ended_overrides={}, active_overrides=(), denial_cache={})
+
+    def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
+        """Return a node and its access domain.
+
+        Raises:
+            Refused: if a node in use was removed from the inventory or its access domain.
+        """
+        node, domain = self.nodes.get(id), self.domain_of.get(id)
+        if node is None or domain is None:
+            missing = NODES_FILE if node is None else "any access domain"
+            message = (
+                f"'{id}' is in use, but not in {missing}; restore it, or release what it holds: "
+                f"demandops decommission {shlex.quote(id)}"
+            )
+            file = NODES_FILE if node is None else DOMAINS_FILE
+            raise Refused([fault("node", message, code="unknown-node").within(file)])
+        return node, domain
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
         """Return the appdef that ``DeploymentRequest`` names by ``number``."""

@@ -13,7 +13,6 @@ from demandops.config.config import (
     CLUSTERS_FILE,
     DOMAINS_FILE,
     IMAGES_FILE,
-    MQTT_CLIENT_IMAGE,
     NODES_FILE,
     Config,
 )
@@ -22,9 +21,8 @@ from demandops.config.override import Override
 from demandops.config.override_conflict import check_override_conflicts
 from demandops.config.policy import matches
 from demandops.config.registry import ChartSource
+from demandops.connections import connection_types
 from demandops.errors import InvalidInput, suggestion
-
-_CONNECTION_PREFIXES = ("mqtt", "zenoh", "ros")
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:
@@ -37,8 +35,8 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
         _check_charts,
         _check_services,
         _check_wire_types,
-        _check_clients,
-        _check_links,
+        _check_bridged,
+        _check_connection_types,
         _check_overrides,
         check_override_conflicts,
     ):
@@ -132,6 +130,7 @@ def _check_chart(where: str, chart: ChartSource, config: Config, reader: ConfigR
 
 def _check_services(config: Config, reader: ConfigReader) -> None:
     prefixes: dict[str, tuple[str, str, Service]] = {}
+    words = {known.word for known in connection_types.CONNECTION_TYPES}
     for appdef in config.appdefs.values():
         file = f"appdefs/{appdef.name}/appdef.yaml"
         for name, service in appdef.services.items():
@@ -150,7 +149,7 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
             if config.values_template(appdef.name, service) not in config.files:
                 message = f"'{service.values}' does not exist; add it beside appdef.yaml"
                 reader.add_fault(file, f"{where}.values", message)
-            if service.prefix in _CONNECTION_PREFIXES:
+            if service.prefix in words:
                 message = f"'{service.prefix}' is the prefix of connections; choose another"
                 reader.add_fault(file, f"{where}.prefix", message)
                 continue
@@ -173,32 +172,18 @@ def _same(config: Config, one: tuple[str, str, Service], other: tuple[str, str, 
     return bool(one[2].each) and one[1:] == other[1:] and texts[0] == texts[1]
 
 
-def _check_clients(config: Config, reader: ConfigReader) -> None:
-    if config.brokers and reader.is_missing(IMAGES_FILE, MQTT_CLIENT_IMAGE):
-        message = f"'{MQTT_CLIENT_IMAGE}' is missing; add it, because MQTT connections run it"
-        reader.add_fault(IMAGES_FILE, "images", message)
-
-
-def _check_links(config: Config, reader: ConfigReader) -> None:
-    hosts: dict[tuple[object, ...], str] = {}
+def _check_bridged(config: Config, reader: ConfigReader) -> None:
     for node in config.nodes.values():
-        where = f"nodes[{reader.index_of(NODES_FILE, node.id)}]"
         for peer in node.bridged:
             if reader.is_missing(NODES_FILE, peer):
+                place = f"nodes[{reader.index_of(NODES_FILE, node.id)}].bridged.{peer}"
                 known = suggestion(peer, reader.item_names(NODES_FILE))
-                message = f"'{peer}' is not in nodes.yaml{known}"
-                reader.add_fault(NODES_FILE, f"{where}.bridged.{peer}", message)
-        if node.zenoh is None:
-            continue
-        host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
-        other = hosts.setdefault(host, node.id)
-        if other != node.id:
-            reader.add_fault(
-                NODES_FILE,
-                f"{where}.zenoh",
-                f"'{other}' already runs a bridge on the same host and ROS domain; remove one of "
-                "them",
-            )
+                reader.add_fault(NODES_FILE, place, f"'{peer}' is not in nodes.yaml{known}")
+
+
+def _check_connection_types(config: Config, reader: ConfigReader) -> None:
+    for known in connection_types.by_number():
+        reader.faults += known.config_faults(config, reader)
 
 
 def _check_wire_types(config: Config, reader: ConfigReader) -> None:

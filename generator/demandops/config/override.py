@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Annotated, Any, Literal
 
@@ -235,6 +236,41 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
     def rank(self) -> tuple[int, str]:
         """Its rank among overrides; the higher rank wins."""
         return (self.priority, self.name)
+
+
+@dataclass(frozen=True, slots=True)
+class Shaping:
+    """The overrides that shape a release, with the effects of each; the last one wins."""
+
+    by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
+
+    def image(self, image: str, images: Mapping[str, Image]) -> Image:
+        """Return an image of the registry's ``images``, with the pins of overrides."""
+        found = images[image]
+        for override, effects in self.by:
+            if "images" in effects and override.images and image in override.images:
+                found = override.images[image].over(found)
+        return found
+
+    @property
+    def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+        """The files that patch values, and their patches."""
+        return tuple(
+            (override.path, override.values or {})
+            for override, effects in self.by
+            if "values" in effects
+        )
+
+    @property
+    def held(self) -> bool:
+        """Whether a ``hold`` applies that no higher override changes, so the file stays."""
+        held = False
+        for _, effects in self.by:
+            held = "hold" in effects or (held and set(effects) <= {"keep"})
+        return held
+
+
+UNSHAPED = Shaping()
 
 
 def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:

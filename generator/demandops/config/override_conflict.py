@@ -16,6 +16,7 @@ from demandops.config.config import Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.override import Override, Selector, by_rank
 from demandops.config.policy import matches
+from demandops.connections import connection_types
 
 _MERGED = ("values", "images")
 _SINGLE = ("version", "replicas", "node")
@@ -97,7 +98,7 @@ def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterat
     yield from ("services", "nodes")
     if not any(_shared(one, other, appdef) for appdef in config.appdefs.values()):
         yield from ("applications", "appdefs")
-    if not any(node.zenoh for node in config.nodes.values()):
+    if not any(known.shares_clients(config) for known in connection_types.CONNECTION_TYPES):
         yield "connections"
 
 

@@ -9,12 +9,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from demandops.config.config import Config
+from demandops.connections import connection_types
 from demandops.demand import connection_type_choice
 from demandops.demand import demand_request as shape
 from demandops.demand.demand_request import (
+    AUTO,
     ApplicationDemand,
     ConnectionDemand,
-    ConnectionType,
     DemandRequest,
 )
 from demandops.errors import Fault, fault, quoted, suggestion
@@ -88,10 +89,9 @@ def _unknown_application(where: str, name: str, config: Config) -> Fault:
 def _connection(
     where: str, connection: ConnectionDemand, config: Config, claiming: bool
 ) -> Iterator[Fault]:
-    types = {known.value: known for known in ConnectionType}
-    kind = types.get(connection.type)
-    if kind is None:
-        known = ", ".join(f"{n} ({item.name})" for n, item in types.items() if n >= 0)
+    kind = connection.chosen_type
+    if kind is None and connection.type != AUTO:
+        known = ", ".join(known.label for known in connection_types.by_number())
         yield fault(
             f"{where}.type",
             f"{connection.type} is not a connection type; known: {known}",
@@ -101,15 +101,15 @@ def _connection(
         return
     yield from _node(f"{where}.source", connection.source, config)
     yield from _node(f"{where}.target", connection.target, config)
-    if kind is None:
-        return
-    if kind is ConnectionType.AUTO:
-        ends_known = connection.source in config.nodes and connection.target in config.nodes
-        if ends_known and connection_type_choice.choose_type(connection, config) is kind:
-            yield _within(where, connection_type_choice.no_type_fault(connection, config))
-        return
-    for found in connection_type_choice.type_faults(kind, connection, config):
-        yield _within(where, found)
+    if kind is not None:
+        for found in connection_type_choice.type_faults(kind, connection, config):
+            yield _within(where, found)
+    elif (
+        connection.type == AUTO
+        and {connection.source, connection.target} <= config.nodes.keys()
+        and connection_type_choice.choose_type(connection, config) is None
+    ):
+        yield _within(where, connection_type_choice.no_type_fault(connection, config))
 
 
 def _within(where: str, found: Fault) -> Fault:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain, matches
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim, Subject, SubjectKind
-from demandops.demand.demand_request import ConnectionType, DemandRequest
+from demandops.demand.demand_request import DemandRequest
 from demandops.demand.lease import Term
 from demandops.demand.permission import (
     Access,
@@ -71,8 +71,7 @@ def _reasons(claim: Claim, config: Config) -> Iterator[str]:
 def _access(claim: Claim, config: Config) -> Iterator[tuple[AccessDomain, Access]]:
     """Yield the access that a claim needs to each access domain."""
     if isinstance(claim, ConnectionClaim):
-        mqtt = claim.type is ConnectionType.MQTT
-        yield from access_of_connection(claim.source, claim.target, claim.broker, mqtt, config)
+        yield from access_of_connection(claim, claim.type, config)
     else:
         yield from access_of_application(claim, config)
 

@@ -12,9 +12,10 @@ from enum import Enum
 from itertools import islice, takewhile
 from types import MappingProxyType
 
-from demandops.demand.demand_request import OVERRIDE_PREFIX, ConnectionType, InputTopic
+from demandops.connections.connection_type import ConnectionType
+from demandops.connections.route import Route
+from demandops.demand.demand_request import OVERRIDE_PREFIX, InputTopic
 from demandops.demand.lease import Lease
-from demandops.demand.route import Route
 
 
 class SubjectKind(Enum):
@@ -97,10 +98,7 @@ def _exact(values: Mapping[str, object]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionClaim:
-    """One demand's hold on a connection. ``topics`` are routes by source topic, sorted.
-
-    ``type`` is never ``AUTO``.
-    """
+    """One demand's hold on a connection. ``topics`` are routes by source topic, sorted."""
 
     connection: str
     demand: str

@@ -17,23 +17,20 @@ from pydantic import Field, PlainValidator
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel
 from demandops.config.policy import seconds_of
+from demandops.connections.connection_types import type_named, type_word
+from demandops.connections.route import RouteOptions
 from demandops.demand.demand_request import (
+    AUTO,
     ApplicationDemand,
     ConnectionDemand,
-    ConnectionType,
     DemandRequest,
     InputTopic,
     Operation,
 )
 from demandops.demand.goal_validation import parse_valid_part
-from demandops.demand.route import RouteOptions
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import absolute_topic
 from demandops.settings import API_VERSION
-
-TypeName = Literal["auto", "mqtt", "zenoh", "ros"]
-
-_TYPES = {known.name.lower(): known.value for known in ConnectionType}
 
 
 class GoalTopic(FrozenModel):
@@ -59,7 +56,7 @@ class GoalApplication(FrozenModel):
     parameters: dict[str, Any] = Field(default_factory=dict)
     parameters_json: dict[str, str] = Field(default_factory=dict)
     version: str = ""
-    connect: Literal["auto", "mqtt", "zenoh", "ros", "none"] = "auto"
+    connect: Annotated[str, type_word("auto", after=("none",))] = "auto"
 
 
 class GoalRoute(RouteOptions):
@@ -73,7 +70,7 @@ class GoalConnection(FrozenModel):
     """One connection and the topics that it carries."""
 
     id: str = ""
-    type: TypeName = "auto"
+    type: Annotated[str, type_word("auto")] = "auto"
     source: str = ""
     target: str = ""
     broker: str = ""
@@ -188,8 +185,12 @@ def _application(
         ),
         parameters=MappingProxyType(parameters),
         version=app.version,
-        connect=None if app.connect == "none" else _TYPES[app.connect],
+        connect=None if app.connect == "none" else _number(app.connect),
     )
+
+
+def _number(word: str) -> int:
+    return AUTO if word == "auto" else type_named(word).number
 
 
 def _storable(where: str, value: object, faults: list[Fault]) -> object:
@@ -215,7 +216,7 @@ def _value_problem(value: object, depth: int) -> str:
 def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> ConnectionDemand:
     return ConnectionDemand(
         id=connection.id,
-        type=_TYPES[connection.type],
+        type=_number(connection.type),
         source=connection.source,
         target=connection.target,
         topics=tuple(

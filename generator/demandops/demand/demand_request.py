@@ -11,14 +11,19 @@ from dataclasses import dataclass, field
 from enum import Enum
 from types import MappingProxyType
 
-from demandops.demand import route as routes
+from demandops.connections import route as routes
+from demandops.connections.connection_type import ConnectionType
+from demandops.connections.connection_types import type_numbered
+from demandops.connections.route import Route
 from demandops.demand.lease import LONGEST_S, Term
-from demandops.demand.route import Route
 from demandops.errors import Fault, fault
 from demandops.identifiers import id_problem, topic_problem
 
 OVERRIDE_PREFIX = "override:"
 """The prefix of the demand ids of claims that overrides make; no other demand may use it."""
+
+AUTO = -1
+"""The number of a connection type that a request leaves open; ``DeploymentRequest`` has none."""
 
 
 class Operation(Enum):
@@ -50,19 +55,6 @@ class Operation(Enum):
         return self in (Operation.JOIN, Operation.SHUTDOWN)
 
 
-class ConnectionType(Enum):
-    """The type of a connection; the values are the numbers in ``DeploymentRequest``.
-
-    Only requests contain ``AUTO``, which has no number there. Claims have the chosen type
-    (:func:`demandops.demand.connection_type_choice.with_chosen_types`).
-    """
-
-    AUTO = -1
-    ROS = 0
-    MQTT = 1
-    ZENOH = 2
-
-
 @dataclass(frozen=True, slots=True, order=True)
 class InputTopic:
     """An input topic of an application, and the node that publishes it."""
@@ -92,9 +84,9 @@ class ApplicationDemand:
 class ConnectionDemand:
     """One connection of a request.
 
-    ``type`` is a value of :class:`ConnectionType` or an unknown number of the goal. ``broker`` is
-    empty if the program chooses it. ``for_input`` is the field of the input for which the program
-    added the connection.
+    ``type`` is the number of a connection type, ``AUTO`` or an unknown number of the goal.
+    ``broker`` is empty if the program chooses it. ``for_input`` is the field of the input for which
+    the program added the connection.
     """
 
     id: str
@@ -106,6 +98,11 @@ class ConnectionDemand:
     requesters: tuple[str, ...]
     term: Term | None = None
     for_input: str = ""
+
+    @property
+    def chosen_type(self) -> ConnectionType | None:
+        """Its type, or ``None`` if it is open or unknown."""
+        return type_numbered(self.type)
 
 
 @dataclass(frozen=True, slots=True)

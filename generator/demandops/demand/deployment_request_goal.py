@@ -16,16 +16,16 @@ from pydantic import Field
 
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.base_model import FrozenModel
+from demandops.connections.route import Route
 from demandops.demand.demand_request import (
+    AUTO,
     ApplicationDemand,
     ConnectionDemand,
-    ConnectionType,
     DemandRequest,
     InputTopic,
     Operation,
 )
 from demandops.demand.goal_validation import parse_valid_part
-from demandops.demand.route import Route
 from demandops.errors import Fault, fault
 from demandops.identifiers import absolute_topic
 
@@ -199,7 +199,7 @@ def _connection(connection: WireConnection, *, valid_type: bool) -> ConnectionDe
     )
     return ConnectionDemand(
         id=connection.id,
-        type=connection.type if valid_type else ConnectionType.AUTO.value,
+        type=connection.type if valid_type else AUTO,
         source=connection.source_node_id,
         target=connection.target_node_id,
         topics=tuple(

@@ -10,12 +10,11 @@ from dataclasses import replace
 
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain, Rule, matches, seconds_of
+from demandops.connections.connection_type import ConnectionType, Ends
 from demandops.demand.claim import ApplicationClaim
-from demandops.demand.connection_type_choice import choose_broker
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
-    ConnectionType,
     DemandRequest,
     Operation,
 )
@@ -41,7 +40,9 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         if home is not None:
             yield from _too_long(request, home)
     for index, connection in enumerate(request.connections):
-        yield from _connection(f"connections[{index}]", connection, config)
+        where = f"connections[{index}]"
+        for domain, access in access_of_connection(connection, connection.chosen_type, config):
+            yield from _not_allowed(where, connection.requesters, domain, access)
         home = config.domain_of.get(connection.target)
         if home is not None:
             yield from _too_long(request, home)
@@ -66,26 +67,15 @@ def _service_nodes(app: ApplicationDemand | ApplicationClaim, config: Config) ->
     return dict.fromkeys((app.node, *sources))
 
 
-def _connection(where: str, connection: ConnectionDemand, config: Config) -> Iterator[Fault]:
-    mqtt = connection.type == ConnectionType.MQTT.value
-    ends = (connection.source, connection.target)
-    for domain, access in access_of_connection(*ends, connection.broker, mqtt, config):
-        yield from _not_allowed(where, connection.requesters, domain, access)
-
-
 def access_of_connection(
-    source: str, target: str, requested_broker: str, mqtt: bool, config: Config
+    ends: Ends, kind: ConnectionType | None, config: Config
 ) -> Iterator[tuple[AccessDomain, Access]]:
     """Yield the access that a connection needs to the access domain of each end."""
-    broker = choose_broker(requested_broker, source, target, config) if mqtt else None
-    for node in dict.fromkeys((source, target)):
+    more = kind.access(ends, config) if kind else []
+    for node in dict.fromkeys((ends.source, ends.target)):
         domain = config.domain_of.get(node)
-        if domain is None:
-            continue
-        access = [("nodes", node)]
-        if broker is not None:
-            access.append(("brokers", broker.node))
-        yield domain, access
+        if domain is not None:
+            yield domain, [("nodes", node), *more]
 
 
 def _not_allowed(

@@ -8,10 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from demandops.config.repo_settings import Proposals
-from demandops.forge.api import Api, ForgeError
+from demandops.forge.forge import Forge, ForgeError, PullRequest
 from demandops.forge.gitea import Gitea
 from demandops.forge.github import GitHub
-from demandops.forge.pull_request import Forge, PullRequest
 
 __all__ = ["Forge", "ForgeError", "PullRequest", "forge_for"]
 
@@ -29,9 +28,9 @@ def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:
     owner, name = proposals.project
     token = _token(token_file, proposals.forge)
     if proposals.forge == "github":
-        return GitHub(Api(proposals.api or _github_api(proposals.url), token), owner, name)
+        return GitHub(proposals.api or _github_api(proposals.url), token, owner, name)
     root = proposals.url.strip("/").rsplit("/", 2)[0]
-    return Gitea(Api(proposals.api or f"{root}/api/v1", token), owner, name)
+    return Gitea(proposals.api or f"{root}/api/v1", token, owner, name)
 
 
 def _github_api(url: str) -> str:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 from urllib.parse import quote
 
-from demandops.forge.api import ForgeError
-from demandops.forge.pull_request import PullRequest
-from demandops.forge.pull_request_api import PullRequestApi
+from demandops.forge.forge import Forge, ForgeError, PullRequest
 
 _NOT_FOUND = 404
 
 
-class Gitea(PullRequestApi):
+class Gitea(Forge):
     """The pull requests of a repository on Gitea or Forgejo."""
 
     NAME = "Gitea"
@@ -23,7 +21,7 @@ class Gitea(PullRequestApi):
         """Return the pull request for a branch."""
         try:  # the branch ends the path, so its slash stays unquoted
             path = f"{self._pulls}/{quote(target, safe='')}/{quote(branch, safe='/')}"
-            return self._read(self._api.call("GET", path, self.HEADERS))
+            return self._read(self._call("GET", path))
         except ForgeError as error:
             if error.status == _NOT_FOUND:
                 return None

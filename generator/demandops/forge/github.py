@@ -8,11 +8,10 @@ from __future__ import annotations
 from typing import Any
 from urllib.parse import urlencode
 
-from demandops.forge.pull_request import PullRequest
-from demandops.forge.pull_request_api import PullRequestApi
+from demandops.forge.forge import Forge, PullRequest
 
 
-class GitHub(PullRequestApi):
+class GitHub(Forge):
     """The pull requests of a repository on GitHub."""
 
     NAME = "GitHub"
@@ -33,7 +32,7 @@ class GitHub(PullRequestApi):
             "direction": "desc",
             "per_page": "1",
         }
-        answer = self._api.call("GET", f"{self._pulls}?{urlencode(query)}", self.HEADERS)
+        answer = self._call("GET", f"{self._pulls}?{urlencode(query)}")
         return self._read(answer[0]) if isinstance(answer, list) and answer else None
 
     def _is_merged(self, data: Any) -> bool:  # noqa: ANN401

@@ -17,6 +17,8 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel, parse
+from demandops.connections.connection_types import type_named, type_word
+from demandops.connections.route import Route, RouteOptions
 from demandops.demand.claim import (
     ApplicationClaim,
     Claim,
@@ -25,9 +27,8 @@ from demandops.demand.claim import (
     Subject,
     SubjectKind,
 )
-from demandops.demand.demand_request import ConnectionType, InputTopic
+from demandops.demand.demand_request import InputTopic
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
-from demandops.demand.route import Route, RouteOptions
 from demandops.errors import InvalidInput, fault
 from demandops.settings import LEDGER_API_VERSION
 
@@ -119,7 +120,7 @@ class _ApplicationFile(_Claim):
 class _ConnectionFile(_Claim):
     kind: Literal["ConnectionClaim"]
     connection: str = Field(min_length=1)
-    type: Literal["ros", "mqtt", "zenoh"]
+    type: Annotated[str, type_word()]
     source: str
     target: str
     broker: str = ""
@@ -145,7 +146,7 @@ def text_of(claim: Claim) -> str:
             tail["version"] = claim.version
     else:
         head |= {"kind": "ConnectionClaim", "connection": claim.connection}
-        tail = {"type": claim.type.name.lower(), "source": claim.source, "target": claim.target}
+        tail = {"type": claim.type.word, "source": claim.source, "target": claim.target}
         if claim.broker:
             tail["broker"] = claim.broker
         tail["topics"] = {source: _route(route) for source, route in claim.topics.items()}
@@ -254,7 +255,7 @@ def _connection(file: _ConnectionFile) -> Claim:
         request=file.request,
         requesters=tuple(sorted(set(file.requesters))),
         booked=_time(file.booked),
-        type=ConnectionType[file.type.upper()],
+        type=type_named(file.type),
         source=file.source,
         target=file.target,
         broker=file.broker,

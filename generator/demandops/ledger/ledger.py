@@ -12,6 +12,8 @@ from typing import TypeAlias
 
 from rpds import HashTrieMap, HashTrieSet
 
+from demandops.connections import connection_types
+from demandops.connections.connection_type import ConnectionType
 from demandops.demand.claim import (
     ApplicationClaim,
     Claim,
@@ -21,7 +23,6 @@ from demandops.demand.claim import (
     SubjectKind,
     is_override_claim,
 )
-from demandops.demand.demand_request import ConnectionType
 from demandops.demand.lease import UNSTARTED
 
 
@@ -197,7 +198,11 @@ class Ledger:
 
     def connections_needing(self, node: str) -> tuple[str, ...]:
         """Return the connections that end at a node or name its broker, sorted."""
-        found = {id for kind in ConnectionType for id in self.connections_at(kind, node)}
+        found = {
+            id
+            for kind in connection_types.CONNECTION_TYPES
+            for id in self.connections_at(kind, node)
+        }
         return tuple(sorted(found | set(self._ids("broker", node))))
 
     def indexed_names(self, entry: str) -> set[str]:

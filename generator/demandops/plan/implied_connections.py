@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from demandops.config.config import Config
+from demandops.connections.route import Route
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
     DemandRequest,
     InputTopic,
 )
-from demandops.demand.route import Route
 from demandops.identifiers import topic_problem
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import outputs
@@ -107,25 +107,20 @@ def _connection(
     app: ApplicationDemand, source: str, topic: str, ledger: Ledger
 ) -> ConnectionDemand:
     assert app.connect is not None  # noqa: S101 - the caller checks it
+    own = ConnectionDemand(
+        id=f"derived/{source}/{app.node}",
+        type=app.connect,
+        source=source,
+        target=app.node,
+        topics=(Route(topic, topic),),
+        broker="",
+        requesters=app.requesters,
+        term=app.term,
+    )
     for id in ledger.connections_bringing(app.node, topic):
         for claim in ledger.connection_claims(id):
             route = claim.topics.get(topic)
             ends = (claim.source, claim.target)
             if ends == (source, app.node) and route is not None and not route.reverse:
-                return _demand(app, id, claim.type.value, source, route)
-    return _demand(app, f"derived/{source}/{app.node}", app.connect, source, Route(topic, topic))
-
-
-def _demand(
-    app: ApplicationDemand, id: str, kind: int, source: str, route: Route
-) -> ConnectionDemand:
-    return ConnectionDemand(
-        id=id,
-        type=kind,
-        source=source,
-        target=app.node,
-        topics=(route,),
-        broker="",
-        requesters=app.requesters,
-        term=app.term,
-    )
+                return replace(own, id=id, type=claim.type.number, topics=(route,))
+    return own

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from types import MappingProxyType
 
+from demandops import naming
 from demandops.config.appdef import ApplicationDefinition, Parameter, Scaling, Service
 from demandops.config.config import Config
 from demandops.config.override import Override
@@ -16,11 +17,10 @@ from demandops.demand.claim import ApplicationClaim
 from demandops.demand.demand_request import InputTopic
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import Ledger
-from demandops.plan import connection_clients, naming, parameters
-from demandops.plan.connection_clients import BridgeKey, EndKey
+from demandops.plan import connection_clients, parameters
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.suspended_claims import without_suspended
-from demandops.plan.release import Release, ServiceKey, ServiceRelease, node_and_domain
+from demandops.plan.release import Release, ServiceKey, ServiceRelease
 from demandops.plan.release_keys import (
     ReleaseKey,
     appdef_of,
@@ -52,11 +52,9 @@ def denied_release(
 
 
 def _unshaped(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
-    if isinstance(key, EndKey):
-        return connection_clients.connection_end(ledger, config, key)
-    if isinstance(key, BridgeKey):
-        return connection_clients.zenoh_bridge(ledger, config, key)
-    return _service(ledger, config, key)
+    if isinstance(key, ServiceKey):
+        return _service(ledger, config, key)
+    return connection_clients.client_at(ledger, config, key)
 
 
 def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease | None:
@@ -66,7 +64,7 @@ def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease 
     users = tuple(dict.fromkeys(claim.application for claim in claims))
     appdef = appdef_of(config, deciding_claim(ledger, users[0]).appdef)
     service = appdef.services[key.service]
-    node, domain = node_and_domain(config, key.node)
+    node, domain = config.node_and_domain(key.node)
     if service.each is not None:
         inputs = {service.each: _shared_input(claims, service.each, key)}
     else:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 from demandops.config.appdef import Service
-from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
-from demandops.config.inventory import Broker, Node
-from demandops.config.override import Override
+from demandops.config.config import CHARTS_FILE, Config
+from demandops.config.inventory import Node
+from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
-from demandops.config.registry import ChartSource, Image
-from demandops.demand.demand_request import ConnectionType, InputTopic
-from demandops.demand.route import Route
-from demandops.errors import Refused, fault
+from demandops.config.registry import ChartSource
+from demandops.connections.communication_client import Client
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import InputTopic
+from demandops.ledger.ledger import Ledger
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,41 +30,6 @@ class ServiceKey:
     application: str | None = None
     source: str | None = None
     topic: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Shaping:
-    """The overrides that shape a release, with the effects of each; the last one wins."""
-
-    by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
-
-    def image(self, image: str, config: Config) -> Image:
-        """Return an image of the registry, with the pins of overrides."""
-        found = config.images[image]
-        for override, effects in self.by:
-            if "images" in effects and override.images and image in override.images:
-                found = override.images[image].over(found)
-        return found
-
-    @property
-    def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """The files that patch values, and their patches."""
-        return tuple(
-            (override.path, override.values or {})
-            for override, effects in self.by
-            if "values" in effects
-        )
-
-    @property
-    def held(self) -> bool:
-        """Whether a ``hold`` applies that no higher override changes, so the file stays."""
-        held = False
-        for _, effects in self.by:
-            held = "hold" in effects or (held and set(effects) <= {"keep"})
-        return held
-
-
-UNSHAPED = Shaping()
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,98 +51,39 @@ class ServiceRelease:
     requesters: tuple[str, ...]
     shaping: Shaping = UNSHAPED
 
+    @property
+    def images(self) -> tuple[str, ...]:
+        """The registry's names of its images."""
+        return self.service.images
 
-@dataclass(frozen=True, slots=True)
-class ConnectionEnd:
-    """The desired state of one end of a connection: one communication client."""
+    @property
+    def description(self) -> str:
+        """What it is, for commit messages."""
+        return f"{self.key.service} on {self.node.id} for {self.key.source or self.key.application}"
 
-    type: ClassVar[ConnectionType]
+    def facts(self) -> list[str]:
+        """Return what people should know of it, one line each."""
+        return [
+            *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
+            *(f"{name} = {value}" for name, value in self.parameters.items()),
+            f"replicas {self.replicas}",
+        ]
 
-    connection: str
-    side: Literal["source", "target"]
-    name: str
-    node: Node
-    peer: str
-    domain: AccessDomain
-    topics: Mapping[str, Route]
-    shaping: Shaping = field(default=UNSHAPED, kw_only=True)
-
-    def reads(self, route: Route) -> bool:
-        """Return whether this end reads the topic from ROS, and the other end publishes it."""
-        return route.reverse is (self.side == "target")
-
-
-@dataclass(frozen=True, slots=True)
-class MqttEnd(ConnectionEnd):
-    """One end of an MQTT connection."""
-
-    type = ConnectionType.MQTT
-
-    broker: Broker
-    channel: str
-    """The prefix of this connection's MQTT topics, the same at both ends."""
+    def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
+        """Yield (file, entry, what it decides) for entries of the configuration that shape it."""
+        folder = f"appdefs/{self.appdef}"
+        yield f"{folder}/appdef.yaml", f"services.{self.key.service}", "what it is"
+        yield config.values_template(self.appdef, self.service), "", "its Helm values"
+        chart, name = self.chart, self.service.chart
+        where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
+        yield CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}"
 
 
-@dataclass(frozen=True, slots=True)
-class RosEnd(ConnectionEnd):
-    """One end of a ROS connection. Every route of ``topics`` has its message type."""
-
-    type = ConnectionType.ROS
-
-    listens: bool
-    address: Address
-    """The address of the end that listens, the same at both ends."""
+Release = ServiceRelease | Client
 
 
-@dataclass(frozen=True, slots=True)
-class Address:
-    """The host and port at which one DDS Router listens for the other."""
-
-    host: str
-    port: int
-    transport: str
-
-
-@dataclass(frozen=True, slots=True)
-class Bridge:
-    """The desired state of a node's Zenoh bridge, which serves all its Zenoh connections.
-
-    ``publishers`` are the topics that it reads from the node's ROS graph, ``subscribers`` those
-    that it publishes there. ``rates`` limits the messages per second of a topic that it reads.
-    """
-
-    name: str
-    node: Node
-    domain: AccessDomain
-    connections: tuple[str, ...]
-    publishers: tuple[str, ...]
-    subscribers: tuple[str, ...]
-    rates: Mapping[str, float]
-    connect: tuple[str, ...]
-    listen: tuple[str, ...]
-    shaping: Shaping = UNSHAPED
-
-
-Release = ServiceRelease | MqttEnd | RosEnd | Bridge
-
-
-def node_and_domain(config: Config, node_id: str) -> tuple[Node, AccessDomain]:
-    """Return a node and its access domain.
-
-    Raises:
-        Refused: if a node in use was removed from the inventory or its access domain.
-    """
-    node, domain = config.nodes.get(node_id), config.domain_of.get(node_id)
-    if node is None or domain is None:
-        missing = NODES_FILE if node is None else "any access domain"
-        raise Refused(
-            [
-                fault(
-                    "node",
-                    f"'{node_id}' is in use, but not in {missing}; restore it, or release "
-                    f"what it holds: demandops decommission {shlex.quote(node_id)}",
-                    code="unknown-node",
-                ).within(NODES_FILE if node is None else DOMAINS_FILE)
-            ]
-        )
-    return node, domain
+def claims_of(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
+    """Return the claims on the applications or connections that a release is for."""
+    if isinstance(release, ServiceRelease):
+        return tuple(c for id in release.applications for c in ledger.application_claims(id))
+    return tuple(c for id in release.connections for c in ledger.connection_claims(id))

@@ -12,15 +12,15 @@ from types import MappingProxyType
 
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
+from demandops.connections.communication_client import ClientKey
 from demandops.demand.claim import ApplicationClaim, Claim, Subject, SubjectKind
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.plan import connection_clients
-from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.overrides.suspended_claims import without_suspended
 from demandops.plan.release import ServiceKey
 
-ReleaseKey = ServiceKey | EndKey | BridgeKey
+ReleaseKey = ServiceKey | ClientKey
 
 
 def keys_of(

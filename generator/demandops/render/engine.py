@@ -26,9 +26,8 @@ from jinja2.environment import Template
 from jinja2.exceptions import TemplateNotFound, TemplateSyntaxError
 from jinja2.runtime import Undefined
 
-from demandops import strict_yaml
+from demandops import naming, strict_yaml
 from demandops.errors import InvalidInput, fault
-from demandops.plan import naming
 from demandops.render.template_sandbox import Sandbox
 from demandops.settings import data_folder
 

@@ -62,7 +62,8 @@ def _context(release: ServiceRelease, config: Config) -> dict[str, object]:
         "outputs": dict(release.outputs),
         "parameters": dict(release.parameters),
         "images": {
-            name: release.shaping.image(name, config).parts() for name in release.service.images
+            name: release.shaping.image(name, config.images).parts()
+            for name in release.service.images
         },
         "replicas": release.replicas,
     }

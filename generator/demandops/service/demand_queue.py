@@ -6,15 +6,17 @@ all. A demand is in the journal before the worker evaluates it.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import replace
 
-from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
+from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, StateRepoError, Withdrawn
 from demandops.service.ticket import ProposalRecord, Receipt, Ticket, ticket_from_journal
 from demandops.staterepo.write.journal import Journal
+
+log = logging.getLogger("demandops")
 
 TAKEN_BACK = "the demand was taken back before it was committed"
 
@@ -50,7 +52,8 @@ class DemandQueue:
     @property
     def unpublished(self) -> int:
         """How many demands are in the journal and do not await approval."""
-        return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
+        with self._changed:
+            return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
 
     def add(self, ticket: Ticket) -> None:
         """Add a demand.
@@ -106,16 +109,25 @@ class DemandQueue:
             if not self._not_journaled and not self._woken:
                 self._changed.wait(timeout)
             self._woken = False
-            return self._journal_new()
+            return self._journal_new([])
 
-    def _journal_new(self) -> list[Ticket]:
+    def _journal_new(self, batch: list[Ticket]) -> list[Ticket]:
+        """Journal what is not in the journal; if that fails, answer it with the error."""
         new = [
             ticket
             for ticket in self._not_journaled
             if ticket.state == "waiting" and ticket.operation not in self._journal.pending
         ]
-        self._journal.append(ticket.journal_entry() for ticket in new)
         self._not_journaled = []
+        try:
+            self._journal.append(ticket.journal_entry() for ticket in new)
+        except StateRepoError as error:
+            log.error("%s", error)
+            refused = set(new)
+            self._queue = deque(ticket for ticket in self._queue if ticket not in refused)
+            batch[:] = [ticket for ticket in batch if ticket not in refused]
+            self.fail(new, error, keep=True)
+            return []
         return new
 
     def set_proposal(self, ticket: Ticket, record: ProposalRecord) -> bool:
@@ -124,18 +136,19 @@ class DemandQueue:
         A demand that awaits approval can still be withdrawn.
         """
         with self._changed:
-            if ticket.state == "withdrawn":
+            if not ticket.can_become("proposed"):
                 return False
-            ticket.state, ticket.proposal = "waiting", record
-            self._journal.append([ticket.journal_entry()])
-        return True
+            self._journal.append([ticket.journal_entry(record)])
+            ticket.proposal = record
+            return ticket.become("proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
         """Queue demands again that no longer need approval."""
         with self._changed:
             for ticket in tickets:
-                ticket.proposal = None
                 self._journal.append([ticket.journal_entry()])
+                ticket.proposal = None
+                ticket.become("waiting")
                 self._queue.append(ticket)
             self._changed.notify()
 
@@ -144,19 +157,23 @@ class DemandQueue:
         with self._changed:  # keep the lock while journaling, so that none is withdrawn in between
             room = limit - len(batch)
             batch += [self._queue.popleft() for _ in range(min(room, len(self._queue)))]
-            self._journal_new()
+            self._journal_new(batch)
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand; return False if it is committed or unknown."""
+        """Withdraw a demand; return False if it is too late or impossible."""
         with self._changed:
             ticket = self._tickets.get(operation)
-            if ticket is None or ticket.state != "waiting":
+            if ticket is None or not ticket.can_become("withdrawn"):
                 return ticket is not None and ticket.state == "withdrawn"
-            if ticket.proposal is not None:
-                self._withdraw_proposed(ticket, TAKEN_BACK)
-                return True
-            ticket.state = "withdrawn"
-            self._journal.mark_done([operation], durably=True)  # a restart must not resume it
+            try:
+                if ticket.state == "proposed":
+                    self._withdraw_proposed(ticket, TAKEN_BACK)
+                    return True
+                self._journal.mark_done([operation], durably=True)  # a restart must not resume it
+            except StateRepoError as error:
+                log.error("demand %s cannot be withdrawn: %s", operation, error)
+                return False
+            ticket.become("withdrawn")
             self._woken = True
             self._changed.notify()  # the worker answers it even while nothing can be published
         return True
@@ -169,20 +186,19 @@ class DemandQueue:
 
     def _withdraw_proposed(self, ticket: Ticket, reason: str) -> None:
         """Keep the demand in the journal until its branch is deleted, so that none merges it."""
-        if ticket.proposal is None or ticket.state != "waiting":
+        if ticket.proposal is None or ticket.state != "proposed":
             return
-        ticket.state = "withdrawn"
-        ticket.proposal = replace(ticket.proposal, withdrawn=reason)
-        self._journal.append([ticket.journal_entry()])
+        record = replace(ticket.proposal, withdrawn=reason)
+        self._journal.append([ticket.journal_entry(record)])
+        ticket.proposal = record
+        ticket.become("withdrawn")
         self._woken = True
         self._changed.notify()
 
     def mark_committed(self, ticket: Ticket) -> bool:
         """Refuse further withdrawals of a demand; return False if it was withdrawn before."""
         with self._changed:
-            if ticket.state != "withdrawn":
-                ticket.state = "committed"
-            return ticket.state == "committed"
+            return ticket.become("committed")
 
     def answer_withdrawn(self, batch: list[Ticket]) -> None:
         """Answer withdrawn demands at once, because the remote may be unreachable for long.
@@ -191,20 +207,27 @@ class DemandQueue:
         """
         with self._changed:
             withdrawn = [ticket for ticket in [*batch, *self._queue] if _is_withdrawn(ticket)]
-            if withdrawn:
-                self._queue = deque(t for t in self._queue if not _is_withdrawn(t))
-                batch[:] = [ticket for ticket in batch if not _is_withdrawn(ticket)]
-        for ticket in withdrawn:
-            self._forget(ticket)
-            ticket.future.set_exception(Withdrawn(TAKEN_BACK))
+            if not withdrawn:
+                return
+            self._queue = deque(t for t in self._queue if not _is_withdrawn(t))
+            batch[:] = [ticket for ticket in batch if not _is_withdrawn(ticket)]
+        self.fail(withdrawn, Withdrawn(TAKEN_BACK))
 
-    def answer(self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]]) -> None:
-        """Answer each demand with its result and remove it from the journal."""
-        results = list(results)
+    def answer(
+        self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
+    ) -> None:
+        """Answer each demand with its result and remove it from the journal, unless ``keep``.
+
+        A demand is answered once: a later result is dropped.
+        """
         with self._changed:
-            self._journal.mark_done(ticket.operation for ticket, _ in results)
+            results = [(ticket, result) for ticket, result in results if ticket.can_become("done")]
+            if not keep:
+                self._journal.mark_done(ticket.operation for ticket, _ in results)
+            for ticket, _ in results:
+                ticket.become("done")
+                self._tickets.pop(ticket.operation, None)
         for ticket, result in results:
-            self._forget(ticket)
             if isinstance(result, Receipt):
                 ticket.notify("pushed", f"pushed {result.commit}")
                 ticket.future.set_result(result)
@@ -212,19 +235,8 @@ class DemandQueue:
                 ticket.future.set_exception(result)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
-        """Answer every demand of a batch with an error; ``keep`` leaves them in the journal."""
-        batch = list(batch)
-        if not keep:
-            with self._changed, suppress(OSError):  # a full disk must not prevent the answer
-                self._journal.mark_done(ticket.operation for ticket in batch)
-        for ticket in batch:
-            self._forget(ticket)
-            ticket.future.set_exception(error)
-
-    def _forget(self, ticket: Ticket) -> None:
-        with self._changed:
-            ticket.state = "done"
-            self._tickets.pop(ticket.operation, None)
+        """Answer every demand of a batch with an error."""
+        self.answer([(ticket, error) for ticket in batch], keep)
 
 
 def _is_withdrawn(ticket: Ticket) -> bool:

@@ -20,7 +20,7 @@ from demandops.staterepo.git import repository_choice
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.write import commit_batch
-from demandops.staterepo.write.journal import Slot
+from demandops.staterepo.write.slot import Slot
 
 log = logging.getLogger("demandops")
 
@@ -220,6 +220,8 @@ class Generator:
             except ShuttingDown as error:
                 self._queue.fail(batch, error, keep=True)
             except DemandOpsError as error:
+                if not batch:  # nobody gets it as an answer
+                    log.error("%s", error)
                 self._queue.fail(batch, error)
             except Exception as error:
                 log.exception("internal error")

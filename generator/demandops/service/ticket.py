@@ -24,6 +24,21 @@ Stage = Literal["away", "admitted", "booked", "committed", "proposed", "pushed"]
 """``away``: the state repo cannot be reached or written; the text says why."""
 Listener = Callable[[Stage, str], None]
 
+State = Literal["waiting", "committed", "proposed", "withdrawn", "done"]
+_NEXT: dict[State, tuple[State, ...]] = {
+    "waiting": ("committed", "proposed", "withdrawn", "done"),
+    "committed": ("committed", "proposed", "done"),
+    "proposed": ("proposed", "waiting", "withdrawn", "done"),
+    "withdrawn": ("done",),
+    "done": (),
+}
+"""Which states may follow a state of a demand; only the queue changes it, under its lock.
+
+``waiting``: it may be evaluated. ``committed``: it has a commit that may be published already, so
+it is evaluated until it has an answer. ``proposed``: it awaits approval. ``withdrawn``: the
+requester took it back, or another demand replaced it. ``done``: it is answered.
+"""
+
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
 
@@ -79,12 +94,22 @@ class Ticket:
     future: Future[Receipt] = field(default_factory=Future)
     base: str = ""
     maybe_published: bool = False
-    state: Literal["waiting", "committed", "withdrawn", "done"] = "waiting"
+    state: State = "waiting"
     notified: set[str] = field(default_factory=set)
     proposal: ProposalRecord | None = None
 
     def __post_init__(self) -> None:
         self.future.set_running_or_notify_cancel()  # a demand is withdrawn, not canceled
+
+    def can_become(self, state: State) -> bool:
+        """Return whether a state may follow the current one."""
+        return state in _NEXT[self.state]
+
+    def become(self, state: State) -> bool:
+        """Change the state; return False, and leave it, if that one may not follow."""
+        if self.can_become(state):
+            self.state = state
+        return self.state == state
 
     def notify(self, stage: Stage, text: str) -> None:
         """Report each stage once, even if the demand is evaluated again.
@@ -105,12 +130,10 @@ class Ticket:
         if not self.maybe_published:
             self.base, self.maybe_published = base, True
 
-    def journal_entry(self) -> JournalEntry:
+    def journal_entry(self, proposal: ProposalRecord | None = None) -> JournalEntry:
         """Return what the journal keeps of the demand."""
-        proposal = asdict(self.proposal) if self.proposal else None
-        return JournalEntry(
-            self.operation, self.goal, self.received.isoformat(), self.base, proposal
-        )
+        record = asdict(proposal) if proposal else None
+        return JournalEntry(self.operation, self.goal, self.received.isoformat(), self.base, record)
 
 
 def new_ticket(goal: object, operation: str | None, listener: Listener) -> Ticket:
@@ -138,4 +161,5 @@ def ticket_from_journal(entry: JournalEntry) -> Ticket:
     if entry.proposal is not None:
         record = entry.proposal
         ticket.proposal = ProposalRecord(**{**record, "commits": tuple(record["commits"])})
+        ticket.state = "withdrawn" if ticket.proposal.withdrawn else "proposed"
     return ticket

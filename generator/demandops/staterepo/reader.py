@@ -32,8 +32,8 @@ from demandops.staterepo.load import (
 )
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
-from demandops.staterepo.write.journal import Slot
 from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
+from demandops.staterepo.write.slot import Slot
 
 
 class Reader:

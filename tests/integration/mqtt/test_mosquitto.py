@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from tests.integration.mqtt.conftest import PASSWORD, USER, Broker, Client, Pod
-from tests.kit.carriers import routes
+from tests.kit.connections import routes
 from tests.kit.memory import MemoryRepo
 
 DEMAND: dict[str, Any] = {

@@ -22,7 +22,7 @@ from tests.kit import rig
 from tests.kit.generator import Proposed
 from tests.kit.git_over_http import serving
 from tests.kit.repo import Person, branches
-from tests.kit.rig import git, goal, leave
+from tests.kit.rig import Gate, git, goal, leave
 
 
 @pytest.fixture(autouse=True)
@@ -133,6 +133,30 @@ def test_a_demand_that_waits_can_be_taken_back(url: str, bare: Path, petra: Pers
             rig.receipt(proposed.ticket)
         assert branches(bare) == []
     assert rig.claims(bare) == []
+
+
+def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
+    bare: Path, petra: Person
+) -> None:
+    gate = Gate()
+    with rig.running(bare) as generator:
+
+        def fill_disk(done: object) -> None:
+            journal = generator._slot.journal
+            journal._file = Path("/dev/full").open("ab", buffering=0)  # noqa: SIM115
+
+        waiting = generator.submit(goal(0), "op-0", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        refused = generator.submit({}, "op-1")
+        refused.future.add_done_callback(fill_disk)
+        unlucky = generator.submit(goal(1), "op-2")
+        gate.open.set()
+        with pytest.raises(Refused):
+            rig.receipt(refused)
+        with pytest.raises(StateRepoError, match="cannot be written"):
+            rig.receipt(unlucky)
+        assert Proposed(generator, goal(2), "op-3").branch in branches(bare)
+        assert not waiting.future.done()
 
 
 def test_a_proposal_outlives_the_generator(address: str, bare: Path, petra: Person) -> None:

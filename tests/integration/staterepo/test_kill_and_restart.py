@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +11,10 @@ from random import Random
 
 import pytest
 from demandops.service import Generator
+from demandops.staterepo.write.journal import DamagedJournal
 
 from tests.kit import rig
+from tests.kit.cli import Run
 from tests.kit.rig import Drivers, Told, demand, goal, leave
 
 pytestmark = pytest.mark.synced
@@ -246,32 +249,76 @@ def _leave_pending(url: str, bare: Path, numbers: list[int]) -> None:
     away.rename(bare)
 
 
-NOT_TEXT = b"\x00\xff\xfe not text \x9c\n"
-OTHER_SHAPES = b'42\nnull\n"done"\n[]\n{}\n{"done": []}\n{"operation": []}\n'
-BAD_TIME = b'{"operation": "op-x", "goal": {}, "received": "soon", "base": ""}\n'
+def _torn(text: bytes) -> bytes:
+    return text + text.splitlines()[-1][: len(text) // 5]
 
 
-@pytest.mark.parametrize("whose", ["own", "orphan"])
-def test_a_journal_is_taken_up_whatever_a_crash_left_in_it(
-    url: str, bare: Path, data_home: Path, whose: str
-) -> None:
+def _of_the_first_version(text: bytes) -> bytes:
+    return re.sub(rb', "digest": "\w+"', b"", text)
+
+
+TAKEN_UP: list[Callable[[bytes], bytes]] = [bytes, _torn, _of_the_first_version]
+
+
+def _leave_journal(url: str, bare: Path, data_home: Path, whose: str) -> Path:
+    """Leave the journal of demands 1 and 2 to the next process, or to that of another slot."""
     _leave_pending(url, bare, [1, 2])
     journal = next(data_home.glob("*/slot-0/outbox.jsonl"))
-    first, second = journal.read_bytes().splitlines(keepends=True)
-    text = NOT_TEXT + first + OTHER_SHAPES + BAD_TIME + second + second[: len(second) // 3]
-    if whose == "orphan":
-        slot = journal.parent.with_name("slot-7")
-        slot.mkdir()
-        (slot / "outbox.jsonl").write_bytes(text)
-        journal.unlink()
-    else:
-        journal.write_bytes(text)
+    if whose == "own":
+        return journal
+    slot = journal.parent.with_name("slot-7")
+    slot.mkdir()
+    return journal.rename(slot / journal.name)
 
+
+@pytest.mark.parametrize("change", TAKEN_UP, ids=lambda change: change.__name__.strip("_"))
+@pytest.mark.parametrize("whose", ["own", "orphan"])
+def test_a_journal_is_taken_up_as_a_crash_left_it(
+    url: str, bare: Path, data_home: Path, change: Callable[[bytes], bytes], whose: str
+) -> None:
+    journal = _leave_journal(url, bare, data_home, whose)
+    journal.write_bytes(change(journal.read_bytes()))
     with rig.running(url) as generator:
         rig.book(generator, goal(3))
     assert {"op-1", "op-2"} < set(rig.operations(bare))
     assert len(rig.operations(bare)) == 3
     rig.assert_sound(bare)
+
+
+@pytest.mark.parametrize("whose", ["own", "orphan"])
+def test_a_damaged_journal_stops_the_start_until_it_is_set_aside(
+    url: str, bare: Path, data_home: Path, whose: str, demandops: Run
+) -> None:
+    journal = _leave_journal(url, bare, data_home, whose)
+    text = journal.read_bytes().replace(b"op-1", b"op-9")
+    journal.write_bytes(text)
+    for _ in range(2):
+        with pytest.raises(DamagedJournal) as error:
+            Generator(url)
+        assert str(error.value).startswith(f"{journal}: line 1 is not what the generator wrote")
+    command = ("journal", "--state-repo", url)
+    listed = demandops(*command)
+    assert listed.code == 1
+    assert "demandops journal --set-aside" in listed.err
+    (row,) = demandops(*command, "--set-aside", "--output", "json").json()
+    assert Path(row["set_aside"]).read_bytes() == text
+    assert [each["operation"] for each in row["demands"]] == ["op-9", "op-2"]
+    assert row["demands"][1]["goal"] == goal(2)
+    with rig.running(url) as generator:
+        rig.receipt(generator.submit(row["demands"][1]["goal"], "op-2"))
+    assert rig.operations(bare) == ["op-2"]
+    rig.assert_sound(bare)
+
+
+def test_the_accepted_demands_are_listed(url: str, bare: Path, demandops: Run) -> None:
+    _leave_pending(url, bare, [1])
+    listed = demandops("journal", "--state-repo", url).out.splitlines()
+    assert listed[0].startswith("op-1  received 20")
+    assert listed[1] == "1 demand is accepted and not published"
+    assert rig.restart(url)
+    assert demandops("journal", "--state-repo", url).out == (
+        "0 demands are accepted and not published\n"
+    )
 
 
 @pytest.mark.parametrize("whose", ["own", "orphan"])

@@ -20,7 +20,8 @@ from demandops.demand.claim import Claim
 from demandops.errors import Refused
 from demandops.service import Generator, worker
 from demandops.service.timing.lease_expiry import LeaseClock
-from demandops.staterepo.write import journal
+from demandops.staterepo.write.journal import JournalEntry
+from demandops.staterepo.write.slot import Slot
 
 from tests.kit import rig
 from tests.kit.repo import GitRepo, Person
@@ -107,10 +108,8 @@ def ends(generator: Generator, demand: str) -> datetime:
 
 def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:
     """Have a demand wait that a generator took in and could not settle before it was killed."""
-    slot = journal.Slot(settings.data_home(str(repo)))
-    slot.journal.append(
-        [journal.JournalEntry(operation, goal, received.isoformat(), rig.tip(repo))]
-    )
+    slot = Slot(settings.data_home(str(repo)))
+    slot.journal.append([JournalEntry(operation, goal, received.isoformat(), rig.tip(repo))])
     slot.close()
 
 

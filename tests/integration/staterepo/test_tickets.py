@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, Withdrawn
+from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, StateRepoError, Withdrawn
 from demandops.service import Generator, Ticket
 
 from tests.kit import rig
@@ -273,14 +273,15 @@ def test_a_journal_that_cannot_be_written_fails_the_demand_and_works_again_later
     bare: Path,
 ) -> None:
     with rig.running(bare) as generator:
-        outbox = generator._slot.journal
-        journal, outbox._file = outbox._file, Path("/dev/full").open("a")  # noqa: SIM115
+        journal = generator._slot.journal
+        file, journal._file = journal._file, Path("/dev/full").open("ab", buffering=0)  # noqa: SIM115
         ticket = generator.submit(goal(1))
-        with pytest.raises(DemandOpsError):
+        with pytest.raises(
+            StateRepoError, match=r"outbox\.jsonl cannot be written: No space left on device; check"
+        ):
             rig.receipt(ticket, timeout=5)
-        with suppress(OSError):
-            outbox._file.close()
-        outbox._file = journal
+        journal._file.close()
+        journal._file = file
         rig.book(generator, goal(2))
     assert rig.books(bare) == rig.books_after([goal(2)])
 

@@ -155,8 +155,8 @@ def test_the_apis_address_follows_from_the_projects(
 ) -> None:
     made = forge_for(Proposals.model_validate({"forge": kind, "url": url}), token)
     assert made is not None
-    assert made._api._address == address  # type: ignore[attr-defined]
-    assert made._pulls == "/repos/its/state/pulls"  # type: ignore[attr-defined]
+    assert made._api == address
+    assert made._pulls == "/repos/its/state/pulls"
 
 
 @pytest.mark.parametrize("forge", ["none", "gitlab"])

@@ -5,6 +5,9 @@ from __future__ import annotations
 from datetime import datetime, timedelta, timezone
 from types import MappingProxyType
 
+from demandops.connections.connection_types import CONNECTION_TYPES
+from demandops.connections.mqtt import MQTT
+from demandops.connections.route import Route, merge_routes
 from demandops.demand.claim import (
     ApplicationClaim,
     Claim,
@@ -14,8 +17,7 @@ from demandops.demand.claim import (
     SubjectKind,
     demand_id,
 )
-from demandops.demand.demand_request import ConnectionType, InputTopic, id_problem
-from demandops.demand.route import Route, merge_routes
+from demandops.demand.demand_request import InputTopic, id_problem
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from hypothesis import given
@@ -49,7 +51,6 @@ topics = st.from_regex(r"(/[a-zA-Z_][a-zA-Z0-9_]{0,6}){1,3}", fullmatch=True)
 moments = st.datetimes(datetime(2000, 1, 1), datetime(2100, 1, 1), timezones=st.just(timezone.utc))
 people = st.lists(ids, min_size=1, max_size=4, unique=True).map(lambda who: tuple(sorted(who)))
 inputs = st.lists(st.builds(InputTopic, topics, ids, st.just("") | ids), min_size=1, max_size=4)
-CONCRETE = [kind for kind in ConnectionType if kind is not ConnectionType.AUTO]
 routes = st.builds(
     Route,
     topics,
@@ -107,7 +108,7 @@ def connection_claims(draw: st.DrawFn) -> ConnectionClaim:
         request=request,
         requesters=who,
         booked=draw(moments),
-        type=draw(st.sampled_from(CONCRETE)),
+        type=draw(st.sampled_from(CONNECTION_TYPES)),
         source=draw(ids),
         target=draw(ids),
         broker=draw(st.just("") | ids),
@@ -161,7 +162,7 @@ def test_a_time_is_the_same_moment_in_any_zone(moment: datetime, hours: int) -> 
         request="",
         requesters=("c",),
         booked=here,
-        type=ConnectionType.MQTT,
+        type=MQTT,
         source="d",
         target="e",
         broker="",

@@ -12,11 +12,12 @@ from types import MappingProxyType
 from typing import Any
 
 from demandops.config.load import load
+from demandops.connections.connection_types import CONNECTION_TYPES
+from demandops.connections.route import Route, merge_routes
 from demandops.decision import Decision, State
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim
-from demandops.demand.demand_request import ConnectionType, InputTopic
+from demandops.demand.demand_request import InputTopic
 from demandops.demand.lease import LONGEST_S, Lease
-from demandops.demand.route import Route, merge_routes
 from demandops.identifiers import id_problem
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
@@ -296,7 +297,7 @@ routes = st.builds(Route, topics, topics, reverse=st.booleans(), qos=st.integers
 connections = st.builds(
     ConnectionClaim,
     connection=ids,
-    type=st.sampled_from([ConnectionType.MQTT, ConnectionType.ZENOH, ConnectionType.ROS]),
+    type=st.sampled_from(CONNECTION_TYPES),
     source=ids,
     target=ids,
     broker=st.just("") | ids,

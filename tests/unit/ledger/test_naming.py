@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import MappingProxyType
 
+from demandops import naming
 from demandops.config.inventory import Node
 from demandops.decision import Decision
 from demandops.demand.demand_request import id_problem
-from demandops.plan import naming
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -9,14 +9,17 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.connections.connection_type import ConnectionType
+from demandops.connections.mqtt import MQTT
+from demandops.connections.ros import ROS
+from demandops.connections.route import Route, merge_routes
+from demandops.connections.zenoh import ZENOH
 from demandops.demand.claim import ConnectionClaim, demand_id
 from demandops.demand.demand_request import (
     ConnectionDemand,
-    ConnectionType,
     DemandRequest,
     Operation,
 )
-from demandops.demand.route import Route, merge_routes
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger import claim_file
 from demandops.ledger.apply import apply
@@ -26,7 +29,7 @@ NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
 STRING = "std_msgs/msg/String"
 
 
-def claim(*routes: Route, kind: ConnectionType = ConnectionType.MQTT) -> ConnectionClaim:
+def claim(*routes: Route, kind: ConnectionType = MQTT) -> ConnectionClaim:
     return ConnectionClaim(
         connection="c",
         demand=demand_id("r", ["v"]),
@@ -42,7 +45,7 @@ def claim(*routes: Route, kind: ConnectionType = ConnectionType.MQTT) -> Connect
 
 
 def joined(ledger: Ledger, *routes: Route, who: str = "v", **more: Any) -> Ledger:
-    asked = ConnectionDemand("c", ConnectionType.MQTT.value, "s", "t", routes, "", (who,))
+    asked = ConnectionDemand("c", MQTT.number, "s", "t", routes, "", (who,))
     asked = replace(asked, **more)
     request = DemandRequest("r", Operation.JOIN, connections=(asked,))
     return apply(ledger, request, NOW)[0]
@@ -159,11 +162,11 @@ def test_what_is_carried_back_arrives_at_the_source() -> None:
     assert not ledger.is_carried_to("t", "/d")
 
 
-@pytest.mark.parametrize("kind", [ConnectionType.ZENOH, ConnectionType.ROS])
+@pytest.mark.parametrize("kind", [ZENOH, ROS])
 def test_links_are_known_at_both_nodes_as_long_as_somebody_holds_them(kind: ConnectionType) -> None:
-    ledger = joined(Ledger(), Route("/a", "/a"), type=kind.value)
-    ledger = joined(ledger, Route("/a", "/a"), type=kind.value, who="w")
-    ledger = joined(ledger, Route("/a", "/a"), type=kind.value, id="d", target="u")
+    ledger = joined(Ledger(), Route("/a", "/a"), type=kind.number)
+    ledger = joined(ledger, Route("/a", "/a"), type=kind.number, who="w")
+    ledger = joined(ledger, Route("/a", "/a"), type=kind.number, id="d", target="u")
     first, second = ledger.connection_claims("c")
     assert (ledger.connections_at(kind, "s"), ledger.connections_at(kind, "t")) == (
         ("c", "d"),

@@ -210,5 +210,5 @@ def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
     values: Any = {}
     for _, patch in shaped.shaping.patches:
         values = merge_patch(values, patch)
-    images = {name: shaped.shaping.image(name, config()) for name in release.service.images}
+    images = {name: shaped.shaping.image(name, config().images) for name in release.service.images}
     return shaped.replicas, shaped.node, shaped.shaping.held, repr(_sorted(values)), images

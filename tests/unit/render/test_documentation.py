@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 import yaml
-from demandops.demand import connection_type_choice
-from demandops.demand.route import RouteOptions
+from demandops.connections.connection_types import CONNECTION_TYPES
+from demandops.connections.route import RouteOptions
 
 from tests.kit.config import skeleton
 from tests.kit.memory import MemoryRepo
@@ -53,7 +53,7 @@ def test_every_field_of_a_route_is_explained_with_the_types_that_honour_it() -> 
     rows = re.findall(r"^\| `(\w+)`[^|]*\|[^|]*\| ([^|]*) \|$", PAGE, re.MULTILINE)
     told = {name: row for name, row in rows if name in RouteOptions.model_fields}
     assert told.keys() == RouteOptions.model_fields.keys()
-    for kind, options in connection_type_choice.SUPPORTED_OPTIONS.items():
+    for kind in CONNECTION_TYPES:
         label = {"MQTT": "MQTT", "ZENOH": "Zenoh", "ROS": "ROS"}[kind.name]
         listed = {name for name, row in told.items() if label in row and name != "type"}
-        assert listed == options
+        assert listed == kind.options

@@ -7,10 +7,10 @@ from datetime import timedelta
 from types import MappingProxyType
 
 import pytest
+from demandops.connections.mqtt import MQTT
+from demandops.connections.route import Route
 from demandops.demand.claim import ConnectionClaim
-from demandops.demand.demand_request import ConnectionType
 from demandops.demand.lease import Lease
-from demandops.demand.route import Route
 from demandops.ledger.ledger import Ledger
 from demandops.service.timing.lease_expiry import LeaseClock
 
@@ -26,7 +26,7 @@ def leased(*terms: tuple[str, int, int]) -> Ledger:
             request=demand,
             requesters=("a",),
             booked=START,
-            type=ConnectionType.MQTT,
+            type=MQTT,
             source="vehicle00",
             target="edge",
             broker="",

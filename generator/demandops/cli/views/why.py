@@ -111,7 +111,7 @@ def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Ma
         return _by_path(repo, snapshot, name)
     ledger, config = snapshot.state.ledger, snapshot.state.config
     known = {
-        *explanation.release_names(ledger, config),
+        *(release.name for release in explanation.releases(ledger, config)),
         *repo.stopped_release_names(str(snapshot.commit)),
     }
     known |= {id for each in SubjectKind for id in ledger.subjects(each)}

@@ -12,7 +12,6 @@ from demandops.ledger import claim_file
 from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
-from demandops.render.changes.changeset import describe_change
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load.snapshot import Snapshot
@@ -27,7 +26,7 @@ def release(snapshot: Snapshot, running: Release) -> dict[str, Any]:
     claims = explanation.claims_behind(without_suspended(ledger, config), running)
     return {
         "runs": True,
-        "what": describe_change(None, running, existed=False).description,
+        "what": running.description,
         **_where(running),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
         "claims": [_claim(claim, config) for claim in claims],
@@ -43,7 +42,7 @@ def denied(stopped: Release, by: Override) -> dict[str, Any]:
     """Return why a release does not run although claims request it."""
     return {
         "runs": False,
-        "what": describe_change(None, stopped, existed=False).description,
+        "what": stopped.description,
         **_where(stopped),
         "denied_by": _override(by, ("deny",)),
     }
@@ -53,14 +52,14 @@ def subject(snapshot: Snapshot, claimed: Subject) -> dict[str, Any]:
     """Return the claims on an application or a connection, and the releases that it needs."""
     ledger, config = snapshot.state.ledger, snapshot.state.config
     claims = sorted(ledger.claims_on(claimed), key=lambda claim: claim.booked)
-    releases = explanation.releases_of(ledger, config, claimed)
     return {
         "runs": any(suspended_by(claim, config) is None for claim in claims),
         "what": str(claimed),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
         "claims": [_claim(claim, config) for claim in claims],
         "releases": [
-            {"name": each.name, **_where(each), "file": path_of(each)} for each in releases
+            {"name": each.name, **_where(each), "file": path_of(each)}
+            for each in explanation.releases(ledger, config, claimed)
         ],
     }
 

@@ -8,12 +8,11 @@ from datetime import datetime
 from types import MappingProxyType
 from typing import TypeVar
 
-from demandops.demand import route as routes
+from demandops.connections import route as routes
 from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim
 from demandops.demand.demand_request import (
     ApplicationDemand,
     ConnectionDemand,
-    ConnectionType,
     InputTopic,
 )
 from demandops.demand.lease import renewed
@@ -55,13 +54,14 @@ def connection_claim(
     connection: ConnectionDemand, request: str, demand: str, current: Claim | None, now: datetime
 ) -> ConnectionClaim:
     """Return the claim that books a connection; arguments as for :func:`application_claim`."""
+    assert connection.chosen_type is not None  # noqa: S101 - admission refuses others
     claim = ConnectionClaim(
         connection=connection.id,
         demand=demand,
         request=request,
         requesters=tuple(sorted(set(connection.requesters))),
         booked=now,
-        type=ConnectionType(connection.type),
+        type=connection.chosen_type,
         source=connection.source,
         target=connection.target,
         broker=connection.broker,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from demandops.demand import route as routes
+from demandops.connections import route as routes
+from demandops.connections.route import Route
 from demandops.demand.claim import ApplicationClaim, ConnectionClaim, Subject, SubjectKind
-from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, ConnectionType
-from demandops.demand.route import Route
+from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand
 from demandops.errors import Fault, fault
 from demandops.ledger.ledger import Ledger
 
@@ -46,7 +46,7 @@ def connection_conflicts(where: str, demanded: ConnectionDemand, ledger: Ledger)
     for claim in ledger.connection_claims(demanded.id):
         held = f"'{demanded.id}' is held by {', '.join(claim.requesters)}"
         for name, new, current in (
-            ("type", ConnectionType(demanded.type).name, claim.type.name),
+            ("type", str(demanded.chosen_type), claim.type.name),
             ("source", demanded.source, claim.source),
             ("target", demanded.target, claim.target),
             ("broker", demanded.broker, claim.broker),

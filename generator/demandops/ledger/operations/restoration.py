@@ -134,7 +134,7 @@ def _request_for(claim: Claim) -> DemandRequest:
     else:
         connection = ConnectionDemand(
             id=claim.connection,
-            type=claim.type.value,
+            type=claim.type.number,
             source=claim.source,
             target=claim.target,
             topics=tuple(claim.topics.values()),

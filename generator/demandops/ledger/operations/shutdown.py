@@ -18,9 +18,9 @@ from demandops.demand.claim import (
     demand_id,
 )
 from demandops.demand.demand_request import (
+    AUTO,
     ApplicationDemand,
     ConnectionDemand,
-    ConnectionType,
     DemandRequest,
     InputTopic,
 )
@@ -86,7 +86,7 @@ def _same_ends(claim: Claim, listed: Demanded) -> bool:
         return (
             listed.source in ("", claim.source)
             and listed.target in ("", claim.target)
-            and listed.type in (ConnectionType.AUTO.value, claim.type.value)
+            and listed.type in (AUTO, claim.type.number)
         )
     return False
 

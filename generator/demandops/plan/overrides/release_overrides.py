@@ -8,28 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from demandops.config.config import DDS_ROUTER_IMAGE, MQTT_CLIENT_IMAGE, ZENOH_BRIDGE_IMAGE, Config
-from demandops.config.override import Override
+from demandops.config.config import Config
+from demandops.config.override import Override, Shaping
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.selectors import Traits, selects
 from demandops.plan.overrides.suspended_claims import denied_by
-from demandops.plan.release import (
-    Bridge,
-    MqttEnd,
-    Release,
-    RosEnd,
-    ServiceRelease,
-    Shaping,
-    node_and_domain,
-)
-
-_CLIENT_IMAGES: dict[type[MqttEnd | RosEnd | Bridge], str] = {
-    MqttEnd: MQTT_CLIENT_IMAGE,
-    RosEnd: DDS_ROUTER_IMAGE,
-    Bridge: ZENOH_BRIDGE_IMAGE,
-}
+from demandops.plan.release import Release, ServiceRelease, claims_of
 
 
 def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release | None:
@@ -40,7 +26,7 @@ def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release
     """
     if not config.active_overrides:
         return release
-    claims = _claims(release, ledger)
+    claims = claims_of(release, ledger)
     traits = _traits(release, claims)
     if service_denied_by(release, ledger, config) is not None:
         return None
@@ -65,7 +51,7 @@ def service_denied_by(release: Release, ledger: Ledger, config: Config) -> Overr
         one.deny for one in config.active_overrides
     ):
         return None
-    return denied_by(_traits(release, _claims(release, ledger)), config)
+    return denied_by(_traits(release, claims_of(release, ledger)), config)
 
 
 def apply_effects(
@@ -85,32 +71,20 @@ def apply_effects(
         if "replicas" in effects and override.replicas is not None:
             release = replace(release, replicas=override.replicas)
         if "node" in effects:
-            node, domain = node_and_domain(config, str(override.node))
+            node, domain = config.node_and_domain(str(override.node))
             release = replace(release, node=node, domain=domain)
     return release
 
 
 def effects_on(release: Release, override: Override, config: Config) -> tuple[str, ...]:
     """Return the effects that an override has on a release that it selects."""
+    possible = {"hold"}
     if isinstance(release, ServiceRelease):
-        images = set(release.service.images)
         known = config.charts[release.service.chart].versions()
-        possible = {"values", "replicas", "node", "hold"}
+        possible |= {"values", "replicas", "node"}
         possible |= {"version"} if override.version in known else set()
-    else:
-        images = {_CLIENT_IMAGES[type(release)]}
-        possible = {"hold"}
-    possible |= {"images"} if images & {*(override.images or ())} else set()
+    possible |= {"images"} if {*release.images} & {*(override.images or ())} else set()
     return tuple(name for name in override.effects() if name in possible)
-
-
-def _claims(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
-    if isinstance(release, ServiceRelease):
-        return tuple(
-            claim for app in release.applications for claim in ledger.application_claims(app)
-        )
-    names = release.connections if isinstance(release, Bridge) else (release.connection,)
-    return tuple(claim for name in names for claim in ledger.connection_claims(name))
 
 
 def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:
@@ -125,5 +99,4 @@ def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:
             service=release.key.service,
         )
     requesters = {who for claim in claims for who in claim.requesters}
-    names = release.connections if isinstance(release, Bridge) else (release.connection,)
-    return Traits(nodes, tuple(sorted(requesters)), connections=names)
+    return Traits(nodes, tuple(sorted(requesters)), connections=release.connections)

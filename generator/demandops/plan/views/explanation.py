@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from demandops.config.config import (
-    BROKERS_FILE,
-    CHARTS_FILE,
-    DDS_ROUTER_IMAGE,
     DOMAINS_FILE,
     IMAGES_FILE,
-    MQTT_CLIENT_IMAGE,
     NODES_FILE,
-    ZENOH_BRIDGE_IMAGE,
     Config,
 )
 from demandops.config.override import OVERRIDES_ROOT, Override
@@ -22,7 +17,7 @@ from demandops.demand.claim import ApplicationClaim, Claim, Subject, demand_id, 
 from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import denied_release, plan
-from demandops.plan.release import Bridge, MqttEnd, Release, ServiceRelease
+from demandops.plan.release import Release, ServiceRelease, claims_of
 from demandops.plan.release_keys import all_keys, keys_of
 
 
@@ -35,24 +30,15 @@ class ShapingFile:
     what: str
 
 
+def releases(ledger: Ledger, config: Config, subject: Subject | None = None) -> Iterator[Release]:
+    """Yield the releases that run, all or those that claims on ``subject`` need."""
+    keys = keys_of(ledger, config, subject) if subject else all_keys(ledger, config)
+    yield from filter(None, (plan(ledger, config, key) for key in dict.fromkeys(keys)))
+
+
 def release_named(ledger: Ledger, config: Config, name: str) -> Release | None:
     """Return the release with a name, or ``None`` if none runs."""
-    releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
-    return next((release for release in releases if release and release.name == name), None)
-
-
-def release_names(ledger: Ledger, config: Config) -> list[str]:
-    """Return the names of all releases that run."""
-    releases = (plan(ledger, config, key) for key in all_keys(ledger, config))
-    return [release.name for release in releases if release]
-
-
-def releases_of(ledger: Ledger, config: Config, subject: Subject) -> list[Release]:
-    """Return the releases that run because of claims on an application or a connection."""
-    releases = (
-        plan(ledger, config, key) for key in dict.fromkeys(keys_of(ledger, config, subject))
-    )
-    return [release for release in releases if release]
+    return next((one for one in releases(ledger, config) if one.name == name), None)
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
@@ -62,20 +48,15 @@ def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
         ledger: the ledger without suspended claims.
         release: the release that runs.
     """
-    claims: Iterable[Claim]
-    if isinstance(release, ServiceRelease):
-        users = (claim for id in release.applications for claim in ledger.application_claims(id))
-        claims = [claim for claim in users if _takes(claim, release)]
-    else:
-        ids = release.connections if isinstance(release, Bridge) else (release.connection,)
-        claims = [claim for id in ids for claim in ledger.connection_claims(id)]
+    claims = (claim for claim in claims_of(release, ledger) if _takes(claim, release))
     return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
 
 
-def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
+def _takes(claim: Claim, release: Release) -> bool:
     """Return whether a claim on an application needs this service of it."""
-    if release.service.each is None:
+    if not isinstance(release, ServiceRelease) or release.service.each is None:
         return True
+    assert isinstance(claim, ApplicationClaim)  # noqa: S101 - a service is for applications
     topics = claim.inputs.get(release.service.each, ())
     return any((t.source, t.topic) == (release.key.source, release.key.topic) for t in topics)
 
@@ -83,9 +64,8 @@ def _takes(claim: ApplicationClaim, release: ServiceRelease) -> bool:
 def how_to_release(claim: Claim) -> str:
     """Return how the requesters release a claim."""
     if is_override_claim(claim):
-        return (
-            f"remove keep from {OVERRIDES_ROOT}/{claim.demand.removeprefix(OVERRIDE_PREFIX)}.yaml"
-        )
+        name = claim.demand.removeprefix(OVERRIDE_PREFIX)
+        return f"remove keep from {OVERRIDES_ROOT}/{name}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):
         return f"send request '{claim.request}' again with shutdown: true"
     return f"send operation: release for demand '{claim.demand}'"
@@ -93,55 +73,27 @@ def how_to_release(claim: Claim) -> str:
 
 def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
     """Return people's files that decide what a release is and where it runs."""
-    found = [ShapingFile(ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}")]
-    of_kind = _service if isinstance(release, ServiceRelease) else _client
-    found += of_kind(release, config)
-    found.append(ShapingFile(NODES_FILE, release.node.id, f"in cluster {release.node.cluster}"))
-    domain = release.domain
-    return [*found, ShapingFile(DOMAINS_FILE, domain.name, f"namespace {domain.namespace}")]
+    images = [image for image in release.images if image in config.images]
+    node, domain = release.node, release.domain
+    entries = [
+        (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
+        *release.shaping_entries(config),
+        *((IMAGES_FILE, f"images.{name}", config.images[name].reference()) for name in images),
+        (NODES_FILE, node.id, f"in cluster {node.cluster}"),
+        (DOMAINS_FILE, domain.name, f"namespace {domain.namespace}"),
+    ]
+    return [ShapingFile(*entry) for entry in entries]
 
 
 def denied_release_named(
     ledger: Ledger, config: Config, name: str
 ) -> tuple[Release, Override] | None:
     """Return the denied release with a name and the override that denies it, or ``None``."""
-    for key in all_keys(ledger, config):
-        found = denied_release(ledger, config, key)
-        if found is not None and found[0].name == name:
-            return found
-    return None
+    denied = (denied_release(ledger, config, key) for key in all_keys(ledger, config))
+    return next((found for found in denied if found and found[0].name == name), None)
 
 
 def keeping_override(claim: Claim, config: Config) -> Override | None:
     """Return the override that keeps this claim, or ``None`` if a demand holds it."""
-    return (
-        config.overrides.get(claim.demand.removeprefix(OVERRIDE_PREFIX))
-        if is_override_claim(claim)
-        else None
-    )
-
-
-def _service(release: Release, config: Config) -> Iterator[ShapingFile]:
-    assert isinstance(release, ServiceRelease)  # noqa: S101 - the caller checks the type
-    folder = f"appdefs/{release.appdef}"
-    yield ShapingFile(f"{folder}/appdef.yaml", f"services.{release.key.service}", "what it is")
-    yield ShapingFile(
-        config.values_template(release.appdef, release.service), "", "its Helm values"
-    )
-    chart, name = release.chart, release.service.chart
-    where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
-    yield ShapingFile(CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}")
-    for image in release.service.images:
-        yield ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
-
-
-def _client(release: Release, config: Config) -> Iterator[ShapingFile]:
-    image = DDS_ROUTER_IMAGE
-    if isinstance(release, Bridge):
-        image = ZENOH_BRIDGE_IMAGE
-    elif isinstance(release, MqttEnd):
-        image = MQTT_CLIENT_IMAGE
-        broker = release.broker
-        yield ShapingFile(BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}")
-    if image in config.images:
-        yield ShapingFile(IMAGES_FILE, f"images.{image}", config.images[image].reference())
+    name = claim.demand.removeprefix(OVERRIDE_PREFIX)
+    return config.overrides.get(name) if is_override_claim(claim) else None

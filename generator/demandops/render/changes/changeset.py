@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from demandops.config.config import Config
-from demandops.demand.route import Route
 from demandops.errors import Refused
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.plan.planner import plan
-from demandops.plan.release import Bridge, MqttEnd, Release, RosEnd, ServiceRelease
+from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
 from demandops.render import release_file
 from demandops.render.engine import Engine
@@ -146,25 +145,18 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
     """
     release = new or old
     assert release is not None  # noqa: S101 - see above
-    if isinstance(release, ServiceRelease):
-        description = f"{release.key.service} on {release.node.id}"
-        description += f" for {release.key.source or release.key.application}"
-    elif isinstance(release, Bridge):
-        description = f"Zenoh bridge on {release.node.id}"
-    else:
-        description = f"{release.type.name} {release.side} of connection {release.connection}"
-        description += f" on {release.node.id}"
     kind: Change = "stop" if not new else "start"
     if new and existed:
         kind = "change"
     details = _differences(old, new) if kind == "change" else ()
-    return ReleaseChange(release.name, kind, description, details)
+    return ReleaseChange(release.name, kind, release.description, details)
 
 
 def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
     before, after = _overrides(old), _overrides(new)
     if new is None or not new.shaping.held:  # of a held file, only the comments change
-        before, after = _facts(old) + before, _facts(new) + after
+        before = (old.facts() if old else []) + before
+        after = (new.facts() if new else []) + after
     old_facts, new_facts = frozenset(before), frozenset(after)
     removed = [f"- {fact}" for fact in before if fact not in new_facts]
     added = [f"+ {fact}" for fact in after if fact not in old_facts]
@@ -173,7 +165,7 @@ def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
 
 def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
     """Yield a warning if a held release would otherwise change."""
-    if new is None or not new.shaping.held or _facts(old) == _facts(new):
+    if new is None or not new.shaping.held or (old and old.facts()) == new.facts():
         return
     by = " and ".join(override.path for override, effects in new.shaping.by if "hold" in effects)
     yield f"{new.name} is held by {by}; its changes wait until the hold ends"
@@ -182,38 +174,3 @@ def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
 def _overrides(release: Release | None) -> list[str]:
     by = release.shaping.by if release is not None else ()
     return [f"{override.path}: {', '.join(effects)}" for override, effects in by]
-
-
-def _facts(release: Release | None) -> list[str]:
-    if release is None:
-        return []
-    if isinstance(release, ServiceRelease):
-        facts = [f"{role} {t.topic}" for role, topics in release.inputs.items() for t in topics]
-        facts += [f"{name} = {value}" for name, value in release.parameters.items()]
-        return [*facts, f"replicas {release.replicas}"]
-    if isinstance(release, Bridge):
-        return _facts_of_bridge(release)
-    return [*map(_fact_of_route, release.topics.values()), _fact_of_link(release)]
-
-
-def _fact_of_route(route: Route) -> str:
-    direction = "from" if route.reverse else "to"
-    options = {name: value for name, value in route.options().items() if name != "reverse"}
-    listed = ", ".join(f"{name} {value}" for name, value in options.items())
-    return f"topic {route.source} {direction} {route.target}" + (f" ({listed})" if listed else "")
-
-
-def _fact_of_link(end: MqttEnd | RosEnd) -> str:
-    if isinstance(end, MqttEnd):
-        return f"broker {end.broker.node}"
-    return f"address {end.address.host}:{end.address.port}"
-
-
-def _facts_of_bridge(bridge: Bridge) -> list[str]:
-    return [
-        *(f"connection {id}" for id in bridge.connections),
-        *(f"reads {topic}" for topic in bridge.publishers),
-        *(f"writes {topic}" for topic in bridge.subscribers),
-        *(f"rate {rate:g} of {topic}" for topic, rate in bridge.rates.items()),
-        *(f"connects to {endpoint}" for endpoint in bridge.connect),
-    ]

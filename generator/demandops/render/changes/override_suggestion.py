@@ -14,7 +14,7 @@ from demandops import strict_yaml
 from demandops.config.config import Config
 from demandops.config.registry import Image
 from demandops.errors import InvalidInput
-from demandops.plan.release import Bridge, Release, ServiceRelease
+from demandops.plan.release import Release, ServiceRelease
 from demandops.render.changes.data_diff import leaf_differences, merge_patch
 from demandops.render.gitops.flux import chart_object
 from demandops.settings import API_VERSION
@@ -123,7 +123,7 @@ def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
     if isinstance(release, ServiceRelease):
         selected = {"applications": list(release.applications), "services": [release.key.service]}
         return selected if release.key.application else selected | {"nodes": [release.node.id]}
-    ids = list(release.connections) if isinstance(release, Bridge) else [release.connection]
+    ids = list(release.connections)
     return {"connections": ids} if whole else {"connections": ids, "nodes": [release.node.id]}
 
 

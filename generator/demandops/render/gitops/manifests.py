@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from demandops.config.config import Config
 from demandops.plan.release import Release, ServiceRelease
-from demandops.render import connections
+from demandops.render import connection_client
 from demandops.render.engine import Engine
 from demandops.render.gitops import argocd, flux
 from demandops.render.helm_values import values_of
@@ -22,7 +22,7 @@ def render(release: Release, config: Config, engine: Engine) -> str:
             schema.
     """
     if not isinstance(release, ServiceRelease):
-        return connections.render(release, config, engine)
+        return connection_client.render(release, config, engine)
     values = values_of(release, config, engine)
     if config.repo_settings.gitops == "argocd":
         return argocd.render(release, values, config.repo_settings, engine)

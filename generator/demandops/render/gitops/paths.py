@@ -5,9 +5,9 @@ Other programs rely on these paths. A folder holds one access domain's part of o
 
 from __future__ import annotations
 
+from demandops import naming
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
-from demandops.plan import naming
 from demandops.plan.release import Release
 
 CLUSTERS_ROOT = "clusters"

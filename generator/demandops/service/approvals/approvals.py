@@ -86,7 +86,6 @@ class Approvals:
             batch.remove(ticket)
             request = admit_or_none(state, ticket.goal)
             record = ticket.proposal or ProposalRecord("")
-            ticket.state = "withdrawn" if record.withdrawn else ticket.state
             proposal = next(
                 (p for p in self._proposals.values() if p.branch == record.branch), None
             )

@@ -47,7 +47,7 @@ class Proposal:
     def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
         """Return whether nothing changed since the last check, with main at ``tip``."""
         head = branches.get(self.branch)
-        all_wait = all(ticket.state == "waiting" for ticket in self.tickets)
+        all_wait = all(ticket.state == "proposed" for ticket in self.tickets)
         return all_wait and self.checked_at == tip and head in self.record.commits[-1:]
 
     def requesters(self) -> set[str]:

@@ -14,10 +14,10 @@ from itertools import count
 import git
 from pygit2 import Commit, Oid, Repository, Tree
 
+from demandops import naming
 from demandops.demand.claim import ApplicationClaim
 from demandops.errors import InvalidInput
 from demandops.ledger import claim_file
-from demandops.plan import naming
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo.git.tree import child, commit_of, differences_below, files_below, read_text
 from demandops.staterepo.history.commit_log import LogEntry, entry_of

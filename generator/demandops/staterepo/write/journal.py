@@ -3,23 +3,40 @@
 It has one JSON line for each demand received and one for each demand done. A demand is written and
 fsynced before it is evaluated. After a restart, demands that are not done are evaluated again;
 their operation ids show whether a commit was already published.
+
+The last key of a line is a digest of the line and of the digest before it. So a changed, missing or
+moved line is noticed (docs/decisions/0020-journal.md). The first version wrote no digests; its
+journals are read as well.
 """
 
 from __future__ import annotations
 
-import fcntl
+import hashlib
 import json
 import os
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from demandops.errors import StateRepoError
 
-_COMPACT_ABOVE = 1 << 20
-_MAX_SLOTS = 256
+_MOST_BYTES = 1 << 20
+_SEALED = re.compile(rb'(\{.*), "digest": "([0-9a-f]{64})"\}')
+
+
+class DamagedJournal(StateRepoError):
+    """Raised if an entry of a journal was changed, or one before it is missing."""
+
+    def __init__(self, path: Path, line: int) -> None:
+        super().__init__(
+            f"{path}: line {line} is not what the generator wrote there; run `demandops journal "
+            "--set-aside` for this state repo, which moves the file away and lists its demands, "
+            "then send again what is still needed"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,86 +52,162 @@ class JournalEntry:
     base: str
     proposal: dict[str, Any] | None = None
 
-    def line(self) -> str:
-        """Return its line of the journal, without copying the goal, which may be deep."""
+    def record(self) -> dict[str, Any]:
+        """Return its content, without copying the goal, which may be deep."""
         record = {field.name: getattr(self, field.name) for field in fields(self)}
         if self.proposal is None:
             del record["proposal"]
-        return json.dumps(record, ensure_ascii=True) + "\n"
+        return record
 
 
 class Journal:
-    """The journal of one process. Not thread-safe: the caller locks."""
+    """The journal of one process. Not thread-safe: the caller locks.
+
+    The file is rewritten when it has twice the size that it had then, and more than 1 MiB.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.pending: dict[str, JournalEntry] = _load(path)
-        self._compact()
+        self.pending = read(path)
+        self._chain, self._size, self._limit, self._is_broken = "", 0, 0, True
+        with self._explained():
+            self._file = path.open("ab", buffering=0)
+            self._rewrite()
 
     def append(self, entries: Iterable[JournalEntry]) -> None:
-        """Write and fsync ``entries``."""
-        lines = []
-        for entry in entries:
-            self.pending[entry.operation] = entry
-            lines.append(entry.line())
-        if lines:
-            self._file.write("".join(lines))
-            self._sync()
+        """Write and fsync ``entries``.
+
+        Raises:
+            StateRepoError: if they cannot be written; then none of them is in the journal.
+        """
+        entries = list(entries)
+        if entries:
+            with self._explained():
+                self._write([entry.record() for entry in entries], durably=True)
+            self.pending.update((entry.operation, entry) for entry in entries)
+            self._bound()
 
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Remove demands that are published, refused or withdrawn.
 
-        Fsynced only if ``durably``: without a later demand it is harmless to replay these, and the
-        :meth:`append` of a later demand fsyncs them too.
+        Only if ``durably`` are they removed for sure, and is a failure raised. Otherwise the
+        :meth:`append` of a later demand makes it sure, and before that it is harmless to replay
+        them.
+
+        Raises:
+            StateRepoError: if ``durably``, and it cannot be written; then they stay.
         """
-        for operation in operations:
-            if self.pending.pop(operation, None) is not None:
-                self._file.write(json.dumps({"done": operation}) + "\n")
-        self._file.flush()
-        if durably:
-            self._sync()
-        if not self.pending and self._file.tell() > _COMPACT_ABOVE:
-            self._compact()
+        done = [each for each in dict.fromkeys(operations) if each in self.pending]
+        records = [{"done": operation} for operation in done]
+        if durably and done:
+            with self._explained():
+                self._write(records, durably=True)
+        for operation in done:
+            del self.pending[operation]
+        if done and not durably:
+            with suppress(OSError):
+                self._write(records, durably=False)
+        self._bound()
 
     def close(self) -> None:
         """Close the journal; pending demands stay for the next process."""
-        self._sync()
+        with suppress(OSError):  # the demands are there; what is done may be evaluated again
+            self._write([], durably=True)
         self._file.close()
 
-    def _sync(self) -> None:
-        self._file.flush()
-        os.fdatasync(self._file.fileno())
-
-    def _compact(self) -> None:
-        fresh = self._path.with_suffix(".new")
-        with fresh.open("w") as file:
-            for entry in self.pending.values():
-                file.write(entry.line())
-            file.flush()
-            os.fsync(file.fileno())
-        fresh.replace(self._path)
-        _sync_folder(self._path.parent)
-        self._file: IO[str] = self._path.open("a")
-
-
-def _load(path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands; skip a line that a crash cut off, which was not acknowledged."""
-    pending: dict[str, JournalEntry] = {}
-    text = path.read_bytes().decode("utf-8", "replace") if path.exists() else ""
-    for line in text.splitlines():
+    def _write(self, records: list[dict[str, Any]], *, durably: bool) -> None:
+        if self._is_broken:
+            self._rewrite()
+        text, chain = _sealed(records, self._chain)
+        self._is_broken = True
         try:
-            record = json.loads(line)
-            if "done" in record:
-                pending.pop(record["done"], None)
-            else:
-                datetime.fromisoformat(record["received"])
-                pending[record["operation"]] = JournalEntry(**record)
-        except (ValueError, TypeError, KeyError, AttributeError):
-            continue
+            _write_all(self._file.fileno(), text)
+            if durably:
+                os.fdatasync(self._file.fileno())
+        except OSError:
+            with suppress(OSError):  # a restart must not find half of it
+                self._file.truncate(self._size)
+            raise
+        self._is_broken, self._chain, self._size = False, chain, self._size + len(text)
+
+    def _bound(self) -> None:
+        if self._size > self._limit:
+            with suppress(OSError):  # the next write tries again
+                self._rewrite()
+
+    def _rewrite(self) -> None:
+        """Replace the file by one with the pending demands only."""
+        text, chain = _sealed([entry.record() for entry in self.pending.values()], "")
+        if text:
+            fresh = self._path.with_suffix(".new")
+            with fresh.open("wb") as writing:
+                writing.write(text)
+                writing.flush()
+                os.fsync(writing.fileno())
+            file = fresh.open("ab", buffering=0)
+            self._is_broken = True
+            fresh.replace(self._path)
+            self._file.close()
+            self._file = file
+        else:
+            self._is_broken = True
+            self._file.truncate(0)  # unlike another file, it needs no room on a full disk
+            os.fdatasync(self._file.fileno())
+        sync_folder(self._path.parent)
+        self._is_broken, self._chain, self._size = False, chain, len(text)
+        self._limit = max(_MOST_BYTES, 2 * len(text))
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise StateRepoError(
+                f"the journal {self._path} cannot be written: {error.strerror or error}; check its "
+                "disk, then send the demand again"
+            ) from None
+
+
+def read(path: Path) -> dict[str, JournalEntry]:
+    """Return the pending demands of a journal's file, by operation id; see :func:`parse`."""
+    return parse(path.read_bytes() if path.exists() else b"", path)
+
+
+def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
+    """Return the pending demands of a journal's text, by operation id.
+
+    An incomplete last line is dropped: it was being written at a crash and never acknowledged.
+
+    Raises:
+        DamagedJournal: if anything else is not what was written.
+    """
+    *lines, last = text.split(b"\n")
+    chain = "" if _SEALED.fullmatch((lines or [last])[0]) else None
+    pending: dict[str, JournalEntry] = {}
+    for number, line in enumerate(lines, start=1):
+        try:
+            chain = _apply(line, chain, pending)
+        except ValueError:
+            raise DamagedJournal(path, number) from None
+    if _is_entry(last[:-1], chain):  # it was complete: only the end of its line was changed
+        raise DamagedJournal(path, len(lines) + 1)
+    with suppress(ValueError):
+        _apply(last, chain, pending)
     return pending
 
 
-def _sync_folder(folder: Path) -> None:
+def readable_entries(path: Path) -> list[JournalEntry]:
+    """Return the demands that can be read in a journal, damaged or not, and are not done."""
+    pending: dict[str, JournalEntry] = {}
+    for line in path.read_bytes().split(b"\n"):
+        found = _SEALED.fullmatch(line)
+        with suppress(ValueError):
+            _replay(found[1] + b"}" if found else line, pending)
+    return list(pending.values())
+
+
+def sync_folder(folder: Path) -> None:
+    """Fsync a folder, so that the names in it are durable."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -122,60 +215,59 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-class Slot:
-    """A folder for the journal and the clone of one process, locked while the process lives.
+def _sealed(records: Iterable[dict[str, Any]], chain: str) -> tuple[bytes, str]:
+    """Return the lines of records that follow the digest ``chain``, and the last one's digest."""
+    lines = []
+    for record in records:
+        body = json.dumps(record, ensure_ascii=True)
+        chain = _digest(body.encode(), chain)
+        lines.append(f'{body[:-1]}, "digest": "{chain}"}}\n')
+    return "".join(lines).encode(), chain
 
-    Several processes on one machine may serve one state repo. Each takes the first free slot and
-    takes over the journals of dead processes.
+
+def _digest(body: bytes, chain: str) -> str:
+    return hashlib.sha256(chain.encode() + body).hexdigest()
+
+
+def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> str | None:
+    """Apply a line to the pending demands and return its digest.
+
+    ``chain`` is the digest before it; None in a journal of the first version.
+
+    Raises:
+        ValueError: if it is not an entry, or does not follow ``chain``.
     """
-
-    def __init__(self, root: Path) -> None:
-        try:
-            root.mkdir(parents=True, exist_ok=True, mode=0o700)
-        except OSError as error:
-            raise StateRepoError(
-                f"the data folder {root} cannot be made: {error.strerror}; set DEMANDOPS_DATA_HOME "
-                "to a writable folder"
-            ) from None
-        for number in range(_MAX_SLOTS):
-            folder = root / f"slot-{number}"
-            lock = _lock(folder)
-            if lock is not None:
-                self.folder, self._lock = folder, lock
-                break
-        else:
-            raise OSError(f"{_MAX_SLOTS} processes already use {root}")
-        self.journal = Journal(self.folder / "outbox.jsonl")
-        self._adopt_orphans(root)
-
-    def _adopt_orphans(self, root: Path) -> None:
-        """Take over the journals of dead processes.
-
-        An entry is written here before it is removed there. A crash between the two leaves it
-        twice, but its operation id makes it count once.
-        """
-        for folder in sorted(root.glob("slot-*")):
-            journal = folder / "outbox.jsonl"
-            if folder == self.folder or not journal.exists():
-                continue
-            lock = _lock(folder)
-            if lock is not None:
-                with lock:
-                    self.journal.append(_load(journal).values())
-                    journal.unlink()
-
-    def close(self) -> None:
-        """Close the journal and release the slot."""
-        self.journal.close()
-        self._lock.close()
+    if chain is not None:
+        found = _SEALED.fullmatch(line)
+        if found is None or _digest(found[1] + b"}", chain) != found[2].decode():
+            raise ValueError("another digest")
+        line, chain = found[1] + b"}", found[2].decode()
+    _replay(line, pending)
+    return chain
 
 
-def _lock(folder: Path) -> IO[str] | None:
-    folder.mkdir(exist_ok=True, mode=0o700)
-    handle = (folder / "lock").open("w")
+def _is_entry(line: bytes, chain: str | None) -> bool:
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        handle.close()
-        return None
-    return handle
+        _apply(line, chain, {})
+    except ValueError:
+        return False
+    return True
+
+
+def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
+    try:
+        record = json.loads(body)
+        if record.keys() == {"done"}:
+            pending.pop(record["done"], None)
+            return
+        entry = JournalEntry(**record)
+        datetime.fromisoformat(entry.received)
+        pending[entry.operation] = entry
+    except (TypeError, AttributeError, RecursionError) as error:
+        raise ValueError("not an entry") from error
+
+
+def _write_all(file: int, text: bytes) -> None:
+    left = memoryview(text)
+    while left:
+        left = left[os.write(file, left) :]

@@ -12,19 +12,20 @@ from typing import Any, ClassVar
 import pytest
 import yaml
 from demandops.config.load import load
+from demandops.connections.communication_client import ClientKey
+from demandops.connections.mqtt import MQTT
+from demandops.connections.route import Route
+from demandops.connections.zenoh import ZENOH
 from demandops.decision import Decision, State, rendered_files
 from demandops.demand.claim import Subject, SubjectKind
-from demandops.demand.route import Route
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger.ledger import changes_on
-from demandops.plan.connection_clients import BridgeKey, EndKey
 from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
-from demandops.render.connections import client_schema
-from demandops.render.connections.ros import dds_type
+from demandops.render.connection_client import check_configuration
 
-from tests.kit.carriers import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.config import skeleton
+from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.memory import MemoryRepo
 
 
@@ -77,13 +78,9 @@ class TestZenoh:
         world.send(demand("zenoh", {"/b": "/b"}, id="other", source="vehicle01"))
         world.send(demand("zenoh"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected_keys(
-            before,
-            world.state.ledger,
-            world.state.config,
-            changes_on(before, world.state.ledger, [subject]),
-        )
-        assert keys == (BridgeKey("vehicle00"), BridgeKey("edge"))
+        changes = changes_on(before, world.state.ledger, [subject])
+        keys = affected_keys(before, world.state.ledger, world.state.config, changes)
+        assert keys == (ClientKey(ZENOH, "vehicle00"), ClientKey(ZENOH, "edge"))
         assert [(found.name, found.change) for found in world.releases] == [
             ("zenoh-vehicle00", "start"),
             ("zenoh-edge", "change"),
@@ -95,22 +92,9 @@ class TestZenoh:
         before = world.state.ledger
         world.send(demand("mqtt"))
         subject = Subject(SubjectKind.CONNECTION, "c")
-        keys = affected_keys(
-            before,
-            world.state.ledger,
-            world.state.config,
-            changes_on(before, world.state.ledger, [subject]),
-        )
-        assert keys == (EndKey("c", "source"), EndKey("c", "target"))
-
-    def test_its_cost_does_not_grow_with_connections_elsewhere(self) -> None:
-        world = zenoh_world()
-        for number in range(30):
-            world.send(demand("zenoh", id=f"c{number}", source="vehicle01"))
-        world.send(demand("zenoh", target="vehicle00", source="edge"))
-        assert world.state.ledger.connections_at(
-            world.state.ledger.connection_claims("c")[0].type, "vehicle00"
-        ) == ("c",)
+        changes = changes_on(before, world.state.ledger, [subject])
+        keys = affected_keys(before, world.state.ledger, world.state.config, changes)
+        assert keys == (ClientKey(MQTT, "c", "source"), ClientKey(MQTT, "c", "target"))
 
     def test_topics_match_whole_names_and_nothing_else(self) -> None:
         world = zenoh_world()
@@ -183,9 +167,6 @@ class TestRos:
             "source" if "-source" in name else "target": yaml.safe_load(data["config.yaml"])
             for name, data in world.clients().items()
         }
-
-    def test_the_types_of_messages_as_dds_knows_them(self) -> None:
-        assert dds_type("std_msgs/msg/String") == "std_msgs::msg::dds_::String_"
 
     def test_both_meet_at_the_targets_address(self) -> None:
         world = self.world()
@@ -383,23 +364,6 @@ class TestWhatPeopleDidInGit:
 class TestSchemas:
     """A field that the client does not read never reaches a commit."""
 
-    @pytest.mark.parametrize(
-        ("kind", "configuration", "expected"),
-        [
-            (
-                "mqtt",
-                {"/**/*": {"ros__parameters": {"broker": {}, "client": {"id": "x"}, "bridge": {}}}},
-                "mqtt of x: /**/*.ros__parameters.bridge: {} has less than 1 property",
-            ),
-            ("zenoh", {"mode": "router"}, 'zenoh of x: "plugins" is a required property'),
-            ("ros", {"version": "v4.0"}, 'ros of x: version: "v5.0" was expected'),
-        ],
-    )
-    def test_it_is_told(self, kind: str, configuration: dict[str, Any], expected: str) -> None:
-        with pytest.raises(InvalidInput) as invalid:
-            client_schema.check(kind, configuration, "x")
-        assert expected in [str(found) for found in invalid.value.faults]
-
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
     def test_a_field_more_anywhere_is_refused(self, kind: str) -> None:
         nodes = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
@@ -408,11 +372,11 @@ class TestSchemas:
         for data in world.clients().values():
             (text,) = data.values()
             whole = yaml.safe_load(text)
-            client_schema.check(kind, whole, "x")
+            check_configuration(kind, whole, "x")
             for spot in _mappings(whole):
                 spot["surplus"] = 1
                 with pytest.raises(InvalidInput):
-                    client_schema.check(kind, whole, "x")
+                    check_configuration(kind, whole, "x")
                 del spot["surplus"]
 
 

@@ -86,14 +86,6 @@ def test_the_parameters_of_both_ends_are_exactly_these() -> None:
     }
 
 
-def test_source_topic_i_arrives_as_target_topic_i() -> None:
-    books = MemoryRepo()
-    topics = [f"/source/{letter}" for letter in "dacb"]
-    targets = [f"/target/t{number}" for number in range(4)]
-    books.send(goal([], [connection("c", topics=topics, targets=targets)]))
-    assert pairs(books, "c") == dict(zip(topics, targets, strict=True))
-
-
 def test_two_source_topics_may_arrive_as_one() -> None:
     books = MemoryRepo()
     books.send(goal([], [connection("c", topics=["/a", "/b"], targets=["/c", "/c"])]))
@@ -140,37 +132,6 @@ def test_every_end_has_a_client_id_of_its_own_and_that_of_its_deployment() -> No
     assert len(found) == 8
     assert all(parameters["client"]["id"] == name for name, parameters in found.items())
     assert found.keys() == books.objects("Deployment").keys()
-
-
-def test_both_ends_meet_at_one_broker() -> None:
-    books = MemoryRepo()
-    books.send(goal([], [connection("c", broker="", ends=("vehicle00", "edge"))]))
-    (host,) = {parameters["broker"]["host"] for parameters in ends(books).values()}
-    (port,) = {parameters["broker"]["port"] for parameters in ends(books).values()}
-    assert (host, port) == ("service-mqtt-broker-edge", 1993)
-
-
-def test_the_client_is_started_by_the_launch_file_that_v2_4_kept() -> None:
-    books = MemoryRepo()
-    books.send(goal([], [connection("c")]))
-    for name, deployment in books.objects("Deployment").items():
-        (container,) = deployment["spec"]["template"]["spec"]["containers"]
-        assert "command" not in container
-        assert container["args"] == [
-            "ros2",
-            "launch",
-            "mqtt_client",
-            "standalone.launch.xml",
-            f"node_name:={name.replace('-', '_')}",
-            "params_file:=/config/params.yaml",
-        ]
-        (volume,) = (
-            item
-            for item in deployment["spec"]["template"]["spec"]["volumes"]
-            if "configMap" in item
-        )
-        (mount,) = (item for item in container["volumeMounts"] if item["name"] == volume["name"])
-        assert (volume["configMap"]["name"], mount["mountPath"]) == (name, "/config")
 
 
 def test_new_topics_restart_both_ends_and_nothing_else_does() -> None:

@@ -6,8 +6,16 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
-from demandops.demand import connection_type_choice
-from demandops.demand.route import Route, RouteOptions, contradictions, faults, merge_routes, parse
+from demandops.config.base_model import parse
+from demandops.connections.connection_types import CONNECTION_TYPES
+from demandops.connections.route import (
+    Route,
+    RouteOptions,
+    contradictions,
+    faults,
+    merge_routes,
+)
+from demandops.errors import InvalidInput
 
 OPTIONS: dict[str, object] = {
     "type": "std_msgs/msg/String",
@@ -26,17 +34,11 @@ def told(found: Any) -> list[str]:
     return [f"{one.field}: {one.message}" for one in found]
 
 
-def test_a_route_is_plain_unless_something_is_said() -> None:
-    route, found = parse("t", "/a", "/b", {})
-    assert (route, found) == (Route("/a", "/b"), [])
-    assert route.options() == {}
-
-
-def test_every_option_is_kept() -> None:
-    route, found = parse("t", "/a", "/b", OPTIONS)
-    assert not found
-    assert route.options() == OPTIONS
-    assert (route.source, route.target) == ("/a", "/b")
+def test_every_option_is_kept_and_only_what_is_said() -> None:
+    assert RouteOptions().route("/a", "/b") == Route("/a", "/b")
+    assert Route("/a", "/b").options() == {}
+    route = parse(RouteOptions, OPTIONS).route("/a", "/b")
+    assert (route.source, route.target, route.options()) == ("/a", "/b", OPTIONS)
 
 
 def test_options_and_routes_have_the_same_fields_and_defaults() -> None:
@@ -47,46 +49,46 @@ def test_options_and_routes_have_the_same_fields_and_defaults() -> None:
 
 
 def test_every_option_does_something_in_some_client() -> None:
-    honoured = set().union(*connection_type_choice.SUPPORTED_OPTIONS.values())
+    honoured = frozenset().union(*(known.options for known in CONNECTION_TYPES))
     assert honoured == RouteOptions.model_fields.keys() - {"type", "reverse"}
 
 
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"qos": 3}, "t.qos: input should be less than or equal to 2, not 3"),
-        ({"qos": -1}, "t.qos: input should be greater than or equal to 0, not -1"),
-        ({"qos": "1"}, "t.qos: must be a whole number, not '1'"),
-        ({"rate": -1}, "t.rate: input should be greater than or equal to 0, not -1"),
-        ({"rate": float("nan")}, "t.rate: input should be a finite number, not nan"),
-        ({"queue": -1}, "t.queue: input should be greater than or equal to 0, not -1"),
-        ({"retained": "yes"}, "t.retained: must be true or false, not 'yes'"),
+        ({"qos": 3}, "qos: input should be less than or equal to 2, not 3"),
+        ({"qos": -1}, "qos: input should be greater than or equal to 0, not -1"),
+        ({"qos": "1"}, "qos: must be a whole number, not '1'"),
+        ({"rate": -1}, "rate: input should be greater than or equal to 0, not -1"),
+        ({"rate": float("nan")}, "rate: input should be a finite number, not nan"),
+        ({"queue": -1}, "queue: input should be greater than or equal to 0, not -1"),
+        ({"retained": "yes"}, "retained: must be true or false, not 'yes'"),
         (
             {"reliability": "relaible"},
-            "t.reliability: is 'relaible', but must be '', 'reliable' or 'best_effort'",
+            "reliability: is 'relaible', but must be '', 'reliable' or 'best_effort'",
         ),
         (
             {"durability": "kept"},
-            "t.durability: is 'kept', but must be '', 'volatile' or 'transient_local'",
+            "durability: is 'kept', but must be '', 'volatile' or 'transient_local'",
         ),
         (
             {"type": "String"},
-            "t.type: 'String' is not a message type; write it like std_msgs/msg/String",
+            "type: 'String' is not a message type; write it like std_msgs/msg/String",
         ),
         (
             {"qso": 1},
-            "t.qso: is not a field here; remove it or correct its spelling; did you mean 'qos'?",
+            "qso: is not a field here; remove it or correct its spelling; did you mean 'qos'?",
         ),
     ],
 )
 def test_what_no_option_can_be_is_told(options: dict[str, object], expected: str) -> None:
-    route, found = parse("t", "/a", "/b", options | {"queue": options.get("queue", 5)})
-    assert told(found) == [expected]
-    assert route == Route("/a", "/b", queue=0 if "queue" in options else 5)
+    with pytest.raises(InvalidInput) as invalid:
+        parse(RouteOptions, options | {"reverse": True})
+    assert told(invalid.value.faults) == [expected]
 
 
 def test_a_whole_number_is_a_rate_too() -> None:
-    assert parse("t", "/a", "/a", {"rate": 5})[0].rate == 5.0
+    assert parse(RouteOptions, {"rate": 5}).rate == 5.0
 
 
 def test_a_topic_listed_with_two_ways_to_carry_it_is_told() -> None:

@@ -1,19 +1,18 @@
 """Routes: one topic of a connection, with its names, direction and options.
 
 Requests and claims contain :class:`Route`, and clients are configured from it. This module knows
-the valid options; :mod:`demandops.demand.connection_type_choice` knows which type supports them.
-:func:`parse` is for options from messages and from the ledger's files.
+the valid options; each connection type knows which it supports.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field
 
-from demandops.config.base_model import FrozenModel, faults_of
+from demandops.config.base_model import FrozenModel
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import message_type_problem, topic_problem
 
@@ -58,6 +57,14 @@ class Route:
         """The topic on the node that messages go to."""
         return self.source if self.reverse else self.target
 
+    @property
+    def fact(self) -> str:
+        """The route in words: ``topic /a to /b (qos 1)``."""
+        options = self.options()
+        direction = "from" if options.pop("reverse", False) else "to"
+        listed = ", ".join(f"{name} {value}" for name, value in options.items())
+        return f"topic {self.source} {direction} {self.target}" + (f" ({listed})" if listed else "")
+
     def sender_and_receiver(self, source: str, target: str) -> tuple[str, str]:
         """Return the sending and the receiving node of a connection between two nodes."""
         return (target, source) if self.reverse else (source, target)
@@ -93,32 +100,6 @@ class RouteOptions(FrozenModel):
     def route(self, source: str, target: str) -> Route:
         """Return the route from ``source`` to ``target`` with these options."""
         return Route(source, target, **self.model_dump(include=set(RouteOptions.model_fields)))
-
-
-def parse(
-    where: str, source: str, target: str, options: Mapping[str, object]
-) -> tuple[Route, list[Fault]]:
-    """Return a route with options from a message or a file, and their faults.
-
-    Args:
-        where: the field that holds them, for faults (``connections[0].topics[2]``).
-        source, target: the topic's absolute names at both ends.
-        options: values of :class:`RouteOptions`; absent ones get their defaults.
-
-    Returns:
-        The route without the invalid options, and the faults. A route with faults must not be
-        booked.
-    """
-    try:
-        return RouteOptions.model_validate(dict(options)).route(source, target), []
-    except ValidationError as error:
-        faults = faults_of(error, RouteOptions)
-        invalid = {found.field for found in faults}
-        valid = {name: value for name, value in options.items() if name not in invalid}
-        return (
-            RouteOptions.model_validate(valid).route(source, target),
-            [fault(f"{where}.{found.field}", found.message) for found in faults],
-        )
 
 
 def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:

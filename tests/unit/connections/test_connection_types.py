@@ -5,12 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from demandops.connections.connection_type import ConnectionType
+from demandops.connections.mqtt import MQTT
+from demandops.connections.ros import ROS
+from demandops.connections.zenoh import ZENOH
 from demandops.decision import State
-from demandops.demand.demand_request import ConnectionType
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 
-from tests.kit.carriers import (
+from tests.kit.connections import (
     REACHABLE,
     SPEAKS,
     TYPED,
@@ -39,31 +42,31 @@ class TestAutomaticChoice:
     """Zenoh where both speak it, else MQTT where there is a broker, else ROS, else refused."""
 
     def test_zenoh_where_both_nodes_speak_it(self) -> None:
-        assert carried(state(vehicle00=SPEAKS, edge=REACHABLE), demand()) is ConnectionType.ZENOH
+        assert carried(state(vehicle00=SPEAKS, edge=REACHABLE), demand()) is ZENOH
 
     def test_zenoh_where_both_connect_to_one_router(self) -> None:
         both = {"zenoh": {"connect": ["tcp/router:7447"]}}
-        assert carried(state(vehicle00=both, edge=both), demand()) is ConnectionType.ZENOH
+        assert carried(state(vehicle00=both, edge=both), demand()) is ZENOH
 
     def test_mqtt_where_one_does_not(self) -> None:
-        assert carried(state(edge=REACHABLE), demand()) is ConnectionType.MQTT
+        assert carried(state(edge=REACHABLE), demand()) is MQTT
 
     def test_mqtt_where_neither_can_be_reached(self) -> None:
-        assert carried(state(vehicle00=SPEAKS, edge=SPEAKS), demand()) is ConnectionType.MQTT
+        assert carried(state(vehicle00=SPEAKS, edge=SPEAKS), demand()) is MQTT
 
     def test_mqtt_where_the_registry_has_no_bridge(self) -> None:
         found = state("", vehicle00=SPEAKS, edge=REACHABLE)
-        assert carried(found, demand()) is ConnectionType.MQTT
+        assert carried(found, demand()) is MQTT
 
     def test_mqtt_for_what_zenoh_cannot_do(self) -> None:
         found = state(vehicle00=SPEAKS, edge=REACHABLE)
         for topics in ({"/a": "/b"}, {"/a": {"qos": 1}}):
-            assert carried(found, demand(topics=topics)) is ConnectionType.MQTT
-        assert carried(found, demand(broker="edge")) is ConnectionType.MQTT
+            assert carried(found, demand(topics=topics)) is MQTT
+        assert carried(found, demand(broker="edge")) is MQTT
 
     def test_ros_where_there_is_no_broker(self) -> None:
         found = state(brokers=False, vehicle00=TYPED, edge=WAN)
-        assert carried(found, demand()) is ConnectionType.ROS
+        assert carried(found, demand()) is ROS
 
     def test_where_nothing_can_carry_it_each_is_told(self) -> None:
         assert faults(state("", brokers=False), demand()) == [
@@ -80,9 +83,7 @@ class TestAutomaticChoice:
         after = decided(before, demand("mqtt"))
         again = demand(requesters=["vehicle01"])
         after = decided(after, again)
-        assert {claim.type for claim in after.ledger.connection_claims("c")} == {
-            ConnectionType.MQTT
-        }
+        assert {claim.type for claim in after.ledger.connection_claims("c")} == {MQTT}
 
     def test_a_shutdown_without_a_type_means_what_stands(self) -> None:
         before = state(vehicle00=SPEAKS, edge=REACHABLE)
@@ -196,7 +197,7 @@ class TestRos:
     def test_the_type_of_a_topic_that_is_carried_back_is_the_targets(self) -> None:
         asked = demand("ros", {"/a": {"reverse": True}})
         assert "types of 'edge'" in faults(state(vehicle00=TYPED, edge=WAN), asked)[0]
-        assert carried(state(edge=WAN | TYPED), asked) is ConnectionType.ROS
+        assert carried(state(edge=WAN | TYPED), asked) is ROS
 
     def test_durability_needs_reliability(self) -> None:
         asked = demand("ros", {"/a": {"durability": "volatile"}})

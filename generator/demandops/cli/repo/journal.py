@@ -1,0 +1,65 @@
+"""``demandops journal``: the accepted demands that generators on this machine did not publish."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime, timezone
+from typing import Any
+
+import click
+
+from demandops import settings
+from demandops.cli.output import console, errors, output_option, print_json, state_repo_option
+from demandops.staterepo.write.slot import FoundJournal, find_journals
+
+
+@click.command()
+@state_repo_option
+@click.option(
+    "--set-aside",
+    is_flag=True,
+    help="Rename journals that are damaged, so that the generator starts without them.",
+)
+@output_option
+def journal(state_repo: str, set_aside: bool, output: str) -> None:
+    """List the accepted demands that are not published.
+
+    A generator on this machine accepted them, and the next one carries them out. It does not start
+    if a journal is damaged, because demands may be missing in it. Then use --set-aside, and send
+    again those of the listed demands that are still needed: --output json prints their goals.
+    """
+    now = datetime.now(timezone.utc)
+    found = list(find_journals(settings.data_home(state_repo), now, set_aside=set_aside))
+    if output == "json":
+        print_json([_row(each) for each in found])
+    else:
+        out = console()
+        for line in _lines(found):
+            out.print(line, soft_wrap=True)
+    damages = [each.damage for each in found if each.damage and not each.set_aside]
+    for damage in damages:
+        errors.print(f"error: {damage}")
+    if damages:
+        click.get_current_context().exit(1)
+
+
+def _row(found: FoundJournal) -> dict[str, Any]:
+    return {
+        "file": str(found.file),
+        "damage": found.damage or None,
+        "set_aside": str(found.set_aside) if found.set_aside else None,
+        "demands": [
+            {"operation": each.operation, "received": each.received, "goal": each.goal}
+            for each in found.demands
+        ],
+    }
+
+
+def _lines(found: list[FoundJournal]) -> Iterator[str]:
+    for each in found:
+        for entry in each.demands:
+            yield f"{entry.operation}  received {entry.received}"
+        if each.set_aside:
+            yield f"the damaged {each.file} is now {each.set_aside}"
+    number = sum(len(each.demands) for each in found)
+    yield f"{number} {'demand is' if number == 1 else 'demands are'} accepted and not published"

@@ -1,0 +1,173 @@
+"""MQTT connections: each end is an mqtt_client, and both meet at a broker.
+
+Parameters as ika-rwth-aachen/mqtt_client v2.5 reads them. The client cannot drop a bridge while it
+runs, so a change of topics restarts the pod.
+
+The parameters do not contain a broker's user name and password: the pod reads them from a Secret
+(``docs/decisions/0009-credentials-of-brokers.md``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from demandops import naming
+from demandops.config.config import BROKERS_FILE, IMAGES_FILE, Config
+from demandops.config.config_reader import ConfigReader
+from demandops.config.inventory import Broker
+from demandops.connections.communication_client import ClientKey, End
+from demandops.connections.connection_type import (
+    Connections,
+    ConnectionType,
+    Ends,
+    make_end,
+    unplannable,
+)
+from demandops.connections.route import Route
+from demandops.errors import Fault, fault, quoted
+
+CA_FILE = "/tls/ca.crt"
+"""The path where the certificate of the broker's authority is mounted."""
+
+_NO_BROKER = "no-broker"
+
+
+class Mqtt(ConnectionType):
+    """Both ends are clients of one broker."""
+
+    name = "MQTT"
+    number = 1
+    image = "mqtt-client"
+    options = frozenset({"qos", "retained", "primitive", "reliability", "durability", "queue"})
+    renames = True
+    takes_broker = True
+    speaks_dds = False
+
+    def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
+        """Yield that there is a broker, but no image."""
+        if config.brokers and reader.is_missing(IMAGES_FILE, self.image):
+            message = f"'{self.image}' is missing; add it, because MQTT connections run it"
+            yield fault("images", message).within(IMAGES_FILE)
+
+    def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
+        """Yield that there is no broker; if none is named, it follows from the ends."""
+        if not ends.broker and not {ends.source, ends.target} <= config.nodes.keys():
+            return
+        if choose_broker(ends, config) is not None:
+            return
+        known = ", ".join(sorted(config.brokers))
+        remedy = f"name one of: {known}" if known else f"{BROKERS_FILE} has none; add one there"
+        message = f"is not given, and no broker runs on '{ends.target}' or '{ends.source}'"
+        if ends.broker:
+            message = f"no broker runs on {quoted(ends.broker)}"
+        yield fault("broker", f"{message}; {remedy}", code=_NO_BROKER)
+
+    def access(self, ends: Ends, config: Config) -> list[tuple[str, str]]:
+        """Return the broker."""
+        broker = choose_broker(ends, config)
+        return [("brokers", broker.node)] if broker else []
+
+    def client(self, key: ClientKey, connections: Connections, config: Config) -> MqttEnd | None:
+        """Return one end of a connection."""
+        connection = connections.get(key.id)
+        if connection is None or not connection.topics:
+            return None
+        broker = choose_broker(connection, config)
+        if broker is None:
+            message = f"connection '{key.id}' has no broker; add one to {BROKERS_FILE}"
+            raise unplannable("broker", message, _NO_BROKER)
+        channel = naming.object_name(self.word, key.id)
+        return make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
+
+
+MQTT = Mqtt()
+
+
+def choose_broker(ends: Ends, config: Config) -> Broker | None:
+    """Return a connection's broker: the named, the target's, the source's or the only one.
+
+    Return ``None`` if there is none of these.
+    """
+    if ends.broker:
+        return config.brokers.get(ends.broker)
+    for node in (ends.target, ends.source):
+        if node in config.brokers:
+            return config.brokers[node]
+    return next(iter(config.brokers.values())) if len(config.brokers) == 1 else None
+
+
+@dataclass(frozen=True, slots=True)
+class MqttEnd(End):
+    """One end of an MQTT connection."""
+
+    broker: Broker
+    channel: str
+    """The prefix of this connection's MQTT topics, the same at both ends."""
+
+    def facts(self) -> list[str]:
+        """Return the topics and the broker."""
+        return [*End.facts(self), f"broker {self.broker.node}"]
+
+    def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
+        """Return the broker's entry."""
+        broker = self.broker
+        yield BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}"
+
+    def configuration(self) -> dict[str, Any]:
+        """Return the content of one end's ROS parameter file.
+
+        Each ROS topic has one MQTT topic, named after the connection and the source topic: a
+        topic's name may differ between the ends.
+        """
+        bridge: dict[str, Any] = {}
+        topics = self.topics.items()
+        read = {route.read_topic: (name, route) for name, route in topics if self.reads(route)}
+        written = {name: route for name, route in topics if not self.reads(route)}
+        if read:
+            bridge["ros2mqtt"] = {"ros_topics": sorted(read)}
+            for topic, (name, route) in sorted(read.items()):
+                bridge["ros2mqtt"][topic] = {
+                    "mqtt_topic": self.channel + name,
+                    **_options(route, retained=route.retained),
+                }
+        if written:
+            bridge["mqtt2ros"] = {"mqtt_topics": [self.channel + name for name in written]}
+            for name, route in written.items():
+                bridge["mqtt2ros"][self.channel + name] = {
+                    "ros_topic": route.written_topic,
+                    **_options(route),
+                }
+        parameters = {
+            "broker": _broker(self.broker),
+            "client": {"id": self.name},
+            "bridge": bridge,
+        }
+        return {"/**/*": {"ros__parameters": parameters}}
+
+
+def _broker(broker: Broker) -> dict[str, Any]:
+    data: dict[str, Any] = {"host": broker.host, "port": broker.port}
+    if broker.tls:
+        data["tls"] = {"enabled": True}
+        if broker.tls.ca_secret:
+            data["tls"]["ca_certificate"] = CA_FILE
+    return data
+
+
+def _options(route: Route, *, retained: bool = False) -> dict[str, Any]:
+    """Return a topic's further parameters, without those that have the client's default."""
+    options: dict[str, Any] = {}
+    if route.primitive:
+        options["primitive"] = True
+    if route.type:
+        options["ros_type"] = route.type
+    ros: dict[str, Any] = {"queue_size": route.queue} if route.queue else {}
+    qos = {"reliability": route.reliability, "durability": route.durability}
+    qos = {name: value for name, value in qos.items() if value}
+    ros |= {"qos": qos} if qos else {}
+    mqtt: dict[str, Any] = {"qos": route.qos} if route.qos else {}
+    mqtt |= {"retained": True} if retained else {}
+    advanced = {name: part for name, part in (("ros", ros), ("mqtt", mqtt)) if part}
+    return {**options, "advanced": advanced} if advanced else options

@@ -1,0 +1,218 @@
+"""ROS connections: each end is an eProsima DDS-Router that links the node to the other end.
+
+Configuration as DDS-Router v3.5 reads it (version v5.0). A running router accepts a new allowlist
+from the mounted file, which it reads again at an interval. Any other change restarts the pod.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any
+
+from demandops import naming
+from demandops.config.config import NODES_FILE, Config
+from demandops.config.inventory import Node, Wan
+from demandops.connections.communication_client import ClientKey, End
+from demandops.connections.connection_type import (
+    UNSUPPORTED,
+    Connections,
+    ConnectionType,
+    Ends,
+    make_end,
+    unplannable,
+)
+from demandops.connections.route import Route
+from demandops.errors import Fault, fault
+
+_LOCAL, _WAN = "local", "wan"
+
+
+class Ros(ConnectionType):
+    """One end listens at its node's address, and the other connects to it."""
+
+    name = "ROS"
+    number = 0
+    image = "dds-router"
+    options = frozenset({"reliability", "durability", "queue", "rate"})
+
+    def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
+        """Yield that no end can be reached."""
+        known = {ends.source, ends.target} <= config.nodes.keys()
+        if known and _listener(ends, config) is None:
+            yield fault(
+                "type",
+                f"{self.label} needs an end with a reachable address; add wan: {{host: …}} to "
+                f"'{ends.source}' or '{ends.target}' in {NODES_FILE}",
+                code=UNSUPPORTED,
+            )
+
+    def route_faults(
+        self, where: str, route: Route, sender: str, config: Config
+    ) -> Iterator[Fault]:
+        """Yield that a message type is unknown, or that a QoS policy is missing."""
+        if sender in config.nodes and not message_type(route, sender, config):
+            yield fault(
+                f"{where}.type",
+                f"the message type of '{route.source}' is not known, and ROS needs it; give it in "
+                "the request if it has a field for it, or add it to types of "
+                f"'{sender}' in {NODES_FILE}",
+            )
+        if route.durability and not route.reliability:
+            yield fault(
+                f"{where}.reliability",
+                f"is not given, but durability of '{route.source}' is set; ROS needs both, add it",
+            )
+
+    def client(self, key: ClientKey, connections: Connections, config: Config) -> RosEnd | None:
+        """Return one end of a connection."""
+        connection = connections.get(key.id)
+        if connection is None or not connection.topics:
+            return None
+        ends = (connection.source, connection.target)
+        typed = {
+            name: replace(
+                route, type=message_type(route, route.sender_and_receiver(*ends)[0], config)
+            )
+            for name, route in connection.topics.items()
+        }
+        listener = _listener(connection, config)
+        if listener is None or listener.wan is None:
+            message = f"connection '{key.id}' has no end with a wan address any longer; restore one"
+            raise unplannable("connections", message)
+        port = _port(key.id, listener.wan)
+        for other in connections.at(listener.id):
+            if other == key.id or _port(other, listener.wan) != port:
+                continue
+            found = connections.get(other)
+            if found is not None and _listener(found, config) is listener:
+                message = (
+                    f"connection '{key.id}' would listen on port {port} of "
+                    f"'{listener.id}', as '{other}' does; use another connection id, or widen "
+                    "firstPort and lastPort of its wan"
+                )
+                raise unplannable("connections", message)
+        connection = replace(connection, topics=MappingProxyType(typed))
+        return make_end(
+            RosEnd, key, connection, config, listener=listener.id, wan=listener.wan, port=port
+        )
+
+
+ROS = Ros()
+
+
+def message_type(route: Route, sender: str, config: Config) -> str:
+    """Return the message type of a route from ``sender``, as the route or the inventory says."""
+    known = config.nodes.get(sender)
+    return route.type or (known.types.get(route.read_topic, "") if known else "")
+
+
+def _listener(ends: Ends, config: Config) -> Node | None:
+    """Return the end that the other connects to: the target if it has a wan address."""
+    for id in (ends.target, ends.source):
+        node = config.nodes.get(id)
+        if node is not None and node.wan is not None:
+            return node
+    return None
+
+
+def _port(connection: str, wan: Wan) -> int:
+    """Return the port of a connection's routers; it depends on the connection id only."""
+    return wan.first_port + _number(connection) % (wan.last_port - wan.first_port + 1)
+
+
+@lru_cache(maxsize=65_536)
+def _number(connection: str) -> int:
+    """Return a number for a connection id; cached, because all ids of a node are compared."""
+    return int(naming.digest("port", connection), 16)
+
+
+@dataclass(frozen=True, slots=True)
+class RosEnd(End):
+    """One end of a ROS connection. Every route of ``topics`` has its message type."""
+
+    listener: str
+    """The node that listens, at ``port`` of its address ``wan``."""
+    wan: Wan
+    port: int
+
+    def facts(self) -> list[str]:
+        """Return the topics and the address."""
+        return [*End.facts(self), f"address {self.wan.host}:{self.port}"]
+
+    def configuration(self) -> dict[str, Any]:
+        """Return the configuration of one end's router.
+
+        A topic passes only from the end that reads it to the end that writes it. Most topics come
+        from the source. The general routes cover them, so that a new one needs no restart.
+        """
+        inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
+        topics, tuned, reverse = [], [], []
+        for route in self.topics.values():
+            reads = self.reads(route)
+            topic = {"name": f"rt{route.read_topic}", "type": dds_type(route.type)}
+            topics.append(topic)
+            if qos := _qos(route, reads=reads):
+                tuned.append({**topic, "qos": qos})
+            if route.reverse:
+                reverse.append({**topic, "routes": inward if reads else outward})
+        listens = self.node.id == self.listener
+        address = {
+            "ip" if _is_ip(self.wan.host) else "domain": self.wan.host,
+            "port": self.port,
+            "transport": self.wan.transport,
+        }
+        return {
+            "version": "v5.0",
+            "allowlist": topics,
+            **({"topics": tuned} if tuned else {}),
+            "routes": inward if self.side == "source" else outward,
+            **({"topic-routes": reverse} if reverse else {}),
+            "participants": [
+                {"name": _LOCAL, "kind": "local", "domain": self.node.ros.domain_id},
+                {
+                    "name": _WAN,
+                    "kind": "wan",
+                    "listening-addresses" if listens else "connection-addresses": [address],
+                },
+            ],
+        }
+
+    def needs_restart(self, configuration: dict[str, Any]) -> dict[str, Any]:
+        """Return all except the list of topics."""
+        return {name: value for name, value in configuration.items() if name != "allowlist"}
+
+
+def dds_type(ros_type: str) -> str:
+    """Return the DDS name of a message type: ``std_msgs::msg::dds_::String_``."""
+    package, kind, name = ros_type.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
+    """Return the routes that let only one participant send to the other."""
+    return [{"src": sender, "dst": [receiver]}, {"src": receiver}]
+
+
+def _qos(route: Route, *, reads: bool) -> dict[str, Any]:
+    """Return a topic's settings; the end that reads the topic limits its rate, before the link."""
+    qos: dict[str, Any] = {}
+    if route.reliability:
+        qos["reliability"] = route.reliability == "reliable"
+    if route.durability:
+        qos["durability"] = route.durability == "transient_local"
+    if route.queue:
+        qos["history-depth"] = route.queue
+    if route.rate and reads:
+        qos["max-tx-rate"] = route.rate
+    return qos
+
+
+def _is_ip(host: str) -> bool:
+    try:
+        return bool(ipaddress.ip_address(host))
+    except ValueError:
+        return False

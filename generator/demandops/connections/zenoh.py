@@ -1,0 +1,214 @@
+"""Zenoh connections: each node has one zenoh-bridge-ros2dds for all of them.
+
+Two bridges on one host and ROS domain do not work. Configuration as
+eclipse-zenoh/zenoh-plugin-ros2dds 1.10 reads it, at the start only.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from demandops import naming
+from demandops.config.config import NODES_FILE, Config
+from demandops.config.config_reader import ConfigReader
+from demandops.config.inventory import Node
+from demandops.connections.communication_client import Client, ClientKey
+from demandops.connections.connection_type import (
+    UNSUPPORTED,
+    Connections,
+    ConnectionType,
+    Ends,
+    unplannable,
+)
+from demandops.errors import Fault, fault
+
+
+class Zenoh(ConnectionType):
+    """All Zenoh connections of a node share its bridge."""
+
+    name = "ZENOH"
+    number = 2
+    image = "zenoh-bridge"
+    options = frozenset({"rate"})
+
+    def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
+        """Yield every second bridge on one host."""
+        hosts: dict[tuple[object, ...], str] = {}
+        for node in config.nodes.values():
+            host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
+            if node.zenoh and (other := hosts.setdefault(host, node.id)) != node.id:
+                yield fault(
+                    f"nodes[{reader.index_of(NODES_FILE, node.id)}].zenoh",
+                    f"'{other}' already runs a bridge on the same host and ROS domain; remove one "
+                    "of them",
+                ).within(NODES_FILE)
+
+    def shares_clients(self, config: Config) -> bool:
+        """Return whether any node has a bridge."""
+        return any(node.zenoh for node in config.nodes.values())
+
+    def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
+        """Yield that a node has no bridge, or that neither bridge can reach the other."""
+        source, target = config.nodes.get(ends.source), config.nodes.get(ends.target)
+        if source is None or target is None:
+            return
+        for end, node in (("source", source), ("target", target)):
+            if node.zenoh is None:
+                yield fault(
+                    end,
+                    f"'{node.id}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to it in "
+                    f"{NODES_FILE}, or zenoh: {{}} if it can reach others",
+                    code=UNSUPPORTED,
+                )
+        if source.zenoh is None or target.zenoh is None or source.id == target.id:
+            return
+        shared = set(source.zenoh.connect) & set(target.zenoh.connect)
+        if not (source.zenoh.endpoint or target.zenoh.endpoint or shared):
+            yield fault(
+                "type",
+                f"{self.label} finds no route between '{source.id}' and '{target.id}'; give one "
+                f"of them an endpoint under zenoh in {NODES_FILE}, or both one router under "
+                "connect",
+                code=UNSUPPORTED,
+            )
+
+    def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
+        """Return the keys of both nodes' bridges."""
+        return ClientKey(self, source), ClientKey(self, target)
+
+    def client(self, key: ClientKey, connections: Connections, config: Config) -> Bridge | None:
+        """Return a node's bridge."""
+        publishers: dict[str, tuple[float, str]] = {}
+        subscribers: set[str] = set()
+        peers: dict[str, str] = {}
+        for id in connections.at(key.id):
+            connection = connections.get(id)
+            if connection is None or not connection.topics:
+                continue
+            ends = connection.source, connection.target
+            peers[id] = ends[1] if key.id == ends[0] else ends[0]
+            for route in connection.topics.values():
+                if key.id != route.sender_and_receiver(*ends)[0]:
+                    subscribers.add(route.written_topic)
+                    continue
+                rate, other = publishers.setdefault(route.read_topic, (route.rate, id))
+                if rate != route.rate:
+                    message = (
+                        f"rate {route.rate} of '{route.read_topic}' in '{id}' contradicts an "
+                        f"existing claim: '{other}' carries it from '{key.id}' with rate {rate}, "
+                        "and the node's bridge has one for each topic; use the same"
+                    )
+                    raise unplannable("connections", message, "conflict")
+        if not peers:
+            return None
+        node, domain = config.node_and_domain(key.id)
+        return Bridge(
+            type=self,
+            name=naming.object_name(self.word, key.id),
+            node=node,
+            domain=domain,
+            connections=tuple(peers),
+            publishers=tuple(sorted(publishers)),
+            subscribers=tuple(sorted(subscribers)),
+            rates=MappingProxyType(
+                {t: rate for t, (rate, _) in sorted(publishers.items()) if rate}
+            ),
+            connect=_connect(node, set(peers.values()), config),
+            listen=node.zenoh.listening() if node.zenoh else (),
+        )
+
+
+ZENOH = Zenoh()
+
+
+def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
+    """Return the endpoints that a bridge connects to: its routers, and some of its peers.
+
+    If two peers can reach each other, only the one whose id sorts first connects. So there is one
+    link between them.
+    """
+    if node.zenoh is None:
+        message = (
+            f"'{node.id}' carries Zenoh connections, but has no zenoh in {NODES_FILE} any longer; "
+            "restore it"
+        )
+        raise unplannable("node", message)
+    endpoints = set(node.zenoh.connect)
+    for id in peers:
+        peer = config.nodes.get(id)
+        endpoint = peer.zenoh.endpoint if peer and peer.zenoh else None
+        if endpoint and (not node.zenoh.endpoint or node.id < id):
+            endpoints.add(endpoint)
+    return tuple(sorted(endpoints))
+
+
+@dataclass(frozen=True, slots=True)
+class Bridge(Client):
+    """The desired state of a node's Zenoh bridge.
+
+    ``publishers`` are the topics that it reads from the node's ROS graph, ``subscribers`` those
+    that it publishes there. ``rates`` limits the messages per second of a topic that it reads.
+    """
+
+    publishers: tuple[str, ...]
+    subscribers: tuple[str, ...]
+    rates: Mapping[str, float]
+    connect: tuple[str, ...]
+    listen: tuple[str, ...]
+
+    @property
+    def description(self) -> str:
+        """Name the node."""
+        return f"Zenoh bridge on {self.node.id}"
+
+    def facts(self) -> list[str]:
+        """Return its connections, topics, rates and endpoints."""
+        return [
+            *(f"connection {id}" for id in self.connections),
+            *(f"reads {topic}" for topic in self.publishers),
+            *(f"writes {topic}" for topic in self.subscribers),
+            *(f"rate {rate:g} of {topic}" for topic, rate in self.rates.items()),
+            *(f"connects to {endpoint}" for endpoint in self.connect),
+        ]
+
+    def configuration(self) -> dict[str, Any]:
+        """Return the configuration of a node's bridge.
+
+        ``allow`` lists the topics that pass; a missing list lets none pass. Multicast scouting is
+        off: Git says which bridges connect.
+        """
+        lists = {"publishers": self.publishers, "subscribers": self.subscribers}
+        ros: dict[str, Any] = {
+            "nodename": naming.ros_name(self.name),
+            "domain": self.node.ros.domain_id,
+            "allow": {
+                name: [_exactly(topic) for topic in topics]
+                for name, topics in lists.items()
+                if topics
+            },
+        }
+        if self.rates:
+            ros["pub_max_frequencies"] = [
+                f"{_exactly(topic)}={rate:g}" for topic, rate in self.rates.items()
+            ]
+        return {
+            "mode": "router",
+            "connect": {"endpoints": list(self.connect)},
+            "listen": {"endpoints": list(self.listen)},
+            "scouting": {"multicast": {"enabled": False}},
+            "plugins": {"ros2dds": ros},
+        }
+
+    def written(self, configuration: Mapping[str, Any]) -> str:
+        """Return a configuration as JSON."""
+        return json.dumps(configuration, indent=2, ensure_ascii=False) + "\n"
+
+
+def _exactly(topic: str) -> str:
+    """Return the regular expression that matches only this topic's name."""
+    return f"^{re.escape(topic)}$"

@@ -1,0 +1,101 @@
+"""HTTP calls to other services: the only module that imports httpx.
+
+The system's certificates are trusted, or those of ``SSL_CERT_FILE``, and the usual variables name a
+proxy. No redirect is followed, because credentials must not reach another host. An answer may not
+be too long or take too long. No error contains the URL or a header, which may hold secrets.
+"""
+
+from __future__ import annotations
+
+import logging
+import ssl
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from demandops import __version__
+from demandops.errors import DemandOpsError, quoted
+
+if TYPE_CHECKING:
+    import httpx
+
+_MOST_BYTES = 4_000_000
+
+for _name in ("httpx", "httpcore"):  # they log URLs and headers
+    logging.getLogger(_name).setLevel(logging.WARNING)
+
+
+class NoAnswer(DemandOpsError):
+    """Raised when a service gives no usable answer; the message says why and what to check."""
+
+
+@dataclass(frozen=True, slots=True)
+class HttpAnswer:
+    """An answer: its status, the status in words, and the body."""
+
+    status: int
+    reason: str
+    body: bytes
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the service accepted the call."""
+        return 200 <= self.status < 300
+
+    @property
+    def is_redirect(self) -> bool:
+        """Whether the service sends the caller elsewhere."""
+        return 300 <= self.status < 400
+
+
+def call(
+    method: str, url: str, headers: Mapping[str, str], body: bytes | None, timeout: float
+) -> HttpAnswer:
+    """Send a request and return the answer, whatever its status.
+
+    Args:
+        timeout: seconds to connect, to send and to wait for each part of the answer; the body must
+            be complete within twice this time.
+
+    Raises:
+        NoAnswer: if there is no answer, or it is too long or too slow.
+    """
+    import httpx  # noqa: PLC0415 - a tenth of a second; only when used
+
+    headers = {"User-Agent": f"demandops/{__version__}", "Accept-Encoding": "identity", **headers}
+    end = time.monotonic() + 2 * timeout
+    try:
+        with (
+            httpx.Client(verify=ssl.create_default_context(), timeout=timeout) as client,
+            client.stream(method, url, headers=headers, content=body) as answer,
+        ):
+            content = b""
+            for chunk in answer.iter_raw():
+                content += chunk
+                if len(content) > _MOST_BYTES:
+                    raise NoAnswer(f"the answer is longer than {_MOST_BYTES} bytes; check the URL")
+                if time.monotonic() > end:
+                    raise NoAnswer(_too_slow(timeout))
+            return HttpAnswer(answer.status_code, answer.reason_phrase, content)
+    except httpx.TimeoutException:
+        raise NoAnswer(_too_slow(timeout)) from None
+    except httpx.TransportError as error:
+        raise NoAnswer(_cause(error)) from None
+    except (httpx.InvalidURL, ValueError):
+        raise NoAnswer("the URL or a header is not valid; check them") from None
+
+
+def _too_slow(timeout: float) -> str:
+    return f"no complete answer within {timeout:g} s; check that it runs and can be reached"
+
+
+def _cause(error: httpx.TransportError) -> str:
+    """Return why there is no answer, without what was sent."""
+    if type(error).__name__ in ("LocalProtocolError", "UnsupportedProtocol"):
+        return "the URL or a header is not valid; check them"
+    text = str(error) or type(error).__name__
+    text = text if text.isprintable() else quoted(text)
+    if "CERTIFICATE_VERIFY_FAILED" in text:
+        return f"{text}; if you trust the certificate, name it in SSL_CERT_FILE"
+    return f"{text}; check that it runs and can be reached"

@@ -1,0 +1,71 @@
+"""The file of a communication client: a Deployment, and a ConfigMap with its configuration.
+
+Each connection type has a template and a schema in ``templates/connections/<type>/``. The schemas
+are our own and list the fields that each program reads. A program ignores an unknown field or
+crashes on it, which shows only on the node.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+
+from demandops.config.base_model import field_path
+from demandops.config.config import IMAGES_FILE, Config
+from demandops.connections.communication_client import Client
+from demandops.connections.connection_type import unplannable
+from demandops.errors import InvalidInput, fault
+from demandops.render.engine import Engine
+from demandops.settings import data_folder
+
+
+def render(client: Client, config: Config, engine: Engine) -> str:
+    """Return the manifests of a client as one YAML text.
+
+    Raises:
+        InvalidInput: if its configuration has a field that the program does not read.
+        Refused: if the registry has no image for the client.
+    """
+    kind, node = client.type, client.node
+    if kind.image not in config.images:
+        message = f"'{kind.image}' is in use, but not in {IMAGES_FILE}; add it there"
+        raise unplannable("images", message)
+    configuration = client.configuration()
+    check_configuration(kind.word, configuration, client.name)
+    restarts = client.written(client.needs_restart(configuration))
+    return engine.text(
+        f"connections/{kind.word}/client.yaml.j2",
+        client=client,
+        configuration=client.written(configuration),
+        checksum=hashlib.sha256(restarts.encode()).hexdigest(),
+        node=node,
+        selector=node.labels(),
+        tolerations=[item.model_dump(exclude_defaults=True) for item in node.tolerations],
+        image=client.shaping.image(kind.image, config.images).reference(),
+    )
+
+
+def check_configuration(kind: str, configuration: dict[str, Any], client: str) -> None:
+    """Check the configuration of a client against the schema of its connection type.
+
+    Raises:
+        InvalidInput: naming each field that does not match. It is a fault of the program, not of a
+            demand.
+    """
+    schema = data_folder("templates") / "connections" / kind / "schema.json"
+    faults = [
+        fault(field_path(tuple(error.instance_path)), error.message).within(f"{kind} of {client}")
+        for error in _validator(schema).iter_errors(configuration)
+    ]
+    if faults:
+        raise InvalidInput(faults)
+
+
+@lru_cache(maxsize=8)
+def _validator(schema: Path) -> Any:  # noqa: ANN401
+    return jsonschema_rs.Draft7Validator(json.loads(schema.read_text()))

@@ -1,0 +1,116 @@
+"""Slots: the folders for the journal and the clone of each process that serves one state repo."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import IO
+
+from demandops.errors import StateRepoError
+from demandops.staterepo.write.journal import (
+    DamagedJournal,
+    Journal,
+    JournalEntry,
+    read,
+    readable_entries,
+    sync_folder,
+)
+
+_MAX_SLOTS = 256
+_JOURNAL = "outbox.jsonl"
+
+
+class Slot:
+    """A folder for the journal and the clone of one process, locked while the process lives.
+
+    Several processes on one machine may serve one state repo. Each takes the first free slot and
+    takes over the journals of dead processes.
+    """
+
+    def __init__(self, root: Path) -> None:
+        try:
+            root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError as error:
+            raise StateRepoError(
+                f"the data folder {root} cannot be made: {error.strerror}; set DEMANDOPS_DATA_HOME "
+                "to a writable folder"
+            ) from None
+        for number in range(_MAX_SLOTS):
+            folder = root / f"slot-{number}"
+            lock = _lock(folder)
+            if lock is not None:
+                self.folder, self._lock = folder, lock
+                break
+        else:
+            raise OSError(f"{_MAX_SLOTS} processes already use {root}")
+        try:
+            self.journal = Journal(self.folder / _JOURNAL)
+            self._adopt_orphans(root)
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def _adopt_orphans(self, root: Path) -> None:
+        """Take over the journals of dead processes.
+
+        An entry is written here before it is removed there. A crash between the two leaves it
+        twice, but its operation id makes it count once.
+        """
+        for journal in sorted(root.glob(f"slot-*/{_JOURNAL}")):
+            lock = _lock(journal.parent) if journal.parent != self.folder else None
+            if lock is not None:
+                with lock:
+                    self.journal.append(read(journal).values())
+                    journal.unlink()
+
+    def close(self) -> None:
+        """Close the journal and release the slot."""
+        self.journal.close()
+        self._lock.close()
+
+
+@dataclass(frozen=True, slots=True)
+class FoundJournal:
+    """A journal on this machine, and its demands that are not done.
+
+    ``damage`` is the error that it raises, or empty; ``set_aside`` is where the file is now.
+    """
+
+    file: Path
+    demands: list[JournalEntry]
+    damage: str = ""
+    set_aside: Path | None = None
+
+
+def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[FoundJournal]:
+    """Yield the journals of a data folder that have demands or are damaged.
+
+    The damaged ones are renamed if ``set_aside``, except those that a running process uses.
+    """
+    for file in sorted(root.glob(f"slot-*/{_JOURNAL}")):
+        try:
+            demands = list(read(file).values())
+            if demands:
+                yield FoundJournal(file, demands)
+        except DamagedJournal as damage:
+            moved = None
+            lock = _lock(file.parent) if set_aside else None
+            if lock is not None:
+                with lock:
+                    moved = file.rename(file.with_name(f"outbox-{now:%Y%m%dT%H%M%S}.damaged"))
+                    sync_folder(file.parent)
+            yield FoundJournal(file, readable_entries(moved or file), str(damage), moved)
+
+
+def _lock(folder: Path) -> IO[str] | None:
+    folder.mkdir(exist_ok=True, mode=0o700)
+    handle = (folder / "lock").open("w")
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        handle.close()
+        return None
+    return handle

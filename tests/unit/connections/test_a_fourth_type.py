@@ -1,0 +1,218 @@
+"""A fourth connection type: one module, its templates, and one more entry in the list of types.
+
+The module is this one. A relay runs at the target and fetches the topics of all sources. Nothing
+else in the program knows it, and a demand for it is booked, planned, rendered and explained.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from demandops import naming, settings
+from demandops.config.config import NODES_FILE, Config
+from demandops.connections import connection_types
+from demandops.connections.communication_client import Client, ClientKey
+from demandops.connections.connection_type import Connections, ConnectionType, Ends
+from demandops.decision import Decision
+from demandops.demand.claim import Subject, SubjectKind
+from demandops.errors import Fault, InvalidInput, fault
+from demandops.ledger import claim_file
+from demandops.plan.views import explanation
+
+from tests.kit.connections import ROS_IMAGE, demand, routes, state
+from tests.kit.goals import connection, goal
+from tests.kit.memory import MemoryRepo
+
+SCHEMA = {
+    "type": "object",
+    "required": ["fetch"],
+    "additionalProperties": False,
+    "properties": {"fetch": {"type": "object", "additionalProperties": {"type": "string"}}},
+}
+TEMPLATE = """\
+apiVersion: v1
+kind: ConfigMap
+metadata:
+  name: {{ client.name }}
+  namespace: {{ client.domain.namespace }}
+data:
+  relay.yaml: |
+{{ configuration | literal(4) }}
+---
+apiVersion: apps/v1
+kind: Deployment
+metadata:
+  name: {{ client.name }}
+  namespace: {{ client.domain.namespace }}
+spec:
+  replicas: 1
+  selector:
+    matchLabels:
+      app.kubernetes.io/instance: {{ client.name }}
+  template:
+    metadata:
+      labels:
+        app.kubernetes.io/instance: {{ client.name }}
+      annotations:
+        demandops/config-checksum: {{ checksum }}
+    spec:
+{% include 'connections/placement.yaml.j2' %}
+      containers:
+        - name: relay
+          image: {{ image }}
+{% include 'connections/security.yaml.j2' %}
+"""
+
+
+class RelayType(ConnectionType):
+    """A client at the target fetches all topics of its connections."""
+
+    name = "RELAY"
+    number = 7
+    image = "relay"
+    options = frozenset({"queue"})
+    renames = True
+
+    def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
+        target = config.nodes.get(ends.target)
+        if target is not None and target.wan is None:
+            yield fault("target", f"'{target.id}' has no wan; add it in {NODES_FILE}")
+
+    def shares_clients(self, config: Config) -> bool:
+        return True
+
+    def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
+        return (ClientKey(self, target),)
+
+    def client(self, key: ClientKey, connections: Connections, config: Config) -> Client | None:
+        found = [one for id in connections.at(key.id) if (one := connections.get(id))]
+        carried = [one for one in found if one.target == key.id and one.topics]
+        fetch = {r.read_topic: r.written_topic for one in carried for r in one.topics.values()}
+        node, domain = config.node_and_domain(key.id)
+        name = naming.object_name(self.word, key.id)
+        ids = tuple(one.id for one in carried)
+        return Relay(self, name, node, domain, ids, fetch) if carried else None
+
+
+@dataclass(frozen=True, slots=True)
+class Relay(Client):
+    """A node's relay."""
+
+    fetch: dict[str, str]
+
+    @property
+    def description(self) -> str:
+        return f"relay on {self.node.id}"
+
+    def facts(self) -> list[str]:
+        return [f"fetches {topic} as {name}" for topic, name in self.fetch.items()]
+
+    def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
+        yield NODES_FILE, f"{self.node.id}.wan", "where it can be reached"
+
+    def configuration(self) -> dict[str, Any]:
+        return {"fetch": self.fetch}
+
+
+RELAY = RelayType()
+
+
+@pytest.fixture(autouse=True)
+def a_fourth_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(settings.data_folder("templates"), tmp_path / "templates")
+    folder = tmp_path / "templates" / "connections" / "relay"
+    folder.mkdir()
+    folder.joinpath("client.yaml.j2").write_text(TEMPLATE)
+    folder.joinpath("schema.json").write_text(json.dumps(SCHEMA))
+    for name in ("appdefs", "state-repo-skeleton"):
+        (tmp_path / name).symlink_to(settings.data_folder(name))
+    monkeypatch.setattr(settings, "_CHECKOUT", tmp_path)
+    types = (*connection_types.CONNECTION_TYPES, RELAY)
+    monkeypatch.setattr(connection_types, "CONNECTION_TYPES", types)
+
+
+def repo() -> MemoryRepo:
+    images = ROS_IMAGE + "  relay: {repository: registry.example/relay, tag: '1'}\n"
+    before = state(images, brokers=False, edge={"wan": {"host": "192.0.2.1"}})
+    return MemoryRepo(state=before)
+
+
+def booked(kind: str = "relay") -> tuple[MemoryRepo, Decision]:
+    world = repo()
+    return world, world.send(routes(demand(kind, {"/a": {"target": "/b", "queue": 3}})))
+
+
+def test_a_demand_for_it_becomes_a_claim_that_its_file_keeps() -> None:
+    world, _ = booked()
+    (claim,) = world.state.ledger.connection_claims("c")
+    assert claim.type is RELAY
+    path = claim_file.path_of(claim.key)
+    assert yaml.safe_load(world.files[path])["type"] == "relay"
+    assert claim_file.read(world.files[path], path) == claim
+
+
+def test_its_client_is_rendered_and_described_for_the_commit() -> None:
+    world, decision = booked()
+    assert world.objects("Deployment").keys() == {"relay-edge"}
+    (config,) = world.objects("ConfigMap").values()
+    assert yaml.safe_load(config["data"]["relay.yaml"]) == {"fetch": {"/a": "/b"}}
+    (release,) = decision.releases
+    assert (release.change, release.description) == ("start", "relay on edge")
+
+
+def test_a_further_connection_changes_the_shared_client_by_the_facts_that_it_adds() -> None:
+    world, _ = booked()
+    other = demand("relay", {"/c": "/c"}, id="d", source="vehicle01")
+    (release,) = world.send(routes(other)).releases
+    assert (release.name, release.change) == ("relay-edge", "change")
+    assert release.details == ("+ fetches /c as /c",)
+    world.send(routes(other | {"shutdown": True}))
+    world.send(routes(demand("relay") | {"shutdown": True}))
+    assert world.objects("Deployment") == {}
+
+
+def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
+    world, _ = booked()
+    ledger = world.state.ledger
+    subject = Subject(SubjectKind.CONNECTION, "c")
+    (release,) = explanation.releases(ledger, world.config, subject)
+    assert explanation.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
+    files = [(one.file, one.entry) for one in explanation.shaping_files(release, world.config)]
+    assert ("inventory/nodes.yaml", "edge.wan") in files
+    assert ("registry/images.yaml", "images.relay") in files
+
+
+def test_it_is_chosen_if_no_other_can_carry_the_topic() -> None:
+    world, _ = booked("auto")
+    assert world.state.ledger.type_of("c") is RELAY
+
+
+def test_its_number_is_known_on_the_wire() -> None:
+    world = repo()
+    assert world.send(goal([], [connection("c", topics=["/a"], broker="", type=7)])).releases
+    (found,) = world.faults(goal([], [connection("d", topics=["/a"], broker="", type=9)]))
+    assert found.endswith("known: 0 (ROS), 1 (MQTT), 2 (ZENOH), 7 (RELAY)")
+
+
+def test_what_it_cannot_do_is_refused_and_others_name_it() -> None:
+    assert repo().faults(routes(demand("relay", {"/a": {"qos": 1}}, target="cloud"))) == [
+        "connections[0].target: 'cloud' has no wan; add it in inventory/nodes.yaml",
+        "connections[0].topics[0].qos: qos of '/a' is not supported by RELAY; leave it out, or use "
+        "type 1 (MQTT)",
+    ]
+    found = repo().faults(routes(demand("ros", {"/a": {"target": "/b"}})))
+    assert any(one.endswith("use one name, or type 1 (MQTT) or 7 (RELAY)") for one in found)
+
+
+def test_a_field_that_it_does_not_read_never_reaches_a_commit(tmp_path: Path) -> None:
+    schema = tmp_path / "templates" / "connections" / "relay" / "schema.json"
+    schema.write_text(json.dumps(SCHEMA | {"required": ["fetch", "port"]}))
+    with pytest.raises(InvalidInput, match="relay of relay-edge"):
+        booked()

@@ -1,0 +1,197 @@
+"""The journal's file: what a crash, a full disk or a damaged disk may do to it, and its size."""
+
+from __future__ import annotations
+
+import json
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from demandops.errors import StateRepoError
+from demandops.staterepo.write.journal import DamagedJournal, Journal, JournalEntry, parse, read
+
+PROPOSAL = {"branch": "demand/x", "commits": ["a"]}
+
+
+def entry(name: str, goal: object = "wish") -> JournalEntry:
+    return JournalEntry(f"op-{name}", {"id": goal}, "2026-01-31T12:00:00+00:00", "b" * 4)
+
+
+def pending(text: bytes) -> dict[str, JournalEntry]:
+    return parse(text, Path("outbox.jsonl"))
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "outbox.jsonl"
+
+
+@pytest.fixture
+def text(path: Path) -> bytes:
+    """A journal as a kill leaves it: two demands are pending, one is done, one is proposed."""
+    journal = Journal(path)
+    journal.append([entry("a"), entry("b")])
+    journal.append([entry("c")])
+    journal.mark_done(["op-b"])
+    journal.append([JournalEntry("op-c", {}, "2026-01-31T12:00:00+00:00", "", PROPOSAL)])
+    return path.read_bytes()
+
+
+def test_what_was_written_is_read(path: Path, text: bytes) -> None:
+    found = pending(text)
+    assert list(found) == ["op-a", "op-c"]
+    assert found["op-a"] == entry("a")
+    assert found["op-c"].proposal == PROPOSAL
+    assert Journal(path).pending == found
+    assert len(path.read_bytes().splitlines()) == 2, "what is done is left out at a start"
+
+
+def test_a_torn_last_entry_is_dropped(path: Path, text: bytes) -> None:
+    *lines, last = text.splitlines(keepends=True)
+    before = pending(b"".join(lines))
+    for length in range(len(last) - 1):
+        assert pending(b"".join(lines) + last[:length]) == before
+    whole = pending(text)
+    assert pending(text[:-1]) == whole
+    assert pending(text + b"\0" * 100) == whole, "pages that were never written"
+
+
+def test_a_torn_entry_is_gone_before_the_next_is_written(path: Path, text: bytes) -> None:
+    path.write_bytes(text[:-9])
+    journal = Journal(path)
+    journal.append([entry("d")])
+    assert list(read(path)) == ["op-a", "op-c", "op-d"]
+
+
+def test_no_flipped_bit_is_overlooked(path: Path, text: bytes) -> None:
+    whole, overlooked = pending(text), []
+    for position in range(len(text)):
+        for bit in range(8):
+            changed = bytearray(text)
+            changed[position] ^= 1 << bit
+            try:
+                if pending(bytes(changed)) != whole:
+                    overlooked.append((position, bit))
+            except DamagedJournal:
+                pass
+    assert overlooked == []
+
+
+def test_no_missing_doubled_or_moved_entry_is_overlooked(path: Path, text: bytes) -> None:
+    lines = text.splitlines(keepends=True)
+    for at in range(len(lines) - 1):
+        swapped = [*lines[:at], lines[at + 1], lines[at], *lines[at + 2 :]]
+        for changed in (lines[:at] + lines[at + 1 :], lines[: at + 1] + lines[at:], swapped):
+            with pytest.raises(DamagedJournal) as error:
+                pending(b"".join(changed))
+            assert str(error.value).startswith("outbox.jsonl: line ")
+
+
+def test_a_damage_names_its_place_and_the_remedy(path: Path, text: bytes) -> None:
+    path.write_bytes(text.replace(b"wish", b"wash", 2))
+    with pytest.raises(DamagedJournal) as error:
+        Journal(path)
+    assert str(error.value) == (
+        f"{path}: line 1 is not what the generator wrote there; run `demandops journal --set-aside`"
+        " for this state repo, which moves the file away and lists its demands, then send again "
+        "what is still needed"
+    )
+    assert path.read_bytes() != text, "nothing was written"
+
+
+@pytest.mark.parametrize("waiting", [0, 1, 3000])
+def test_the_file_stays_small_however_many_demands_pass(path: Path, waiting: int) -> None:
+    """Not even if one demand waits for approval all the time."""
+    journal = Journal(path)
+    journal.append(entry(f"waiting-{number}") for number in range(waiting))
+    largest = 0
+    for number in range(200):
+        batch = [entry(f"{number}-{each}", "x" * 100) for each in range(100)]
+        journal.append(batch)
+        journal.mark_done(each.operation for each in batch)
+        largest = max(largest, path.stat().st_size)
+    written = 20_000 * 300
+    assert largest < (1 << 20) + 3 * waiting * 250 + 100 * 400 < written
+    assert len(read(path)) == waiting
+
+
+# ---- a full disk ----
+
+
+@contextmanager
+def room(path: Path, more: int) -> Iterator[None]:
+    """Let files grow to the size of this one and some bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + more, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_without_room_nothing_is_accepted_and_nothing_lost(path: Path) -> None:
+    journal = Journal(path)
+    journal.append([entry("a")])
+    before = path.read_bytes()
+    with room(path, 50):
+        for _ in range(2):
+            with pytest.raises(StateRepoError, match=r"outbox\.jsonl cannot be written: File too"):
+                journal.append([entry("b")])
+            assert path.read_bytes() == before, "no half of an entry"
+            assert list(journal.pending) == ["op-a"]
+    journal.append([entry("c")])
+    assert list(read(path)) == ["op-a", "op-c"]
+
+
+def test_without_room_a_withdrawal_fails_and_an_answer_does_not(path: Path) -> None:
+    journal = Journal(path)
+    journal.append([entry("a"), entry("b")])
+    with room(path, 10):
+        with pytest.raises(StateRepoError):
+            journal.mark_done(["op-a"], durably=True)
+        assert list(journal.pending) == ["op-a", "op-b"]
+        journal.mark_done(["op-b"])
+    journal.append([entry("c")])
+    assert list(read(path)) == ["op-a", "op-c"]
+
+
+def test_a_journal_that_filled_the_disk_makes_room_once_all_is_done(path: Path) -> None:
+    journal = Journal(path)
+    journal.append([entry("a"), entry("b")])
+    with room(path, 10):
+        journal.mark_done(["op-a", "op-b"])
+        journal.append([entry("c")])
+        journal.close()
+    assert list(read(path)) == ["op-c"]
+
+
+# ---- the first version's journal ----
+
+
+def of_the_first_version(*records: dict[str, object]) -> bytes:
+    return b"".join(json.dumps(record).encode() + b"\n" for record in records)
+
+
+WAITING = {"operation": "op-1", "goal": {"id": 1}, "received": "2026-01-31T12:00:00", "base": ""}
+PROPOSED = {**WAITING, "operation": "op-2", "proposal": PROPOSAL}
+
+
+def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:
+    done = [{**WAITING, "operation": "op-3"}, {"done": "op-3"}]
+    path.write_bytes(of_the_first_version(WAITING, PROPOSED, *done) + b'{"operation": "op-4"')
+    found = read(path)
+    assert list(found) == ["op-1", "op-2"]
+    assert Journal(path).pending == found
+    assert path.read_bytes().count(b'"digest"') == 2
+    assert read(path) == found
+
+
+@pytest.mark.parametrize(
+    "line",
+    [b"42", b"null", b"{}", b"\x00\xff", b'{"done": []}', b'{"operation": "x"}', b"[" * 9999],
+)
+def test_a_line_that_the_first_version_did_not_write_is_damage(path: Path, line: bytes) -> None:
+    with pytest.raises(DamagedJournal, match="line 2 is not what"):
+        pending(of_the_first_version(WAITING) + line + b"\n" + of_the_first_version(PROPOSED))

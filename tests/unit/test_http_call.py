@@ -1,0 +1,130 @@
+"""HTTP calls to real servers on loopback: what they trust, how long they wait, what they tell."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import ssl
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from demandops import http_call
+from demandops.http_call import HttpAnswer, NoAnswer
+
+from tests.kit.http import Answer, serving
+
+SECRET = "s3cret"  # noqa: S105 - it opens nothing
+
+
+@pytest.fixture(autouse=True)
+def _no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("no_proxy", "127.0.0.1,localhost")
+
+
+def call(url: str, timeout: float = 5.0) -> HttpAnswer:
+    return http_call.call("POST", url, {"Authorization": SECRET}, b"{}", timeout)
+
+
+@contextmanager
+def speaking(
+    *chunks: bytes, pause: float = 0.0, tls: ssl.SSLContext | None = None
+) -> Iterator[str]:
+    """Answer one connection with these bytes, slowly, and close it."""
+
+    def speak() -> None:
+        try:
+            connection, _ = listener.accept()
+            with tls.wrap_socket(connection, server_side=True) if tls else connection as peer:
+                request = b""
+                while not request.endswith(b"{}"):
+                    request += peer.recv(1 << 16) or b"{}"
+                for chunk in chunks:
+                    peer.sendall(chunk)
+                    time.sleep(pause)
+        except OSError:  # the caller has had enough
+            pass
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=speak)
+        thread.start()
+        yield f"{'https' if tls else 'http'}://127.0.0.1:{listener.getsockname()[1]}/{SECRET}"
+        thread.join()
+
+
+def test_every_status_is_an_answer_and_nothing_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    with serving(lambda sent: Answer(418, b"no coffee")) as server:
+        answer = call(f"{server.url}/{SECRET}")
+    assert (answer.status, answer.body, answer.is_success) == (418, b"no coffee", False)
+    assert server.calls[0].body == b"{}"
+    assert SECRET not in caplog.text
+
+
+def test_an_answer_without_end_is_cut_off() -> None:
+    head = b"HTTP/1.1 200 OK\r\n\r\n"
+    with (
+        speaking(head, *[b"x" * 1_000_000] * 5) as url,
+        pytest.raises(NoAnswer, match="longer than 4000000 bytes; check the URL"),
+    ):
+        call(url)
+
+
+def test_an_answer_that_drips_is_cut_off() -> None:
+    head = b"HTTP/1.1 200 OK\r\n\r\n"
+    began = time.monotonic()
+    with (
+        speaking(head, *[b"x"] * 15, pause=0.1) as url,
+        pytest.raises(NoAnswer, match=r"no complete answer within 0\.3 s; check that it runs"),
+    ):
+        call(url, timeout=0.3)
+    assert time.monotonic() - began < 5
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("http://127.0.0.1:1/s3cret", "Connection refused; check that it runs and can be reached"),
+        ("http://s3cret:pass:word@:x/", "the URL or a header is not valid; check them"),
+        ("ftp://127.0.0.1/s3cret", "the URL or a header is not valid; check them"),
+    ],
+)
+def test_an_error_tells_no_secret(url: str, message: str) -> None:
+    with pytest.raises(NoAnswer) as error:
+        call(url)
+    assert message in str(error.value)
+    assert SECRET not in str(error.value)
+
+
+def test_an_answer_that_is_not_http_is_quoted_on_one_line() -> None:
+    with speaking(b"\x1b[31mhello\n\n") as url, pytest.raises(NoAnswer) as error:
+        call(url)
+    assert str(error.value).isprintable()
+
+
+def test_only_trusted_certificates_are_accepted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key, certificate = tmp_path / "key.pem", tmp_path / "cert.pem"
+    names = ["-subj", "/CN=x", "-addext", "subjectAltName=IP:127.0.0.1"]
+    command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
+    subprocess.run(
+        [*command, "-nodes", "-keyout", str(key), "-out", str(certificate), *names],
+        check=True,
+        capture_output=True,
+    )
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    tls.load_cert_chain(certificate, key)
+    answer = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok"
+    with (
+        speaking(answer, tls=tls) as url,
+        pytest.raises(NoAnswer, match="if you trust the certificate, name it in SSL_CERT_FILE"),
+    ):
+        call(url)
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    with speaking(answer, tls=tls) as url:
+        assert call(url).body == b"ok"
