@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from demandops.config.config import Config
+from demandops.connections.connection import Connection
 from demandops.demand import (
     admission,
     approval_rule,
@@ -24,8 +25,8 @@ from demandops.demand import (
     deployment_request_goal,
     permission,
 )
-from demandops.demand.claim import Subject
-from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.demand.application import Application
+from demandops.demand.demand_request import DemandRequest
 from demandops.errors import Fault, InvalidInput, Refused
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Changes, Ledger, changes_on
@@ -41,19 +42,20 @@ from demandops.render import trial_render
 from demandops.render.changes import changeset
 from demandops.render.changes.changeset import FileReader, ReleaseChange
 from demandops.render.engine import Engine
+from demandops.subject import Subject
 
 _SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
 Stage = Literal["admitted", "booked"]
 Outcome = Literal["booked", "released", "restored", "unchanged"]
 
-_OUTCOMES: dict[Operation, Outcome] = {
-    Operation.SHUTDOWN: "released",
-    Operation.RELEASE: "released",
-    Operation.EXPIRE: "released",
-    Operation.ROLLBACK: "restored",
-    Operation.DECOMMISSION: "released",
+_OUTCOMES: dict[str, Outcome] = {
+    "join": "booked",
+    "put": "booked",
+    "renew": "booked",
+    "rollback": "restored",
 }
+"""By operation; the others release."""
 
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 """Yields a fault if a request comes too soon after others of its requesters."""
@@ -131,18 +133,15 @@ def decide(
         if faults:
             raise Refused(faults)
     on_stage("admitted")
-    try:
-        ledger, changes = _book(state, request, now)
-        keys = affected_keys(state.ledger, ledger, state.config, changes.claims)
-        rendered = changeset.build_changeset(
-            state.ledger, ledger, changes.claims, keys, (state.config, state.engine, read)
-        )
-    except Refused as error:
-        raise Refused(_with_goal_fields(error.faults, request, state.config)) from None
+    ledger, changes = _book(state, request, now)
+    keys = affected_keys(state.ledger, ledger, state.config, changes.claims)
+    rendered = changeset.build_changeset(
+        state.ledger, ledger, changes.claims, keys, (state.config, state.engine, read)
+    )
     on_stage("booked")
     outcome: Outcome = "unchanged"
     if changes.claims:
-        outcome = _OUTCOMES.get(request.operation, "booked")
+        outcome = _OUTCOMES.get(request.operation, "released")
     return Decision(
         request=request,
         outcome=outcome,
@@ -169,7 +168,7 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
     Raises:
         Refused: if existing claims, an override or a quota forbid it.
     """
-    subjects, config = kept_claims.requested_subjects(request), state.config
+    subjects, config = request.subjects(), state.config
     ledger, changes = apply(kept_claims.without_kept_claims(state.ledger, subjects), request, now)
     refusals = list(denial.faults(request, ledger, changes, config))
     refusals = refusals or list(quota.faults(state.ledger, ledger, changes, config))
@@ -190,19 +189,18 @@ def admit(
     if isinstance(goal, dict) and decommission_goal.is_decommission(goal):
         return decommission_goal.parse(goal)
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
-        request, faults = demand_goal.parse(goal)
-        request = permission.with_lease_terms(request, config)
+        parsed, faults = demand_goal.parse(goal)
+        request = permission.with_lease_terms(parsed, config)
         request = implied_connections.with_implied_connections(request, state.ledger, config)
     else:
-        parsed, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
-        if parsed is None:
+        wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
+        if wired is None:
             raise Refused(faults)
-        request = permission.with_lease_terms(parsed, config)
-    request = connection_type_choice.with_chosen_types(request, config, state.ledger.type_of)
+        request = permission.with_lease_terms(wired, config)
+    request = connection_type_choice.with_chosen_types(request, config, state.ledger.connection)
     malformed = {found.field for found in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
-    content_faults = [*admission.faults(request, config), *permission.faults(request, config)]
-    content = _with_goal_fields(content_faults, request, config)
+    content = [*admission.faults(request, config), *permission.faults(request, config)]
     # do not report as missing what could not be read
     unread = bool(malformed & {"apps", "applications", "connections"})
     faults += [
@@ -262,27 +260,15 @@ def _subject_of(field: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else ("", 0)
 
 
-def _with_goal_fields(
-    faults: Iterable[Fault], request: DemandRequest, config: Config
-) -> list[Fault]:
-    """Return the faults with the field names of the original goal."""
-
-    def field(path: str) -> str:
-        if request.operation is Operation.DECOMMISSION:
-            return path
-        if request.operation.is_reference:
-            return deployment_request_goal.goal_field(path, request, config.appdefs)
-        return demand_goal.goal_field(path, request)
-
-    return [replace(found, field=field(found.field)) for found in faults]
-
-
 def _missing_connections(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
     """Yield a warning for each input that no connection brings to the application's node."""
-    if not request.operation.adds_claims:
+    if not request.adds_claims:
         return
     ledger = without_suspended(ledger, config)
-    for app in request.applications:
+    for one in request.demanded:
+        app = one.held
+        if not isinstance(app, Application):
+            continue
         for foreign in implied_connections.foreign_inputs(app, config):
             topic = foreign.topic
             if not ledger.is_carried_to(app.node, topic.topic):
@@ -294,11 +280,14 @@ def _missing_connections(request: DemandRequest, ledger: Ledger, config: Config)
 
 def _already_bridged(request: DemandRequest, config: Config) -> Iterator[str]:
     """Yield a warning for each topic that the initial deployment already carries."""
-    if not request.operation.adds_claims:
+    if not request.adds_claims:
         return
-    for connection in request.connections:
+    for one in request.demanded:
+        connection = one.held
+        if not isinstance(connection, Connection):
+            continue
         for route in connection.topics:
-            if is_bridged(route, connection.source, connection.target, config):
+            if is_bridged(route, *connection.nodes, config):
                 yield (
                     f"connection '{connection.id}': {route.read_topic} is bridged between "
                     f"'{connection.source}' and '{connection.target}' already, so no client "

@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.demand_request import Demanded, Join, Place
 from demandops.errors import Refused
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
@@ -270,20 +271,14 @@ class TestParameters:
     def book(
         ledger: Ledger, who: str, appdef: str = "recorder", minute: int = 0, **parameters: object
     ) -> Ledger:
-        request = DemandRequest(
-            id=who,
-            operation=Operation.JOIN,
-            applications=(
-                ApplicationDemand(
-                    id=f"edge/{appdef}",
-                    appdef=appdef,
-                    node="edge",
-                    requesters=(who,),
-                    inputs={"point_cloud": (InputTopic(*CLOUD),)},
-                    parameters=MappingProxyType(parameters),
-                ),
-            ),
+        app = Application(
+            f"edge/{appdef}",
+            appdef,
+            "edge",
+            {"point_cloud": (InputTopic(*CLOUD),)},
+            MappingProxyType(parameters),
         )
+        request = Join(who, (Demanded(app, (who,), Place("applications[0]")),))
         return apply(ledger, request, NOW + timedelta(minutes=minute))[0]
 
     @staticmethod

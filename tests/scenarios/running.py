@@ -17,7 +17,7 @@ from demandops.config.base_model import FrozenModel, parse_file
 from demandops.config.load import load
 from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered_files
-from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.demand.demand_request import Expire
 from demandops.errors import Fault, Refused
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
@@ -223,7 +223,7 @@ class World(MemoryRepo):
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
         done = []
         for demand in dict.fromkeys(claim.demand for claim in claims):
-            request = DemandRequest(id=demand, operation=Operation.EXPIRE, demand=demand)
+            request = Expire(id=demand, demand=demand)
             taken = self.take(request)
             assert isinstance(taken, Decision)
             assert taken.files, f"nothing of '{demand}' was released at {now}"

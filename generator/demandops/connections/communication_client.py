@@ -87,7 +87,7 @@ class End(Client):
 
     side: Side
     peer: str
-    topics: Mapping[str, Route]
+    topics: tuple[Route, ...]
 
     @property
     def description(self) -> str:
@@ -97,7 +97,7 @@ class End(Client):
 
     def facts(self) -> list[str]:
         """Return the topics."""
-        return [route.fact for route in self.topics.values()]
+        return [route.fact for route in self.topics]
 
     def reads(self, route: Route) -> bool:
         """Return whether this end reads the topic from ROS, and the other end publishes it."""

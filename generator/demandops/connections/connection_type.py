@@ -7,14 +7,14 @@ what it supports and needs, which clients a connection has, and what each of the
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from demandops import naming
 from demandops.config.config import Config
 from demandops.config.config_reader import ConfigReader
 from demandops.connections.communication_client import Client, ClientKey, End
+from demandops.connections.connection import Connection
 from demandops.connections.route import Route
 from demandops.errors import Fault, Refused, fault
 
@@ -22,28 +22,6 @@ UNSUPPORTED = "unsupported-connection-type"
 """The code of a fault: inventory or registry lack what a type needs."""
 
 AnyEnd = TypeVar("AnyEnd", bound=End)
-
-
-class Ends(Protocol):
-    """The ends of a demanded, claimed or planned connection; ``broker`` is empty if not given."""
-
-    @property
-    def source(self) -> str: ...  # noqa: D102 - see above
-    @property
-    def target(self) -> str: ...  # noqa: D102
-    @property
-    def broker(self) -> str: ...  # noqa: D102
-
-
-@dataclass(frozen=True, slots=True)
-class Connection:
-    """A connection as its type plans it; ``topics`` are the routes that its clients carry."""
-
-    id: str
-    source: str
-    target: str
-    broker: str
-    topics: Mapping[str, Route]
 
 
 class Connections(Protocol):
@@ -101,7 +79,7 @@ class ConnectionType(ABC):
         return False
 
     @abstractmethod
-    def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
+    def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield why the inventory does not let it link two ends.
 
         Unknown nodes are skipped, :mod:`demandops.demand.admission` reports them.
@@ -113,7 +91,7 @@ class ConnectionType(ABC):
         """Yield what else it does not support in a route from ``sender``."""
         return iter(())
 
-    def access(self, ends: Ends, config: Config) -> list[tuple[str, str]]:
+    def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
         """Return the fields of access rules, with values, that it needs besides both nodes."""
         return []
 

@@ -18,10 +18,10 @@ from demandops.config.config import BROKERS_FILE, IMAGES_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Broker
 from demandops.connections.communication_client import ClientKey, End
+from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     Connections,
     ConnectionType,
-    Ends,
     make_end,
     unplannable,
 )
@@ -51,22 +51,27 @@ class Mqtt(ConnectionType):
             message = f"'{self.image}' is missing; add it, because MQTT connections run it"
             yield fault("images", message).within(IMAGES_FILE)
 
-    def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
+    def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield that there is no broker; if none is named, it follows from the ends."""
-        if not ends.broker and not {ends.source, ends.target} <= config.nodes.keys():
+        if (
+            not connection.broker
+            and not {connection.source, connection.target} <= config.nodes.keys()
+        ):
             return
-        if choose_broker(ends, config) is not None:
+        if choose_broker(connection, config) is not None:
             return
         known = ", ".join(sorted(config.brokers))
         remedy = f"name one of: {known}" if known else f"{BROKERS_FILE} has none; add one there"
-        message = f"is not given, and no broker runs on '{ends.target}' or '{ends.source}'"
-        if ends.broker:
-            message = f"no broker runs on {quoted(ends.broker)}"
+        message = (
+            f"is not given, and no broker runs on '{connection.target}' or '{connection.source}'"
+        )
+        if connection.broker:
+            message = f"no broker runs on {quoted(connection.broker)}"
         yield fault("broker", f"{message}; {remedy}", code=_NO_BROKER)
 
-    def access(self, ends: Ends, config: Config) -> list[tuple[str, str]]:
+    def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
         """Return the broker."""
-        broker = choose_broker(ends, config)
+        broker = choose_broker(connection, config)
         return [("brokers", broker.node)] if broker else []
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> MqttEnd | None:
@@ -85,14 +90,14 @@ class Mqtt(ConnectionType):
 MQTT = Mqtt()
 
 
-def choose_broker(ends: Ends, config: Config) -> Broker | None:
+def choose_broker(connection: Connection, config: Config) -> Broker | None:
     """Return a connection's broker: the named, the target's, the source's or the only one.
 
     Return ``None`` if there is none of these.
     """
-    if ends.broker:
-        return config.brokers.get(ends.broker)
-    for node in (ends.target, ends.source):
+    if connection.broker:
+        return config.brokers.get(connection.broker)
+    for node in (connection.target, connection.source):
         if node in config.brokers:
             return config.brokers[node]
     return next(iter(config.brokers.values())) if len(config.brokers) == 1 else None
@@ -122,20 +127,19 @@ class MqttEnd(End):
         topic's name may differ between the ends.
         """
         bridge: dict[str, Any] = {}
-        topics = self.topics.items()
-        read = {route.read_topic: (name, route) for name, route in topics if self.reads(route)}
-        written = {name: route for name, route in topics if not self.reads(route)}
+        read = {route.read_topic: route for route in self.topics if self.reads(route)}
+        written = [route for route in self.topics if not self.reads(route)]
         if read:
             bridge["ros2mqtt"] = {"ros_topics": sorted(read)}
-            for topic, (name, route) in sorted(read.items()):
+            for topic, route in sorted(read.items()):
                 bridge["ros2mqtt"][topic] = {
-                    "mqtt_topic": self.channel + name,
+                    "mqtt_topic": self.channel + route.source,
                     **_options(route, retained=route.retained),
                 }
         if written:
-            bridge["mqtt2ros"] = {"mqtt_topics": [self.channel + name for name in written]}
-            for name, route in written.items():
-                bridge["mqtt2ros"][self.channel + name] = {
+            bridge["mqtt2ros"] = {"mqtt_topics": [self.channel + one.source for one in written]}
+            for route in written:
+                bridge["mqtt2ros"][self.channel + route.source] = {
                     "ros_topic": route.written_topic,
                     **_options(route),
                 }

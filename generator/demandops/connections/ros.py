@@ -10,18 +10,17 @@ import ipaddress
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from types import MappingProxyType
 from typing import Any
 
 from demandops import naming
 from demandops.config.config import NODES_FILE, Config
 from demandops.config.inventory import Node, Wan
 from demandops.connections.communication_client import ClientKey, End
+from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,
     Connections,
     ConnectionType,
-    Ends,
     make_end,
     unplannable,
 )
@@ -39,14 +38,14 @@ class Ros(ConnectionType):
     image = "dds-router"
     options = frozenset({"reliability", "durability", "queue", "rate"})
 
-    def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
+    def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield that no end can be reached."""
-        known = {ends.source, ends.target} <= config.nodes.keys()
-        if known and _listener(ends, config) is None:
+        known = {connection.source, connection.target} <= config.nodes.keys()
+        if known and _listener(connection, config) is None:
             yield fault(
                 "type",
                 f"{self.label} needs an end with a reachable address; add wan: {{host: …}} to "
-                f"'{ends.source}' or '{ends.target}' in {NODES_FILE}",
+                f"'{connection.source}' or '{connection.target}' in {NODES_FILE}",
                 code=UNSUPPORTED,
             )
 
@@ -73,12 +72,10 @@ class Ros(ConnectionType):
         if connection is None or not connection.topics:
             return None
         ends = (connection.source, connection.target)
-        typed = {
-            name: replace(
-                route, type=message_type(route, route.sender_and_receiver(*ends)[0], config)
-            )
-            for name, route in connection.topics.items()
-        }
+        typed = tuple(
+            replace(route, type=message_type(route, route.sender_and_receiver(*ends)[0], config))
+            for route in connection.topics
+        )
         listener = _listener(connection, config)
         if listener is None or listener.wan is None:
             message = f"connection '{key.id}' has no end with a wan address any longer; restore one"
@@ -95,7 +92,7 @@ class Ros(ConnectionType):
                     "firstPort and lastPort of its wan"
                 )
                 raise unplannable("connections", message)
-        connection = replace(connection, topics=MappingProxyType(typed))
+        connection = replace(connection, topics=typed)
         return make_end(
             RosEnd, key, connection, config, listener=listener.id, wan=listener.wan, port=port
         )
@@ -110,9 +107,9 @@ def message_type(route: Route, sender: str, config: Config) -> str:
     return route.type or (known.types.get(route.read_topic, "") if known else "")
 
 
-def _listener(ends: Ends, config: Config) -> Node | None:
+def _listener(connection: Connection, config: Config) -> Node | None:
     """Return the end that the other connects to: the target if it has a wan address."""
-    for id in (ends.target, ends.source):
+    for id in (connection.target, connection.source):
         node = config.nodes.get(id)
         if node is not None and node.wan is not None:
             return node
@@ -151,7 +148,7 @@ class RosEnd(End):
         """
         inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
         topics, tuned, reverse = [], [], []
-        for route in self.topics.values():
+        for route in self.topics:
             reads = self.reads(route)
             topic = {"name": f"rt{route.read_topic}", "type": dds_type(route.type)}
             topics.append(topic)

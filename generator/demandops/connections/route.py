@@ -148,11 +148,11 @@ def _shown(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else f"{value!r}"
 
 
-def merge_routes(routes: Iterable[Route]) -> dict[str, Route]:
-    """Return routes by source topic, sorted; a message type that one gives is kept."""
+def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
+    """Return routes sorted by source topic, each once; a message type that one gives is kept."""
     merged: dict[str, Route] = {}
     for route in routes:
         first = merged.get(route.source)
         if first is None or (route.type and not first.type):
             merged[route.source] = route
-    return dict(sorted(merged.items()))
+    return tuple(merged[source] for source in sorted(merged))

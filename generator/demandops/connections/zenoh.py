@@ -18,11 +18,11 @@ from demandops.config.config import NODES_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Node
 from demandops.connections.communication_client import Client, ClientKey
+from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,
     Connections,
     ConnectionType,
-    Ends,
     unplannable,
 )
 from demandops.errors import Fault, fault
@@ -52,9 +52,9 @@ class Zenoh(ConnectionType):
         """Return whether any node has a bridge."""
         return any(node.zenoh for node in config.nodes.values())
 
-    def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
+    def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield that a node has no bridge, or that neither bridge can reach the other."""
-        source, target = config.nodes.get(ends.source), config.nodes.get(ends.target)
+        source, target = config.nodes.get(connection.source), config.nodes.get(connection.target)
         if source is None or target is None:
             return
         for end, node in (("source", source), ("target", target)):
@@ -92,7 +92,7 @@ class Zenoh(ConnectionType):
                 continue
             ends = connection.source, connection.target
             peers[id] = ends[1] if key.id == ends[0] else ends[0]
-            for route in connection.topics.values():
+            for route in connection.topics:
                 if key.id != route.sender_and_receiver(*ends)[0]:
                     subscribers.add(route.written_topic)
                     continue

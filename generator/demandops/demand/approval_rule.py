@@ -11,15 +11,10 @@ from dataclasses import replace
 
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain, matches
-from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim, Subject, SubjectKind
-from demandops.demand.demand_request import DemandRequest
-from demandops.demand.lease import Term
-from demandops.demand.permission import (
-    Access,
-    access_of_application,
-    access_of_connection,
-    first_uncovered,
-)
+from demandops.demand.application import Application
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest
+from demandops.demand.permission import Access, first_uncovered, needed_access
 
 
 def approval_reasons(
@@ -34,9 +29,9 @@ def approval_reasons(
         changes: each claim that it changes, before and after the request.
         config: the access domains and application definitions.
     """
-    if not request.operation.adds_claims:
+    if not request.adds_claims:
         return ()
-    listed = set(subjects_of(request))
+    listed = set(request.subjects())
     changed = (
         after
         for before, after in changes
@@ -45,35 +40,19 @@ def approval_reasons(
     return tuple(dict.fromkeys(reason for claim in changed for reason in _reasons(claim, config)))
 
 
-def subjects_of(request: DemandRequest) -> list[Subject]:
-    """Return the applications and connections that a request lists."""
-    return [
-        *(Subject(SubjectKind.APPLICATION, app.id) for app in request.applications),
-        *(Subject(SubjectKind.CONNECTION, one.id) for one in request.connections),
-    ]
-
-
 def _is_more_than_renewed(before: Claim | None, after: Claim) -> bool:
     """Return whether a claim is new or differs in more than its lease."""
     return before is None or replace(after, lease=before.lease) != before
 
 
 def _reasons(claim: Claim, config: Config) -> Iterator[str]:
-    if isinstance(claim, ApplicationClaim):
-        appdef = config.appdefs.get(claim.appdef)
+    if isinstance(claim.held, Application):
+        appdef = config.appdefs.get(claim.held.appdef)
         if appdef is not None and appdef.approval == "required":
             yield f"application definition '{appdef.name}'"
-    for domain, access in _access(claim, config):
+    for domain, access in needed_access(claim.held, config):
         for requester in claim.requesters:
             yield from _domain_reasons(domain, requester, access)
-
-
-def _access(claim: Claim, config: Config) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield the access that a claim needs to each access domain."""
-    if isinstance(claim, ConnectionClaim):
-        yield from access_of_connection(claim, claim.type, config)
-    else:
-        yield from access_of_application(claim, config)
 
 
 def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Iterator[str]:
@@ -92,14 +71,10 @@ def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Ite
         yield f"access domain '{domain.name}'"
 
 
-def with_leases_from_approval(request: DemandRequest) -> DemandRequest:
+def with_leases_from_approval(request: AnyRequest) -> AnyRequest:
     """Return the request with leases that start at its approval."""
 
-    def from_approval(term: Term | None) -> Term | None:
-        return replace(term, on_approval=True) if term else None
+    def from_approval(one: Demanded) -> Demanded:
+        return replace(one, term=replace(one.term, on_approval=True)) if one.term else one
 
-    return replace(
-        request,
-        applications=tuple(replace(a, term=from_approval(a.term)) for a in request.applications),
-        connections=tuple(replace(c, term=from_approval(c.term)) for c in request.connections),
-    )
+    return replace(request, demanded=tuple(map(from_approval, request.demanded)))

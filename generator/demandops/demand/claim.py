@@ -4,37 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from bisect import bisect_left
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from datetime import datetime
-from enum import Enum
-from itertools import islice, takewhile
-from types import MappingProxyType
 
-from demandops.connections.connection_type import ConnectionType
-from demandops.connections.route import Route
-from demandops.demand.demand_request import OVERRIDE_PREFIX, InputTopic
+from demandops.connections.connection import Connection
+from demandops.demand.application import Application
 from demandops.demand.lease import Lease
+from demandops.subject import Subject, SubjectKind
 
-
-class SubjectKind(Enum):
-    """The kinds of subjects; the values are the ledger's folder names."""
-
-    APPLICATION = "applications"
-    CONNECTION = "connections"
-
-
-@dataclass(frozen=True, slots=True)
-class Subject:
-    """An application or a connection, by its exact id."""
-
-    kind: SubjectKind
-    id: str
-
-    def __str__(self) -> str:
-        """Return ``application 'edge/fusion'``."""
-        return f"{self.kind.value[:-1]} '{self.id}'"
+OVERRIDE_PREFIX = "override:"
+"""The prefix of the demand ids of claims that overrides make; no other demand may use it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,89 +26,65 @@ class ClaimKey:
 
 
 @dataclass(frozen=True, slots=True)
-class ApplicationClaim:  # noqa: PLW1641 - claims contain mappings, so they have no hash
-    """One demand's hold on an application. ``inputs`` are sorted by topic within each role."""
+class Claim:
+    """One demand's hold on an application or a connection."""
 
-    application: str
+    held: Application | Connection
     demand: str
     request: str
     requesters: tuple[str, ...]
     booked: datetime
-    appdef: str
-    node: str
-    inputs: Mapping[str, tuple[InputTopic, ...]]
-    parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
-    version: str = ""
     lease: Lease | None = None
 
-    def __eq__(self, other: object) -> bool:
-        """Compare exactly: in Python 1 equals True and 1.0, but a chart treats them differently."""
-        if not isinstance(other, ApplicationClaim):
-            return NotImplemented
-        same = all(getattr(self, one.name) == getattr(other, one.name) for one in fields(self))
-        return same and _exact(self.parameters) == _exact(other.parameters)
+    @property
+    def application(self) -> Application:
+        """The held application; the caller knows that it is one."""
+        assert isinstance(self.held, Application), self.subject  # noqa: S101
+        return self.held
+
+    @property
+    def connection(self) -> Connection:
+        """The held connection; the caller knows that it is one."""
+        assert isinstance(self.held, Connection), self.subject  # noqa: S101
+        return self.held
 
     @property
     def subject(self) -> Subject:
-        """The claimed application."""
-        return Subject(SubjectKind.APPLICATION, self.application)
+        """Which application or connection it is on."""
+        return self.held.subject
+
+    @property
+    def is_on_application(self) -> bool:
+        """Whether it holds an application."""
+        return self.subject.kind is SubjectKind.APPLICATION
 
     @property
     def key(self) -> ClaimKey:
         """The key of the claim in the ledger."""
         return ClaimKey(self.subject, self.demand)
 
-    def all_inputs(self) -> Iterable[tuple[str, InputTopic]]:
-        """Return every (role, topic)."""
-        return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
-
-    def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
-        """Return the inputs in a role that are ``topic`` of ``source``; they differ by type."""
-        inputs = self.inputs.get(role, ())
-        start = bisect_left(inputs, InputTopic(topic, source))
-        same = takewhile(
-            lambda one: (one.topic, one.source) == (topic, source), islice(inputs, start, None)
-        )
-        return tuple(same)
-
-
-def _exact(values: Mapping[str, object]) -> str:
-    return json.dumps(dict(values), sort_keys=True, default=repr) if values else ""
-
-
-@dataclass(frozen=True, slots=True)
-class ConnectionClaim:
-    """One demand's hold on a connection. ``topics`` are routes by source topic, sorted."""
-
-    connection: str
-    demand: str
-    request: str
-    requesters: tuple[str, ...]
-    booked: datetime
-    type: ConnectionType
-    source: str
-    target: str
-    broker: str
-    topics: Mapping[str, Route]
-    lease: Lease | None = None
-
     @property
-    def subject(self) -> Subject:
-        """The claimed connection."""
-        return Subject(SubjectKind.CONNECTION, self.connection)
+    def keeping_override(self) -> str | None:
+        """The name of the override whose effect ``keep`` made the claim, or ``None``."""
+        name = self.demand.removeprefix(OVERRIDE_PREFIX)
+        return None if name == self.demand else name
 
-    @property
-    def key(self) -> ClaimKey:
-        """The key of the claim in the ledger."""
-        return ClaimKey(self.subject, self.demand)
+    def index_entries(self) -> Iterator[tuple[str, ...]]:
+        """Yield what the ledger finds it by, except the end of its lease."""
+        yield ("demand", self.demand)
+        for requester in self.requesters:
+            yield ("requester", requester)
+        if self.keeping_override is not None:
+            yield ("kept",)
+            yield ("kept", self.subject.kind.value, self.subject.id)
+        yield from self.held.index_entries()
 
-
-Claim = ApplicationClaim | ConnectionClaim
-
-
-def is_override_claim(claim: Claim) -> bool:
-    """Return whether an override with the effect ``keep`` made the claim."""
-    return claim.demand.startswith(OVERRIDE_PREFIX)
+    def after_booking(self, current: Claim | None) -> Claim:
+        """Return it with the booking time of the ``current`` claim if at most the lease differs."""
+        if current is None:
+            return self
+        kept = replace(self, booked=current.booked)
+        return kept if replace(kept, lease=current.lease) == current else self
 
 
 def demand_id(request: str, requesters: Iterable[str]) -> str:

@@ -11,38 +11,40 @@ from dataclasses import replace
 
 from demandops.config.config import IMAGES_FILE, NODES_FILE, Config
 from demandops.connections import connection_types
+from demandops.connections.connection import Connection
 from demandops.connections.connection_type import UNSUPPORTED, ConnectionType
 from demandops.connections.connection_types import labels
 from demandops.connections.route import Route
-from demandops.demand.demand_request import AUTO, ConnectionDemand, DemandRequest
+from demandops.demand.demand_request import AnyRequest, Demanded
 from demandops.errors import Fault, fault
 from demandops.identifiers import topic_problem
 
 _ALWAYS = ("type", "reverse")
 
-CurrentType = Callable[[str], ConnectionType | None]
-"""Returns the type of a connection that is already claimed, or ``None``."""
+CurrentConnection = Callable[[str], Connection | None]
+"""Returns a connection that is already claimed, or ``None``."""
 
 
 def with_chosen_types(
-    request: DemandRequest, config: Config, current_type: CurrentType
-) -> DemandRequest:
-    """Return ``request`` with a chosen type for each connection of type ``AUTO``.
+    request: AnyRequest, config: Config, current: CurrentConnection
+) -> AnyRequest:
+    """Return ``request`` with a chosen type for each connection that leaves it open.
 
     A claimed connection keeps its current type. Another gets the first type that can carry it
-    (:func:`type_faults`); it stays ``AUTO`` if none can.
+    (:func:`type_faults`); it stays open if none can.
     """
 
-    def chosen(connection: ConnectionDemand) -> ConnectionDemand:
-        if connection.type != AUTO:
-            return connection
-        found = current_type(connection.id) or choose_type(connection, config)
-        return replace(connection, type=found.number) if found else connection
+    def chosen(one: Demanded) -> Demanded:
+        if not isinstance(one.held, Connection) or one.held.type is not None:
+            return one
+        claimed = current(one.held.id)
+        found = claimed.type if claimed else choose_type(one.held, config)
+        return replace(one, held=replace(one.held, type=found))
 
-    return replace(request, connections=tuple(map(chosen, request.connections)))
+    return replace(request, demanded=tuple(map(chosen, request.demanded)))
 
 
-def choose_type(connection: ConnectionDemand, config: Config) -> ConnectionType | None:
+def choose_type(connection: Connection, config: Config) -> ConnectionType | None:
     """Return the type for a connection that leaves it open, or ``None`` if none can carry it."""
     for kind in connection_types.CONNECTION_TYPES:
         if next(type_faults(kind, connection, config), None) is None:
@@ -50,7 +52,7 @@ def choose_type(connection: ConnectionDemand, config: Config) -> ConnectionType 
     return None
 
 
-def no_type_fault(connection: ConnectionDemand, config: Config) -> Fault:
+def no_type_fault(connection: Connection, config: Config) -> Fault:
     """Return a fault that says for each type why it cannot carry a connection."""
     reasons = []
     for kind in connection_types.CONNECTION_TYPES:
@@ -61,10 +63,8 @@ def no_type_fault(connection: ConnectionDemand, config: Config) -> Fault:
     return fault("type", message, code=UNSUPPORTED)
 
 
-def type_faults(
-    kind: ConnectionType, connection: ConnectionDemand, config: Config
-) -> Iterator[Fault]:
-    """Yield why ``kind`` cannot carry a connection, by fields of :class:`ConnectionDemand`.
+def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
+    """Yield why ``kind`` cannot carry a connection, by fields of :class:`Connection`.
 
     Nodes that are not in the inventory are skipped; :mod:`demandops.demand.admission` reports them.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from demandops.demand.demand_request import DecommissionTarget, DemandRequest, Operation
+from demandops.demand.demand_request import Decommission
 from demandops.errors import Fault, Refused, fault
 from demandops.identifiers import id_problem
 
@@ -31,7 +31,7 @@ def is_decommission(data: object) -> bool:
     return isinstance(data, dict) and data.get("kind") == KIND
 
 
-def parse(data: dict[str, Any]) -> DemandRequest:
+def parse(data: dict[str, Any]) -> Decommission:
     """Return the request of plain data.
 
     Raises:
@@ -43,5 +43,4 @@ def parse(data: dict[str, Any]) -> DemandRequest:
     if faults:
         raise Refused(faults)
     kinds = frozenset(kind for kind in data.get("as", ()) if kind in ("node", "requester"))
-    target = DecommissionTarget(str(name), kinds, str(data.get("by") or ""))
-    return DemandRequest(id=str(name), operation=Operation.DECOMMISSION, decommission_target=target)
+    return Decommission(id=str(name), kinds=kinds, by=str(data.get("by") or ""))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-import re
+from collections.abc import Iterator
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
@@ -17,16 +17,11 @@ from pydantic import Field, PlainValidator
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel
 from demandops.config.policy import seconds_of
+from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import RouteOptions
-from demandops.demand.demand_request import (
-    AUTO,
-    ApplicationDemand,
-    ConnectionDemand,
-    DemandRequest,
-    InputTopic,
-    Operation,
-)
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.demand_request import Demanded, DemandRequest, Place, Put, Release, Renew
 from demandops.demand.goal_validation import parse_valid_part
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import absolute_topic
@@ -122,19 +117,51 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
     """
     goal, faults = parse_valid_part(data, DemandGoal, _LISTS_OF_TEXT)
     requesters = tuple(goal.requesters)
-    request = DemandRequest(
-        id=goal.request or goal.demand,
-        operation=Operation(goal.operation),
-        applications=tuple(
-            _application(f"applications[{index}]", app, requesters, faults)
-            for index, app in enumerate(goal.applications)
-        ),
-        connections=tuple(_connection(connection, requesters) for connection in goal.connections),
-        demand=goal.demand,
-        own_requesters=requesters,
-        lease_s=_lease(goal.lease, faults),
+    head: dict[str, Any] = {
+        "id": goal.request or goal.demand,
+        "demand": goal.demand,
+        "own_requesters": requesters,
+    }
+    lease_s = _lease(goal.lease, faults)
+    if goal.operation != "put":
+        faults += _not_of_a_put(goal, lease_s)
+        return (Release if goal.operation == "release" else Renew)(**head), faults
+    applications = (
+        Demanded(
+            _application(f"applications[{index}]", app, faults),
+            requesters,
+            _Place(f"applications[{index}]"),
+            connect=app.connect,
+        )
+        for index, app in enumerate(goal.applications)
     )
-    return request, faults
+    connections = (
+        Demanded(_connection(connection), requesters, _Place(f"connections[{index}]"))
+        for index, connection in enumerate(goal.connections)
+    )
+    return Put(**head, demanded=(*applications, *connections), lease_s=lease_s), faults
+
+
+class _Place(Place):
+    """Where a goal lists something; its requesters stand above it."""
+
+    def at(self, path: str) -> str:
+        """Return the goal's field for a field below it."""
+        if path.startswith("requesters"):
+            return path
+        return f"{self.field}.{'type' if path == 'appdef' else path}"
+
+
+def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
+    """Yield the fields that only a put may have."""
+    if lease_s is not None:
+        yield fault("lease", "is set by a put; leave it out, or put the demand again")
+    if goal.applications or goal.connections:
+        yield fault(
+            "applications" if goal.applications else "connections",
+            f"a {goal.operation} names only its demand; to release a part, put the demand without "
+            "it",
+        )
 
 
 def form_faults(data: dict[str, Any]) -> list[Fault]:
@@ -152,12 +179,7 @@ def _lease(lease: str | int | None, faults: list[Fault]) -> int | None:
         return None
 
 
-def _application(
-    where: str,
-    app: GoalApplication,
-    requesters: tuple[str, ...],
-    faults: list[Fault],
-) -> ApplicationDemand:
+def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Application:
     parameters: dict[str, Any] = {}
     for name, value in app.parameters.items():
         parameters[name] = _storable(f"{where}.parameters.{name}", value, faults)
@@ -171,11 +193,10 @@ def _application(
         except (ValueError, RecursionError):
             message = 'is not JSON; text needs its own quotes, as in "\\"fast\\""'
             faults.append(fault(place, message))
-    return ApplicationDemand(
+    return Application(
         id=app.id,
         appdef=app.type,
         node=app.node,
-        requesters=requesters,
         inputs=MappingProxyType(
             {
                 role: tuple(InputTopic(absolute_topic(t.topic), t.source, t.type) for t in topics)
@@ -185,12 +206,7 @@ def _application(
         ),
         parameters=MappingProxyType(parameters),
         version=app.version,
-        connect=None if app.connect == "none" else _number(app.connect),
     )
-
-
-def _number(word: str) -> int:
-    return AUTO if word == "auto" else type_named(word).number
 
 
 def _storable(where: str, value: object, faults: list[Fault]) -> object:
@@ -213,10 +229,10 @@ def _value_problem(value: object, depth: int) -> str:
     return next(filter(None, (_value_problem(part, depth + 1) for part in nested)), "")
 
 
-def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> ConnectionDemand:
-    return ConnectionDemand(
+def _connection(connection: GoalConnection) -> Connection:
+    return Connection(
         id=connection.id,
-        type=_number(connection.type),
+        type=None if connection.type == "auto" else type_named(connection.type),
         source=connection.source,
         target=connection.target,
         topics=tuple(
@@ -224,24 +240,4 @@ def _connection(connection: GoalConnection, requesters: tuple[str, ...]) -> Conn
             for route in connection.topics
         ),
         broker=connection.broker,
-        requesters=requesters,
     )
-
-
-_NAMES = (
-    (re.compile(r"^(applications\[\d+\])\.appdef$"), r"\1.type"),
-    (re.compile(r"^(applications|connections)\[\d+\]\.requesters"), "requesters"),
-    (re.compile(r"^id$"), "request"),
-)
-
-
-_OF_CONNECTION = re.compile(r"connections\[(\d+)\]")
-
-
-def goal_field(path: str, request: DemandRequest) -> str:
-    """Return the goal's field for a request's field; for a derived connection, its input's."""
-    for pattern, replacement in _NAMES:
-        if pattern.match(path):
-            return pattern.sub(replacement, path)
-    match = _OF_CONNECTION.match(path)
-    return (request.connections[int(match[1])].for_input if match else "") or path

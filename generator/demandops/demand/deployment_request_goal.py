@@ -7,8 +7,8 @@ Faults name the fields of the message (``apps[0].header.node_id``).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated
 
@@ -16,22 +16,18 @@ from pydantic import Field
 
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.base_model import FrozenModel
+from demandops.connections.connection import Connection
+from demandops.connections.connection_type import ConnectionType
+from demandops.connections.connection_types import by_number, type_numbered
 from demandops.connections.route import Route
-from demandops.demand.demand_request import (
-    AUTO,
-    ApplicationDemand,
-    ConnectionDemand,
-    DemandRequest,
-    InputTopic,
-    Operation,
-)
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.demand_request import Demanded, DemandRequest, Join, Place, Shutdown
 from demandops.demand.goal_validation import parse_valid_part
 from demandops.errors import Fault, fault
 from demandops.identifiers import absolute_topic
 
 Uint8 = Annotated[int, Field(ge=0, le=255)]
 AppdefByType = Callable[[int], ApplicationDefinition | None]
-AppdefByName = Mapping[str, ApplicationDefinition]
 
 
 class WireTopic(FrozenModel):
@@ -88,21 +84,46 @@ class WireGoal(FrozenModel):
 
 
 _BODY = "object_detection_fusion_app"
-_INPUT = re.compile(r"^applications\[(\d+)\]\.inputs\.(\w+)(\[\d+\])?(.*)$")
 _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
-_WIRE_NAMES = (
-    (re.compile(r"^applications(\[\d+\])\.id$"), r"apps\1.header.id"),
-    (re.compile(r"^applications(\[\d+\])\.node$"), r"apps\1.header.node_id"),
-    (re.compile(r"^applications(\[\d+\])\.requesters"), rf"apps\1.{_BODY}.requester_ids"),
-    (re.compile(r"^applications(\[\d+\])\.appdef$"), r"apps\1.type"),
-    (re.compile(r"^applications(\[\d+\])\.inputs$"), rf"apps\1.{_BODY}"),
-    (re.compile(r"^(connections\[\d+\])\.requesters"), r"\1.requester_ids"),
-    (re.compile(r"^(connections\[\d+\])\.(source|target)$"), r"\1.\2_node_id"),
-    (re.compile(r"^(connections\[\d+\])\.broker$"), r"\1.broker_node_id"),
-    (re.compile(r"^(connections\[\d+\])\.topics(\[\d+\])\.(source|target)$"), r"\1.\3_topics\2"),
-    (re.compile(r"^(connections\[\d+\])\.topics(\[\d+\])\.\w+$"), r"\1.source_topics\2"),
-    (re.compile(r"^(connections\[\d+\])\.topics$"), r"\1.source_topics"),
-)
+
+
+@dataclass(frozen=True, slots=True)
+class _ApplicationPlace(Place):
+    """An application of the message; ``lists`` maps roles to its lists of topics."""
+
+    lists: tuple[tuple[str, str], ...]
+
+    def at(self, path: str) -> str:
+        """Return the message's field for a field of the application."""
+        name, _, rest = path.partition(".")
+        if name in ("id", "node"):
+            return f"{self.field}.header.{'id' if name == 'id' else 'node_id'}"
+        if name.startswith("requesters"):
+            return f"{self.field}.{_BODY}.requester_ids{name.removeprefix('requesters')}"
+        if name == "appdef":
+            return f"{self.field}.type"
+        if name != "inputs":
+            return f"{self.field}.{path}"
+        role, bracket, place = rest.partition("[")
+        place = place.replace("].topic", "].topic_name").replace("].source", "].source_node_id")
+        field = f".{dict(self.lists).get(role, role)}" if role else ""
+        return f"{self.field}.{_BODY}{field}{bracket}{place}"
+
+
+@dataclass(frozen=True, slots=True)
+class _ConnectionPlace(Place):
+    """A connection of the message, which has the topics in two lists."""
+
+    def at(self, path: str) -> str:
+        """Return the message's field for a field of the connection."""
+        if path.startswith("requesters"):
+            return f"{self.field}.requester_ids{path.removeprefix('requesters')}"
+        if path in ("source", "target", "broker"):
+            return f"{self.field}.{path}_node_id"
+        if path.startswith("topics"):
+            place, _, name = path.removeprefix("topics").partition(".")
+            return f"{self.field}.{'target' if name == 'target' else 'source'}_topics{place}"
+        return f"{self.field}.{path}"
 
 
 def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | None, list[Fault]]:
@@ -121,17 +142,22 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
         return None, [_not_a_mapping()]
     goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
     faulty = {found.field for found in faults}
+    demanded = [
+        _application(f"apps[{index}]", app, appdef_by_type(app.type))
+        for index, app in enumerate(goal.apps)
+    ]
+    for index, connection in enumerate(goal.connections):
+        where = f"connections[{index}]"
+        # without a valid type, none is assumed, so that no type's rules apply
+        kind = type_numbered(connection.type) if f"{where}.type" not in faulty else None
+        demanded.append(_connection(where, connection, kind))
+        if kind is None and f"{where}.type" not in faulty:
+            known = ", ".join(known.label for known in by_number())
+            message = f"{connection.type} is not a connection type; known: {known}"
+            faults.append(fault(f"{where}.type", message, code="unknown-connection-type"))
     # without a valid "shutdown", only the rules of both operations apply, which are a shutdown's
-    unclear = "shutdown" in faulty
-    request = DemandRequest(
-        id=goal.id,
-        operation=Operation.SHUTDOWN if goal.shutdown or unclear else Operation.JOIN,
-        applications=tuple(_application(app, appdef_by_type(app.type)) for app in goal.apps),
-        connections=tuple(
-            _connection(connection, valid_type=f"connections[{index}].type" not in faulty)
-            for index, connection in enumerate(goal.connections)
-        ),
-    )
+    operation = Shutdown if goal.shutdown or "shutdown" in faulty else Join
+    request = operation(id=goal.id, demanded=tuple(demanded))
     for index, connection in enumerate(goal.connections):
         sources, targets = len(connection.source_topics), len(connection.target_topics)
         if sources != targets:
@@ -163,23 +189,26 @@ def _wire_inputs(appdef: ApplicationDefinition | None) -> Mapping[str, str]:
     return {str(name): role for name, role in appdef.deployment_request.inputs.items()}
 
 
-def _application(app: WireApplication, appdef: ApplicationDefinition | None) -> ApplicationDemand:
+def _application(
+    where: str, app: WireApplication, appdef: ApplicationDefinition | None
+) -> Demanded:
     body = app.object_detection_fusion_app
-    wire_names = _wire_inputs(appdef)
+    roles = _wire_inputs(appdef)
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for name in ("ego_data_topics", "pointcloud_topics"):
         topics: list[WireTopic] = getattr(body, name)
-        role = wire_names.get(name)
-        if role and topics:
+        role = roles.get(name) or name
+        if topics:
             inputs[role] = (*inputs.get(role, ()), *_topics(topics))
-        elif topics:
-            inputs[name] = _topics(topics)
-    return ApplicationDemand(
-        id=app.header.id,
-        appdef=appdef.name if appdef else f"#{app.type}",
-        node=app.header.node_id,
-        requesters=tuple(dict.fromkeys(body.requester_ids)),
-        inputs=MappingProxyType(inputs),
+    return Demanded(
+        Application(
+            id=app.header.id,
+            appdef=appdef.name if appdef else f"#{app.type}",
+            node=app.header.node_id,
+            inputs=MappingProxyType(inputs),
+        ),
+        tuple(dict.fromkeys(body.requester_ids)),
+        _ApplicationPlace(where, tuple((role, name) for name, role in roles.items())),
     )
 
 
@@ -190,42 +219,23 @@ def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
     )
 
 
-def _connection(connection: WireConnection, *, valid_type: bool) -> ConnectionDemand:
-    """Return a connection; ``AUTO`` replaces an invalid type, so that no type's rules apply."""
+def _connection(where: str, connection: WireConnection, kind: ConnectionType | None) -> Demanded:
     sources, targets = connection.source_topics, connection.target_topics
     # the caller reports lists of unequal length; names of the longer fill the shorter
     pairs = zip(
         [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
     )
-    return ConnectionDemand(
-        id=connection.id,
-        type=connection.type if valid_type else AUTO,
-        source=connection.source_node_id,
-        target=connection.target_node_id,
-        topics=tuple(
-            Route(absolute_topic(source), absolute_topic(target)) for source, target in pairs
+    return Demanded(
+        Connection(
+            id=connection.id,
+            type=kind,
+            source=connection.source_node_id,
+            target=connection.target_node_id,
+            topics=tuple(
+                Route(absolute_topic(source), absolute_topic(target)) for source, target in pairs
+            ),
+            broker=connection.broker_node_id,
         ),
-        broker=connection.broker_node_id,
-        requesters=tuple(dict.fromkeys(connection.requester_ids)),
+        tuple(dict.fromkeys(connection.requester_ids)),
+        _ConnectionPlace(where),
     )
-
-
-def goal_field(path: str, request: DemandRequest, appdefs: AppdefByName) -> str:
-    """Return the message's field for a field of ``request``.
-
-    ``applications[0].node`` is ``apps[0].header.node_id`` in the message. A role is the topic list
-    that the appdef maps to it.
-    """
-    for pattern, replacement in _WIRE_NAMES:
-        if pattern.match(path):
-            path = pattern.sub(replacement, path)
-            break
-    match = _INPUT.match(path)
-    if not match:
-        return path
-    app, role, place, leaf = match.groups()
-    appdef = appdefs.get(request.applications[int(app)].appdef)
-    wire = _wire_inputs(appdef)
-    names = {wire_role: name for name, wire_role in wire.items()}
-    leaf = {".topic": ".topic_name", ".source": ".source_node_id"}.get(leaf, leaf)
-    return f"apps[{app}].{_BODY}.{names.get(role, role)}{place or ''}{leaf}"

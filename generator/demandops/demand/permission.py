@@ -10,14 +10,9 @@ from dataclasses import replace
 
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain, Rule, matches, seconds_of
-from demandops.connections.connection_type import ConnectionType, Ends
-from demandops.demand.claim import ApplicationClaim
-from demandops.demand.demand_request import (
-    ApplicationDemand,
-    ConnectionDemand,
-    DemandRequest,
-    Operation,
-)
+from demandops.connections.connection import Connection
+from demandops.demand.application import Application
+from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put
 from demandops.demand.lease import Term
 from demandops.errors import Fault, fault
 
@@ -30,67 +25,47 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 
     A release needs no permission. :mod:`demandops.demand.admission` reports nodes without a domain.
     """
-    if not request.operation.adds_claims:
+    if not request.adds_claims:
         return
-    for index, app in enumerate(request.applications):
-        where = f"applications[{index}]"
-        for domain, access in access_of_application(app, config):
-            yield from _not_allowed(where, app.requesters, domain, access)
-        home = config.domain_of.get(app.node)
-        if home is not None:
-            yield from _too_long(request, home)
-    for index, connection in enumerate(request.connections):
-        where = f"connections[{index}]"
-        for domain, access in access_of_connection(connection, connection.chosen_type, config):
-            yield from _not_allowed(where, connection.requesters, domain, access)
-        home = config.domain_of.get(connection.target)
+    for one in request.demanded:
+        for domain, access in needed_access(one.held, config):
+            yield from _not_allowed(one, domain, access)
+        home = config.domain_of.get(one.held.home)
         if home is not None:
             yield from _too_long(request, home)
 
 
-def access_of_application(
-    app: ApplicationDemand | ApplicationClaim, config: Config
+def needed_access(
+    held: Application | Connection, config: Config
 ) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield the access that an application needs to the access domain of each of its nodes."""
-    for node in _service_nodes(app, config):
+    """Yield the access that an application or connection needs to the domain of each node."""
+    more: Access = []
+    if isinstance(held, Application):
+        nodes, first = _service_nodes(held, config), [("applications", held.appdef)]
+    else:
+        nodes, first = held.nodes, []
+        more = held.type.access(held, config) if held.type else []
+    for node in dict.fromkeys(nodes):
         domain = config.domain_of.get(node)
         if domain is not None:
-            yield domain, [("applications", app.appdef), ("nodes", node)]
+            yield domain, [*first, ("nodes", node), *more]
 
 
-def _service_nodes(app: ApplicationDemand | ApplicationClaim, config: Config) -> Iterable[str]:
+def _service_nodes(app: Application, config: Config) -> Iterable[str]:
     """Return the nodes on which services of an application run: its node, and sources."""
     appdef = config.appdefs.get(app.appdef)
     services = appdef.services.values() if appdef else ()
     roles = [service.each for service in services if service.placement == "source"]
-    sources = (topic.source for role in roles for topic in app.inputs.get(str(role), ()))
-    return dict.fromkeys((app.node, *sources))
+    return app.node, *(topic.source for role in roles for topic in app.inputs.get(str(role), ()))
 
 
-def access_of_connection(
-    ends: Ends, kind: ConnectionType | None, config: Config
-) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield the access that a connection needs to the access domain of each end."""
-    more = kind.access(ends, config) if kind else []
-    for node in dict.fromkeys((ends.source, ends.target)):
-        domain = config.domain_of.get(node)
-        if domain is not None:
-            yield domain, [("nodes", node), *more]
-
-
-def _not_allowed(
-    where: str,
-    requesters: Iterable[str],
-    domain: AccessDomain,
-    access: Access,
-) -> Iterator[Fault]:
+def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
     """Yield a fault for each requester without a rule of the domain that grants the access."""
-    for index, requester in enumerate(requesters if domain.rules else ()):
+    for index, requester in enumerate(one.requesters if domain.rules else ()):
         own = [rule for rule in domain.rules if matches(requester, rule.requesters)]
         misses = [first_uncovered(rule, access) for rule in own]
         if own and None in misses:
             continue
-        place = f"{where}.requesters[{index}]"
         if not own:
             rules = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
             message = (
@@ -103,7 +78,7 @@ def _not_allowed(
                 for rule, (kind, value) in zip(own, filter(None, misses), strict=True)
             )
             message = f"{reasons}; ask for what is allowed, or have policy/ changed"
-        yield fault(place, message, code="not-allowed")
+        yield one.fault(f"requesters[{index}]", message, code="not-allowed")
 
 
 def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
@@ -114,41 +89,35 @@ def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
 
 
 def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
-    longest = domain.leases.longest
-    if longest is None or request.lease_s is None or request.lease_s <= seconds_of(longest):
+    longest, lease_s = domain.leases.longest, _wanted_lease(request)
+    if longest is None or lease_s is None or lease_s <= seconds_of(longest):
         return
     yield fault(
         "lease",
-        f"is {request.lease_s} s, above leases.longest of access domain '{domain.name}', "
-        f"{longest}; request that, and renew",
+        f"is {lease_s} s, above leases.longest of access domain '{domain.name}', {longest}; "
+        "request that, and renew",
         code="not-allowed",
     )
 
 
-def with_lease_terms(request: DemandRequest, config: Config) -> DemandRequest:
+def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
     """Return the request with the lease of each subject, by the policy of its domain."""
 
-    def term(node: str) -> Term | None:
-        domain = config.domain_of.get(node)
-        return _term(request, domain) if domain else None
+    def with_term(one: Demanded) -> Demanded:
+        domain = config.domain_of.get(one.held.home)
+        return replace(one, term=_term(request, domain) if domain else None)
 
-    def app_with(app: ApplicationDemand) -> ApplicationDemand:
-        return replace(app, term=term(app.node))
-
-    def connection_with(connection: ConnectionDemand) -> ConnectionDemand:
-        return replace(connection, term=term(connection.target))
-
-    return replace(
-        request,
-        applications=tuple(map(app_with, request.applications)),
-        connections=tuple(map(connection_with, request.connections)),
-    )
+    return replace(request, demanded=tuple(map(with_term, request.demanded)))
 
 
 def _term(request: DemandRequest, domain: AccessDomain) -> Term | None:
     policy = domain.leases
-    if request.operation is Operation.JOIN and not policy.deployment_requests:
+    if request.is_reference and not policy.deployment_requests:
         return None
     given = policy.default or policy.longest
-    seconds = request.lease_s or (seconds_of(given) if given else None)
+    seconds = _wanted_lease(request) or (seconds_of(given) if given else None)
     return Term(seconds, seconds_of(policy.slack)) if seconds else None
+
+
+def _wanted_lease(request: DemandRequest) -> int | None:
+    return request.lease_s if isinstance(request, Put) else None

@@ -7,7 +7,16 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.demand.demand_request import (
+    Decommission,
+    DemandRequest,
+    Expire,
+    Join,
+    Put,
+    Release,
+    Renew,
+    Shutdown,
+)
 from demandops.ledger.ledger import Changes, Ledger
 from demandops.ledger.operations.decommission import decommission
 from demandops.ledger.operations.demand_release import release_demand
@@ -15,7 +24,7 @@ from demandops.ledger.operations.join import join
 from demandops.ledger.operations.lease_end import release_ended
 from demandops.ledger.operations.lease_renewal import renew_leases
 from demandops.ledger.operations.put import put
-from demandops.ledger.operations.restoration import restore
+from demandops.ledger.operations.restoration import Restoration, restore
 from demandops.ledger.operations.shutdown import shut_down
 
 
@@ -34,20 +43,21 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
         Refused: with every conflict with an existing claim, or if the request releases or renews
             what is not held. Nothing is booked then.
     """
-    match request.operation:
-        case Operation.JOIN:
+    match request:
+        case Join():
             return join(ledger, request, now)
-        case Operation.SHUTDOWN:
+        case Shutdown():
             return shut_down(ledger, request, now)
-        case Operation.PUT:
+        case Put():
             return put(ledger, request, now)
-        case Operation.RELEASE:
+        case Release():
             return release_demand(ledger, request)
-        case Operation.RENEW:
+        case Renew():
             return renew_leases(ledger, request, now)
-        case Operation.EXPIRE:
+        case Expire():
             return release_ended(ledger, request, now)
-        case Operation.DECOMMISSION:
+        case Decommission():
             return decommission(ledger, request, now)
-        case Operation.ROLLBACK:
+        case Restoration():
             return restore(ledger, request, now)
+    raise TypeError(f"{type(request).__name__} cannot be applied")

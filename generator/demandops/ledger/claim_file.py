@@ -17,20 +17,15 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel, parse
+from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import Route, RouteOptions
-from demandops.demand.claim import (
-    ApplicationClaim,
-    Claim,
-    ClaimKey,
-    ConnectionClaim,
-    Subject,
-    SubjectKind,
-)
-from demandops.demand.demand_request import InputTopic
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
 from demandops.errors import InvalidInput, fault
 from demandops.settings import LEDGER_API_VERSION
+from demandops.subject import Subject, SubjectKind
 
 LEDGER_ROOT = "ledger"
 
@@ -106,6 +101,19 @@ class _Claim(FrozenModel):
     booked: Timestamp
     lease: _Lease | None = None
 
+    def held(self) -> Application | Connection:
+        raise NotImplementedError
+
+    def claim(self) -> Claim:
+        return Claim(
+            held=self.held(),
+            demand=self.demand,
+            request=self.request,
+            requesters=tuple(sorted(set(self.requesters))),
+            booked=_time(self.booked),
+            lease=self.lease.lease() if self.lease else None,
+        )
+
 
 class _ApplicationFile(_Claim):
     kind: Literal["ApplicationClaim"]
@@ -115,6 +123,21 @@ class _ApplicationFile(_Claim):
     inputs: dict[str, list[_Topic]] = Field(default_factory=dict)
     parameters: dict[str, Any] = Field(default_factory=dict)
     version: str = ""
+
+    def held(self) -> Application:
+        inputs = {
+            role: tuple(sorted(InputTopic(t.topic, t.source, t.type) for t in topics))
+            for role, topics in sorted(self.inputs.items())
+            if topics
+        }
+        return Application(
+            self.application,
+            self.definition,
+            self.node,
+            MappingProxyType(inputs),
+            MappingProxyType(self.parameters),
+            self.version,
+        )
 
 
 class _ConnectionFile(_Claim):
@@ -126,45 +149,62 @@ class _ConnectionFile(_Claim):
     broker: str = ""
     topics: dict[str, Annotated[_Route, BeforeValidator(_plain_route)]] = Field(min_length=1)
 
+    def held(self) -> Connection:
+        topics = tuple(
+            topic.route(source, topic.target) for source, topic in sorted(self.topics.items())
+        )
+        ends = (self.source, self.target)
+        return Connection(self.connection, type_named(self.type), *ends, self.broker, topics)
+
 
 def text_of(claim: Claim) -> str:
     """Return the text of a claim's file. The same claim gives the same bytes."""
-    head: dict[str, Any] = {"apiVersion": LEDGER_API_VERSION}
-    tail: dict[str, Any]
-    if isinstance(claim, ApplicationClaim):
-        head |= {"kind": "ApplicationClaim", "application": claim.application}
-        tail = {
-            "definition": claim.appdef,
-            "node": claim.node,
-            "inputs": {
-                role: [_topic(topic) for topic in topics] for role, topics in claim.inputs.items()
-            },
-        }
-        if claim.parameters:
-            tail["parameters"] = dict(sorted(claim.parameters.items()))
-        if claim.version:
-            tail["version"] = claim.version
-    else:
-        head |= {"kind": "ConnectionClaim", "connection": claim.connection}
-        tail = {"type": claim.type.word, "source": claim.source, "target": claim.target}
-        if claim.broker:
-            tail["broker"] = claim.broker
-        tail["topics"] = {source: _route(route) for source, route in claim.topics.items()}
+    held = claim.held
+    kind = "Application" if isinstance(held, Application) else "Connection"
+    lease: dict[str, object] = {}
     if claim.lease is not None:
-        lease: dict[str, object] = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
+        lease = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
         if claim.lease.has_started:
             lease["until"] = _written(claim.lease.until)
-        tail["lease"] = lease
     return strict_yaml.dump(
         {
-            **head,
+            "apiVersion": LEDGER_API_VERSION,
+            "kind": f"{kind}Claim",
+            kind.lower(): held.id,
             "demand": claim.demand,
             "request": claim.request,
             "requesters": list(claim.requesters),
             "booked": _written(claim.booked),
-            **tail,
+            **(
+                _application_data(held) if isinstance(held, Application) else _connection_data(held)
+            ),
+            **({"lease": lease} if lease else {}),
         }
     )
+
+
+def _application_data(app: Application) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "definition": app.appdef,
+        "node": app.node,
+        "inputs": {
+            role: [_topic(topic) for topic in topics] for role, topics in app.inputs.items()
+        },
+    }
+    if app.parameters:
+        data["parameters"] = dict(sorted(app.parameters.items()))
+    return data | {"version": app.version} if app.version else data
+
+
+def _connection_data(connection: Connection) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "type": connection.known_type.word,
+        "source": connection.source,
+        "target": connection.target,
+    }
+    if connection.broker:
+        data["broker"] = connection.broker
+    return data | {"topics": {route.source: _route(route) for route in connection.topics}}
 
 
 def _written(moment: datetime) -> str:
@@ -204,9 +244,9 @@ def read(text: str, path: str) -> Claim:
             ]
         )
     if kind == "ApplicationClaim":
-        claim = _application(parse(_ApplicationFile, data, path))
+        claim = parse(_ApplicationFile, data, path).claim()
     elif kind == "ConnectionClaim":
-        claim = _connection(parse(_ConnectionFile, data, path))
+        claim = parse(_ConnectionFile, data, path).claim()
     else:
         raise InvalidInput(
             [
@@ -226,47 +266,6 @@ def read(text: str, path: str) -> Claim:
             ]
         )
     return claim
-
-
-def _application(file: _ApplicationFile) -> Claim:
-    inputs = {
-        role: tuple(sorted(InputTopic(t.topic, t.source, t.type) for t in topics))
-        for role, topics in sorted(file.inputs.items())
-    }
-    return ApplicationClaim(
-        application=file.application,
-        demand=file.demand,
-        request=file.request,
-        requesters=tuple(sorted(set(file.requesters))),
-        booked=_time(file.booked),
-        appdef=file.definition,
-        node=file.node,
-        inputs=MappingProxyType({role: topics for role, topics in inputs.items() if topics}),
-        parameters=MappingProxyType(file.parameters),
-        version=file.version,
-        lease=file.lease.lease() if file.lease else None,
-    )
-
-
-def _connection(file: _ConnectionFile) -> Claim:
-    return ConnectionClaim(
-        connection=file.connection,
-        demand=file.demand,
-        request=file.request,
-        requesters=tuple(sorted(set(file.requesters))),
-        booked=_time(file.booked),
-        type=type_named(file.type),
-        source=file.source,
-        target=file.target,
-        broker=file.broker,
-        topics=MappingProxyType(
-            {
-                source: topic.route(source, topic.target)
-                for source, topic in sorted(file.topics.items())
-            }
-        ),
-        lease=file.lease.lease() if file.lease else None,
-    )
 
 
 def kind_of(path: str) -> SubjectKind | None:

@@ -13,17 +13,12 @@ from typing import TypeAlias
 from rpds import HashTrieMap, HashTrieSet
 
 from demandops.connections import connection_types
+from demandops.connections.connection import Connection
 from demandops.connections.connection_type import ConnectionType
-from demandops.demand.claim import (
-    ApplicationClaim,
-    Claim,
-    ClaimKey,
-    ConnectionClaim,
-    Subject,
-    SubjectKind,
-    is_override_claim,
-)
+from demandops.demand.application import Application
+from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import UNSTARTED
+from demandops.subject import Subject, SubjectKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,29 +98,31 @@ class Ledger:
         held = self.claims.get(subject)
         return held.first if held else None
 
-    def application_claims(self, application: str) -> tuple[ApplicationClaim, ...]:
+    def application_claims(self, application: str) -> tuple[Claim, ...]:
         """Return the claims on an application."""
-        claims = self.claims_on(Subject(SubjectKind.APPLICATION, application))
-        return tuple(claim for claim in claims if isinstance(claim, ApplicationClaim))
+        return self.claims_on(Subject(SubjectKind.APPLICATION, application))
 
-    def connection_claims(self, connection: str) -> tuple[ConnectionClaim, ...]:
+    def connection_claims(self, connection: str) -> tuple[Claim, ...]:
         """Return the claims on a connection."""
-        claims = self.claims_on(Subject(SubjectKind.CONNECTION, connection))
-        return tuple(claim for claim in claims if isinstance(claim, ConnectionClaim))
+        return self.claims_on(Subject(SubjectKind.CONNECTION, connection))
 
-    def type_of(self, connection: str) -> ConnectionType | None:
-        """Return the type of a connection that a claim holds, or ``None``."""
-        first = self.first_claim(Subject(SubjectKind.CONNECTION, connection))
-        return first.type if isinstance(first, ConnectionClaim) else None
+    def application(self, id: str) -> Application | None:
+        """Return where a claimed application runs and what it is, by its first claim."""
+        first = self.first_claim(Subject(SubjectKind.APPLICATION, id))
+        return first.application if first else None
+
+    def connection(self, id: str) -> Connection | None:
+        """Return the ends and the type of a claimed connection, by its first claim."""
+        first = self.first_claim(Subject(SubjectKind.CONNECTION, id))
+        return first.connection if first else None
 
     def subjects(self, kind: SubjectKind) -> list[str]:
         """Return the ids of all subjects of a kind that have claims, sorted."""
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
-    def claims_taking(self, source: str, topic: str) -> tuple[ApplicationClaim, ...]:
+    def claims_taking(self, source: str, topic: str) -> tuple[Claim, ...]:
         """Return the claims with ``topic`` of ``source`` as an input, by application and demand."""
-        claims = self._claims("takes", source, topic)
-        return tuple(claim for claim in claims if isinstance(claim, ApplicationClaim))
+        return self._claims("takes", source, topic)
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         """Return the connections that bring ``topic`` to the node ``target``, sorted."""
@@ -263,26 +260,9 @@ class Ledger:
 
 def index_entries(claim: Claim | None) -> set[Entry]:
     """Return the index entries of a claim."""
-    if claim is None:
-        return set()
-    found: set[Entry] = {("demand", claim.demand)}
-    found |= {("requester", requester) for requester in claim.requesters}
-    if is_override_claim(claim):
-        found |= {("kept",), ("kept", claim.subject.kind.value, claim.subject.id)}
-    if claim.lease is not None:
+    found = set(claim.index_entries()) if claim else set()
+    if claim and claim.lease:
         found.add((_ENDS, _minute(claim.lease.expires_at)))
-    if isinstance(claim, ApplicationClaim):
-        found.add(("node", claim.node))
-        for _, topic in claim.all_inputs():
-            found |= {("takes", topic.source, topic.topic), ("node", topic.source)}
-    else:
-        for end in (claim.source, claim.target):
-            found.add(("link", claim.type.name, end))
-        if claim.broker:
-            found.add(("broker", claim.broker))
-        for route in claim.topics.values():
-            _, taking = route.sender_and_receiver(claim.source, claim.target)
-            found.add(("brings", taking, route.written_topic))
     return found
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 from demandops.config.config import Config
 from demandops.connections import route as routes
 from demandops.connections.communication_client import Client, ClientKey
-from demandops.connections.connection_type import Connection, ConnectionType
+from demandops.connections.connection import Connection
+from demandops.connections.connection_type import ConnectionType
 from demandops.connections.route import Route
-from demandops.demand.claim import ConnectionClaim, Subject, SubjectKind
+from demandops.demand.claim import Claim
 from demandops.demand.connection_type_choice import route_faults
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
@@ -19,9 +19,9 @@ from demandops.ledger.ledger import Ledger
 
 def client_keys(ledger: Ledger, connection: str) -> Iterator[ClientKey]:
     """Yield the keys of the clients that a connection needs."""
-    first = ledger.first_claim(Subject(SubjectKind.CONNECTION, connection))
-    if isinstance(first, ConnectionClaim):
-        yield from first.type.keys(connection, first.source, first.target)
+    first = ledger.connection(connection)
+    if first is not None:
+        yield from first.known_type.keys(connection, *first.nodes)
 
 
 def client_at(ledger: Ledger, config: Config, key: ClientKey) -> Client | None:
@@ -52,29 +52,27 @@ class _ClaimedConnections:
             Refused: if a person wrote a claim that its type cannot carry, or removed what it needs
                 from the inventory.
         """
-        claims = self.ledger.connection_claims(id)
-        if not claims or claims[0].type is not self.type:
+        first, claims = self.ledger.connection(id), self.ledger.connection_claims(id)
+        if first is None or first.type is not self.type:
             return None
-        first = claims[0]
-        topics = {
-            name: route
-            for name, route in connection_topics(claims).items()
-            if not is_bridged(route, first.source, first.target, self.config)
-        }
-        ends = (first.source, first.target)
-        problems = list(route_faults(self.type, topics.values(), ends, self.config))
+        topics = tuple(
+            route
+            for route in connection_topics(claims)
+            if not is_bridged(route, *first.nodes, self.config)
+        )
+        problems = list(route_faults(self.type, topics, first.nodes, self.config))
         if problems:
             raise Refused(
                 replace(one, field="connections", message=f"'{id}': {one.message}")
                 for one in problems
             )
-        broker = next((claim.broker for claim in claims if claim.broker), "")
-        return Connection(id, *ends, broker, MappingProxyType(topics))
+        brokers = (claim.connection.broker for claim in claims)
+        return replace(first, broker=next(filter(None, brokers), ""), topics=topics)
 
 
-def connection_topics(claims: Iterable[ConnectionClaim]) -> dict[str, Route]:
-    """Return the routes of all claims on a connection by source topic, sorted."""
-    return routes.merge_routes(route for claim in claims for route in claim.topics.values())
+def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
+    """Return the routes of all claims on a connection, sorted by source topic."""
+    return routes.merged_routes(route for claim in claims for route in claim.connection.topics)
 
 
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:

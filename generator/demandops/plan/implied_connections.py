@@ -6,59 +6,79 @@ demands, changes when the application moves, and is released with the demand.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 from demandops.config.config import Config
+from demandops.connections.connection import Connection
+from demandops.connections.connection_types import type_named
 from demandops.connections.route import Route
-from demandops.demand.demand_request import (
-    ApplicationDemand,
-    ConnectionDemand,
-    DemandRequest,
-    InputTopic,
-)
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.demand_request import AnyRequest, Demanded, Place
 from demandops.identifiers import topic_problem
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import outputs
 from demandops.plan.release import ServiceKey
 
 
-def with_implied_connections(
-    request: DemandRequest, ledger: Ledger, config: Config
-) -> DemandRequest:
+class _InputPlace(Place):
+    """The input that needs a connection: faults of the connection are faults of the input."""
+
+    def at(self, path: str) -> str:
+        """Return the input's field, or that of the demand's requesters."""
+        return path if path.startswith("requesters") else self.field
+
+
+def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
     """Return the request with a connection for each input that no listed connection brings.
 
     A connection that already brings the topic is joined. Otherwise the two nodes get a connection
     of their own. A faulty input adds none; admission reports it.
     """
-    connections: dict[tuple[str, str, str], ConnectionDemand] = {}
-    routes: dict[tuple[str, str, str], dict[Route, None]] = {}
+    first: dict[_Ends, Demanded] = {}
+    routes: dict[_Ends, dict[Route, None]] = {}
+    listed = [one.held for one in request.demanded if isinstance(one.held, Connection)]
     brought = {
-        (route.sender_and_receiver(connection.source, connection.target)[1], route.written_topic)
-        for connection in request.connections
+        (route.sender_and_receiver(*connection.nodes)[1], route.written_topic)
+        for connection in listed
         for route in connection.topics
     }
-    for index, app in enumerate(request.applications):
-        if app.connect is None or app.appdef not in config.appdefs:
+    for one in request.demanded:
+        app = one.held
+        if not isinstance(app, Application) or one.connect == "none":
+            continue
+        if app.appdef not in config.appdefs:
             continue
         for foreign in foreign_inputs(app, config):
             topic = foreign.topic
             if (app.node, topic.topic) in brought or not _is_valid(app, topic, config):
                 continue
-            needed = _connection(app, topic.source, topic.topic, ledger)
-            same = (needed.id, needed.source, needed.target)
-            where = f"applications[{index}].{foreign.field}"
-            connections.setdefault(same, replace(needed, for_input=where))
-            routes.setdefault(same, {}).update(dict.fromkeys(needed.topics))
-    listed = []
-    for connection in request.connections:
-        more = routes.pop((connection.id, connection.source, connection.target), {})
-        topics = tuple(dict.fromkeys((*connection.topics, *more)))
-        listed.append(replace(connection, topics=topics) if more else connection)
-    implied = (replace(connections[same], topics=tuple(topics)) for same, topics in routes.items())
-    return replace(request, connections=(*listed, *implied))
+            needed = _connection(app, one.connect, topic, ledger)
+            place = _InputPlace(one.place.at(foreign.field))
+            ends = (needed.id, *needed.nodes)
+            first.setdefault(ends, replace(one, held=needed, place=place, connect="none"))
+            routes.setdefault(ends, {}).update(dict.fromkeys(needed.topics))
+    demanded = []
+    for one in request.demanded:
+        if isinstance(one.held, Connection):
+            more = routes.pop((one.held.id, *one.held.nodes), {})
+            demanded.append(_with_topics(one, (*one.held.topics, *more)) if more else one)
+        else:
+            demanded.append(one)
+    implied = (_with_topics(first[ends], topics) for ends, topics in routes.items())
+    return replace(request, demanded=(*demanded, *implied))
 
 
-def _is_valid(app: ApplicationDemand, topic: InputTopic, config: Config) -> bool:
+_Ends: TypeAlias = "tuple[str, ...]"
+
+
+def _with_topics(one: Demanded, topics: Iterable[Route]) -> Demanded:
+    assert isinstance(one.held, Connection)  # noqa: S101 - the caller knows
+    return replace(one, held=replace(one.held, topics=tuple(dict.fromkeys(topics))))
+
+
+def _is_valid(app: Application, topic: InputTopic, config: Config) -> bool:
     return {app.node, topic.source} <= config.domain_of.keys() and not topic_problem(topic.topic)
 
 
@@ -75,7 +95,7 @@ class ForeignInput:
     field: str
 
 
-def foreign_inputs(app: ApplicationDemand, config: Config) -> list[ForeignInput]:
+def foreign_inputs(app: Application, config: Config) -> list[ForeignInput]:
     """Return the topics that must be carried to the application's node."""
     appdef = config.appdefs[app.appdef]
     needed = set()
@@ -103,24 +123,14 @@ def foreign_inputs(app: ApplicationDemand, config: Config) -> list[ForeignInput]
     return found
 
 
-def _connection(
-    app: ApplicationDemand, source: str, topic: str, ledger: Ledger
-) -> ConnectionDemand:
-    assert app.connect is not None  # noqa: S101 - the caller checks it
-    own = ConnectionDemand(
-        id=f"derived/{source}/{app.node}",
-        type=app.connect,
-        source=source,
-        target=app.node,
-        topics=(Route(topic, topic),),
-        broker="",
-        requesters=app.requesters,
-        term=app.term,
-    )
-    for id in ledger.connections_bringing(app.node, topic):
+def _connection(app: Application, type: str, topic: InputTopic, ledger: Ledger) -> Connection:
+    """Return the connection that brings a topic to an application, with this topic alone."""
+    ends, name = (topic.source, app.node), topic.topic
+    for id in ledger.connections_bringing(app.node, name):
         for claim in ledger.connection_claims(id):
-            route = claim.topics.get(topic)
-            ends = (claim.source, claim.target)
-            if ends == (source, app.node) and route is not None and not route.reverse:
-                return replace(own, id=id, type=claim.type.number, topics=(route,))
-    return own
+            known, route = claim.connection, claim.connection.route(name)
+            if known.nodes == ends and route is not None and not route.reverse:
+                return Connection(id, known.type, *ends, "", (route,))
+    kind = None if type == "auto" else type_named(type)
+    id = f"derived/{topic.source}/{app.node}"
+    return Connection(id, kind, *ends, "", (Route(name, name),))

@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeAlias, TypeVar, cast
 
 from demandops.config.config import Config
-from demandops.demand.claim import Subject
 from demandops.ledger.ledger import ClaimChange, Ledger, index_entries
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, keys_of
+from demandops.subject import Subject
 
 T = TypeVar("T")
 

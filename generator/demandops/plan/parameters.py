@@ -9,13 +9,11 @@ import json
 from collections.abc import Iterable, Mapping
 
 from demandops.config.appdef import Parameter
-from demandops.demand.claim import ApplicationClaim
+from demandops.demand.claim import Claim
 from demandops.errors import Refused, fault
 
 
-def merged(
-    definitions: Mapping[str, Parameter], claims: Iterable[ApplicationClaim]
-) -> dict[str, object]:
+def merged(definitions: Mapping[str, Parameter], claims: Iterable[Claim]) -> dict[str, object]:
     """Return the value of every parameter, merged over all claims.
 
     Raises:
@@ -24,15 +22,17 @@ def merged(
     claims = list(claims)
     values: dict[str, object] = {}
     for name, parameter in sorted(definitions.items()):
-        given = [claim for claim in claims if name in claim.parameters]
+        given = [claim for claim in claims if name in claim.application.parameters]
         values[name] = _merged_value(name, parameter, given) if given else parameter.default
     return values
 
 
-def _merged_value(name: str, parameter: Parameter, claims: list[ApplicationClaim]) -> object:
-    given = [claim.parameters[name] for claim in claims]
+def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> object:
+    given = [claim.application.parameters[name] for claim in claims]
     if parameter.merge == "latest":
-        return max(claims, key=lambda claim: (claim.booked, claim.demand)).parameters[name]
+        return max(claims, key=lambda claim: (claim.booked, claim.demand)).application.parameters[
+            name
+        ]
     if parameter.merge == "union":
         items = [
             item for value in given for item in (value if isinstance(value, list) else [value])
@@ -59,7 +59,7 @@ def _merged_value(name: str, parameter: Parameter, claims: list[ApplicationClaim
         return max(numbers) if parameter.merge == "max" else min(numbers)
     if any(value != given[0] for value in given):
         shown = " and ".join(
-            f"{json.dumps(claim.parameters[name])} for {', '.join(claim.requesters)}"
+            f"{json.dumps(claim.application.parameters[name])} for {', '.join(claim.requesters)}"
             for claim in claims[:3]
         )
         raise Refused(

@@ -13,8 +13,8 @@ from demandops.config.appdef import ApplicationDefinition, Parameter, Scaling, S
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.config.registry import ChartSource
-from demandops.demand.claim import ApplicationClaim
-from demandops.demand.demand_request import InputTopic
+from demandops.demand.application import InputTopic
+from demandops.demand.claim import Claim
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import Ledger
 from demandops.plan import connection_clients, parameters
@@ -25,7 +25,6 @@ from demandops.plan.release_keys import (
     ReleaseKey,
     appdef_of,
     claims_needing,
-    deciding_claim,
 )
 
 
@@ -61,8 +60,9 @@ def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease 
     claims = claims_needing(ledger, config, key)
     if not claims:
         return None
-    users = tuple(dict.fromkeys(claim.application for claim in claims))
-    appdef = appdef_of(config, deciding_claim(ledger, users[0]).appdef)
+    users = tuple(dict.fromkeys(claim.subject.id for claim in claims))
+    first = ledger.application(users[0]) or claims[0].application
+    appdef = appdef_of(config, first.appdef)
     service = appdef.services[key.service]
     node, domain = config.node_and_domain(key.node)
     if service.each is not None:
@@ -70,7 +70,7 @@ def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease 
     else:
         inputs = _application_inputs(config, appdef, service, claims)
     definitions: dict[str, Parameter] = {}
-    for name in sorted({claim.appdef for claim in claims}, reverse=True):
+    for name in sorted({claim.application.appdef for claim in claims}, reverse=True):
         definitions |= appdef_of(config, name).parameters
     values = parameters.merged(definitions, claims)
     return ServiceRelease(
@@ -94,14 +94,15 @@ def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease 
     )
 
 
-def _chart(config: Config, service: Service, claims: Iterable[ApplicationClaim]) -> ChartSource:
+def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSource:
     """Return the chart in the version that the claims ask for, or the default version.
 
     Raises:
         Refused: if applications that share the service ask for different versions.
     """
     chart = config.charts[service.chart]
-    charts = {claim.version: chart.at(claim.version) or chart for claim in claims}
+    wanted = {claim.application.version for claim in claims}
+    charts = {version: chart.at(version) or chart for version in wanted}
     if len({source.version for source in charts.values()}) > 1:
         versions = " and ".join(
             f"{source.version} (for '{version}')" for version, source in sorted(charts.items())
@@ -113,15 +114,13 @@ def _chart(config: Config, service: Service, claims: Iterable[ApplicationClaim])
     return next(iter(charts.values()))
 
 
-def _requesters(claims: Iterable[ApplicationClaim]) -> tuple[str, ...]:
+def _requesters(claims: Iterable[Claim]) -> tuple[str, ...]:
     return tuple(sorted({who for claim in claims for who in claim.requesters}))
 
 
-def _shared_input(
-    claims: Iterable[ApplicationClaim], role: str, key: ServiceKey
-) -> tuple[InputTopic, ...]:
+def _shared_input(claims: Iterable[Claim], role: str, key: ServiceKey) -> tuple[InputTopic, ...]:
     source, topic = str(key.source), str(key.topic)
-    inputs = (one for claim in claims for one in claim.inputs_from(role, source, topic))
+    inputs = (one for claim in claims for one in claim.application.inputs_from(role, source, topic))
     return (InputTopic(topic, source, min((one.type for one in inputs if one.type), default="")),)
 
 
@@ -129,7 +128,7 @@ def _application_inputs(
     config: Config,
     appdef: ApplicationDefinition,
     service: Service,
-    claims: tuple[ApplicationClaim, ...],
+    claims: tuple[Claim, ...],
 ) -> dict[str, tuple[InputTopic, ...]]:
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for role, origin in sorted(service.inputs.items()):
@@ -139,16 +138,20 @@ def _application_inputs(
             continue
         producer = appdef.services[producer_name]
         pattern, each = producer.outputs[output], str(producer.each)
-        topics = {(one.source, one.topic) for claim in claims for one in claim.inputs.get(each, ())}
+        topics = {
+            (one.source, one.topic)
+            for claim in claims
+            for one in claim.application.inputs.get(each, ())
+        }
         names = {(_of_instance(pattern, config, producer, *one), one[0]) for one in topics}
         inputs[role] = tuple(InputTopic(*name) for name in sorted(names))
     return inputs
 
 
-def _united(claims: Iterable[ApplicationClaim], role: str) -> tuple[InputTopic, ...]:
+def _united(claims: Iterable[Claim], role: str) -> tuple[InputTopic, ...]:
     types: dict[tuple[str, str], set[str]] = {}
     for claim in claims:
-        for topic in claim.inputs.get(role, ()):
+        for topic in claim.application.inputs.get(role, ()):
             types.setdefault((topic.topic, topic.source), set()).add(topic.type)
     return tuple(InputTopic(*key, max(found)) for key, found in sorted(types.items()))
 

@@ -12,8 +12,8 @@ from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import ChartSource
 from demandops.connections.communication_client import Client
+from demandops.demand.application import InputTopic
 from demandops.demand.claim import Claim
-from demandops.demand.demand_request import InputTopic
 from demandops.ledger.ledger import Ledger
 
 

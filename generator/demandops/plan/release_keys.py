@@ -8,17 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from types import MappingProxyType
 
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
 from demandops.connections.communication_client import ClientKey
-from demandops.demand.claim import ApplicationClaim, Claim, Subject, SubjectKind
+from demandops.demand.application import Application
+from demandops.demand.claim import Claim
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.plan import connection_clients
 from demandops.plan.overrides.suspended_claims import without_suspended
 from demandops.plan.release import ServiceKey
+from demandops.subject import Subject, SubjectKind
 
 ReleaseKey = ServiceKey | ClientKey
 
@@ -44,38 +45,41 @@ def keys_of_claims(
         for claim in claims
         for key in (
             _service_keys(ledger, config, claim, strict)
-            if isinstance(claim, ApplicationClaim)
-            else connection_clients.client_keys(ledger, claim.connection)
+            if claim.is_on_application
+            else connection_clients.client_keys(ledger, claim.subject.id)
         )
     )
     yield from dict.fromkeys(keys)
 
 
 def _service_keys(
-    ledger: Ledger, config: Config, claim: ApplicationClaim, strict: bool
+    ledger: Ledger, config: Config, claim: Claim, strict: bool
 ) -> Iterator[ServiceKey]:
-    first = deciding_claim(ledger, claim.application)
+    app = claim.application
+    first = ledger.application(app.id) or app
     known = strict or first.appdef in config.appdefs
     appdef = appdef_of(config, first.appdef) if known else None
     for name, service in (appdef.services if appdef else {}).items():
         if service.each is None:
-            yield ServiceKey(name, first.node, application=claim.application)
+            yield ServiceKey(name, first.node, application=app.id)
             continue
-        for topic in claim.inputs.get(service.each, ()):
+        for topic in app.inputs.get(service.each, ()):
             node = topic.source if service.placement == "source" else first.node
             yield ServiceKey(name, node, source=topic.source, topic=topic.topic)
 
 
-def claims_needing(ledger: Ledger, config: Config, key: ServiceKey) -> tuple[ApplicationClaim, ...]:
+def claims_needing(ledger: Ledger, config: Config, key: ServiceKey) -> tuple[Claim, ...]:
     """Return the claims that need a service instance, by application and demand."""
     if key.application is not None:
         needed = _role(ledger, config, key.application, key) is not None
         return ledger.application_claims(key.application) if needed else ()
     source, topic = str(key.source), str(key.topic)
     claims = ledger.claims_taking(source, topic)
-    roles = {name: _role(ledger, config, name, key) for name in {one.application for one in claims}}
+    roles = {name: _role(ledger, config, name, key) for name in {one.subject.id for one in claims}}
     return tuple(
-        one for one in claims if one.inputs_from(roles[one.application] or "", source, topic)
+        one
+        for one in claims
+        if one.application.inputs_from(roles[one.subject.id] or "", source, topic)
     )
 
 
@@ -85,20 +89,13 @@ def _role(ledger: Ledger, config: Config, application: str, key: ServiceKey) -> 
     The text is empty if there is one instance for the application. ``None`` means that ``key`` is
     not a service of the application, for example because it moved or changed its definition.
     """
-    first = ledger.first_claim(Subject(SubjectKind.APPLICATION, application))
-    appdef = config.appdefs.get(first.appdef) if isinstance(first, ApplicationClaim) else None
+    first = ledger.application(application)
+    appdef = config.appdefs.get(first.appdef) if first else None
     service = appdef.services.get(key.service) if appdef else None
-    if service is None or (service.each is None) is (key.application is None):
+    if first is None or service is None or (service.each is None) is (key.application is None):
         return None
-    node = key.source if service.placement == "source" else deciding_claim(ledger, application).node
+    node = key.source if service.placement == "source" else first.node
     return service.each or "" if node == key.node else None
-
-
-def deciding_claim(ledger: Ledger, application: str) -> ApplicationClaim:
-    """Return the claim that decides where a claimed application runs, and what it is."""
-    first = ledger.first_claim(Subject(SubjectKind.APPLICATION, application))
-    assert isinstance(first, ApplicationClaim)  # noqa: S101 - the application is claimed
-    return first
 
 
 def affected_keys(
@@ -126,30 +123,32 @@ def affected_keys(
 def _differing(change: ClaimChange, config: Config) -> tuple[Claim | None, Claim | None]:
     """Return a changed claim before and after; if only inputs differ, with these inputs alone."""
     before, after = change.before, change.after
-    if (
-        not isinstance(before, ApplicationClaim)
-        or not isinstance(after, ApplicationClaim)
-        or before.parameters  # the latest booking decides some of them
-        or replace(after, inputs=before.inputs, booked=before.booked, lease=before.lease) != before
-    ):
+    if before is None or after is None or not before.is_on_application:
         return before, after
-    return _with_inputs_not_in(before, after), _with_inputs_not_in(after, before)
+    old, new = before.application, after.application
+    same = replace(new, inputs=old.inputs) == old and before.requesters == after.requesters
+    if not same or old.parameters:  # the latest booking decides some of them
+        return before, after
+    return (
+        replace(before, held=_with_inputs_not_in(old, new)),
+        replace(after, held=_with_inputs_not_in(new, old)),
+    )
 
 
-def _with_inputs_not_in(claim: ApplicationClaim, other: ApplicationClaim) -> ApplicationClaim:
+def _with_inputs_not_in(app: Application, other: Application) -> Application:
     inputs = {}
-    for role, topics in claim.inputs.items():
+    for role, topics in app.inputs.items():
         known = {*other.inputs.get(role, ())}
         inputs[role] = tuple(topic for topic in topics if topic not in known)
-    return replace(claim, inputs=MappingProxyType(inputs))
+    return app.with_inputs(inputs)
 
 
 def _decided_alike(before: Ledger, after: Ledger, subject: Subject) -> bool:
     """Return whether an application runs at the same place and is the same in both ledgers."""
-    one, other = before.first_claim(subject), after.first_claim(subject)
-    if isinstance(one, ApplicationClaim) and isinstance(other, ApplicationClaim):
-        return (one.appdef, one.node) == (other.appdef, other.node)
-    return True
+    if subject.kind is not SubjectKind.APPLICATION:
+        return True
+    one, other = before.application(subject.id), after.application(subject.id)
+    return not one or not other or (one.appdef, one.node) == (other.appdef, other.node)
 
 
 def all_keys(ledger: Ledger, config: Config) -> tuple[ReleaseKey, ...]:

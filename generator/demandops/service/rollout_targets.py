@@ -5,7 +5,6 @@ from __future__ import annotations
 from demandops.cluster.health import ClusterDomain, ObjectName, Target
 from demandops.config.repo_settings import RepoSettings
 from demandops.decision import Decision, State
-from demandops.demand.claim import Subject, SubjectKind
 from demandops.demand.demand_request import DemandRequest
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
@@ -13,6 +12,7 @@ from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, keys_of
 from demandops.render.gitops.argocd import project_of
+from demandops.subject import Subject
 
 
 def targets_of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
@@ -51,9 +51,8 @@ def targets_of_state(state: State) -> list[tuple[Release, Target]]:
 
 def _requested_subjects(request: DemandRequest, ledger: Ledger) -> list[Subject]:
     subjects = [claim.subject for claim in ledger.claims_of_demand(request.demand)]
-    if request.operation.adds_claims:
-        subjects += [Subject(SubjectKind.APPLICATION, app.id) for app in request.applications]
-        subjects += [Subject(SubjectKind.CONNECTION, link.id) for link in request.connections]
+    if request.adds_claims:
+        subjects += request.subjects()
     return subjects
 
 

@@ -150,7 +150,7 @@ def test_as_a_requester_only_a_node_keeps_what_is_at_it(bare: Path, demandops: R
         topics = [
             topic.topic
             for claim in generator.snapshot.state.ledger.application_claims("edge/fusion-2")
-            for _, topic in claim.all_inputs()
+            for _, topic in claim.application.all_inputs()
         ]
     assert "/stations/station00/pointcloud" in topics
 

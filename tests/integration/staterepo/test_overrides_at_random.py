@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops.demand.demand_request import OVERRIDE_PREFIX
+from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.errors import DemandOpsError
 
 from tests.kit import rig

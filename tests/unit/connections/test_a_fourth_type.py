@@ -19,12 +19,13 @@ from demandops import naming, settings
 from demandops.config.config import NODES_FILE, Config
 from demandops.connections import connection_types
 from demandops.connections.communication_client import Client, ClientKey
-from demandops.connections.connection_type import Connections, ConnectionType, Ends
+from demandops.connections.connection import Connection
+from demandops.connections.connection_type import Connections, ConnectionType
 from demandops.decision import Decision
-from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file
 from demandops.plan.views import explanation
+from demandops.subject import Subject, SubjectKind
 
 from tests.kit.connections import ROS_IMAGE, demand, routes, state
 from tests.kit.goals import connection, goal
@@ -80,8 +81,8 @@ class RelayType(ConnectionType):
     options = frozenset({"queue"})
     renames = True
 
-    def link_faults(self, ends: Ends, config: Config) -> Iterator[Fault]:
-        target = config.nodes.get(ends.target)
+    def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
+        target = config.nodes.get(connection.target)
         if target is not None and target.wan is None:
             yield fault("target", f"'{target.id}' has no wan; add it in {NODES_FILE}")
 
@@ -94,7 +95,7 @@ class RelayType(ConnectionType):
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Client | None:
         found = [one for id in connections.at(key.id) if (one := connections.get(id))]
         carried = [one for one in found if one.target == key.id and one.topics]
-        fetch = {r.read_topic: r.written_topic for one in carried for r in one.topics.values()}
+        fetch = {r.read_topic: r.written_topic for one in carried for r in one.topics}
         node, domain = config.node_and_domain(key.id)
         name = naming.object_name(self.word, key.id)
         ids = tuple(one.id for one in carried)
@@ -152,7 +153,7 @@ def booked(kind: str = "relay") -> tuple[MemoryRepo, Decision]:
 def test_a_demand_for_it_becomes_a_claim_that_its_file_keeps() -> None:
     world, _ = booked()
     (claim,) = world.state.ledger.connection_claims("c")
-    assert claim.type is RELAY
+    assert claim.connection.type is RELAY
     path = claim_file.path_of(claim.key)
     assert yaml.safe_load(world.files[path])["type"] == "relay"
     assert claim_file.read(world.files[path], path) == claim
@@ -191,7 +192,8 @@ def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
 
 def test_it_is_chosen_if_no_other_can_carry_the_topic() -> None:
     world, _ = booked("auto")
-    assert world.state.ledger.type_of("c") is RELAY
+    found = world.state.ledger.connection("c")
+    assert found and found.type is RELAY
 
 
 def test_its_number_is_known_on_the_wire() -> None:

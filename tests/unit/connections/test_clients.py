@@ -17,12 +17,12 @@ from demandops.connections.mqtt import MQTT
 from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH
 from demandops.decision import Decision, State, rendered_files
-from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger.ledger import changes_on
 from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connection_client import check_configuration
+from demandops.subject import Subject, SubjectKind
 
 from tests.kit.config import skeleton
 from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
@@ -325,7 +325,7 @@ class TestWhatPeopleDidInGit:
         world = World(state(**self.NODES))
         world.send(demand(kind))
         (claim,) = world.state.ledger.connection_claims("c")
-        edited = replace(claim, topics={route.source: route})
+        edited = replace(claim, held=replace(claim.connection, topics=(route,)))
         books = world.state.ledger.replace(claim.key, edited)
         with pytest.raises(Refused) as refused:
             rendered_files(replace(state(**(self.NODES | nodes)), ledger=books))

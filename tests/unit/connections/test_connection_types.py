@@ -29,7 +29,7 @@ from tests.kit.memory import MemoryRepo
 def carried(before: State, asked: dict[str, Any]) -> ConnectionType:
     after = decided(before, asked)
     (claim,) = after.ledger.connection_claims("c")
-    return claim.type
+    return claim.connection.known_type
 
 
 def faults(before: State, asked: dict[str, Any]) -> list[str]:
@@ -83,7 +83,7 @@ class TestAutomaticChoice:
         after = decided(before, demand("mqtt"))
         again = demand(requesters=["vehicle01"])
         after = decided(after, again)
-        assert {claim.type for claim in after.ledger.connection_claims("c")} == {MQTT}
+        assert {claim.connection.type for claim in after.ledger.connection_claims("c")} == {MQTT}
 
     def test_a_shutdown_without_a_type_means_what_stands(self) -> None:
         before = state(vehicle00=SPEAKS, edge=REACHABLE)
@@ -232,7 +232,7 @@ class TestThroughTheWire:
         assert books.send(goal([], [asked])).outcome == "booked"
         assert books.send(goal([], [asked])).outcome == "unchanged"
         (claim,) = books.state.ledger.connection_claims("c")
-        assert claim.type.name == name
+        assert claim.connection.known_type.name == name
         assert books.books()["connections"]["c"]["topics"] == ["/a"]
         assert books.send(goal([], [asked], shutdown=True)).outcome == "released"
         assert len(books.state.ledger) == 0

@@ -13,7 +13,7 @@ from demandops.connections.route import (
     RouteOptions,
     contradictions,
     faults,
-    merge_routes,
+    merged_routes,
 )
 from demandops.errors import InvalidInput
 
@@ -114,7 +114,7 @@ def test_two_topics_may_arrive_as_one() -> None:
 def test_a_type_that_is_not_said_contradicts_none_and_is_filled_in() -> None:
     plain, typed = Route("/a", "/a"), Route("/a", "/a", type="std_msgs/msg/String")
     assert not list(contradictions(plain, typed))
-    assert merge_routes([plain, typed]) == merge_routes([typed, plain]) == {"/a": typed}
+    assert merged_routes([plain, typed]) == merged_routes([typed, plain]) == (typed,)
     other = Route("/a", "/a", type="std_msgs/msg/Bool")
     assert list(contradictions(typed, other)) == [
         ("type", "'std_msgs/msg/String'", "'std_msgs/msg/Bool'")

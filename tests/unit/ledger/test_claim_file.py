@@ -5,21 +5,16 @@ from __future__ import annotations
 from datetime import datetime, timedelta, timezone
 from types import MappingProxyType
 
+from demandops.connections.connection import Connection
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.mqtt import MQTT
-from demandops.connections.route import Route, merge_routes
-from demandops.demand.claim import (
-    ApplicationClaim,
-    Claim,
-    ClaimKey,
-    ConnectionClaim,
-    Subject,
-    SubjectKind,
-    demand_id,
-)
-from demandops.demand.demand_request import InputTopic, id_problem
+from demandops.connections.route import Route, merged_routes
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.claim import Claim, ClaimKey, demand_id
+from demandops.demand.demand_request import id_problem
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
+from demandops.subject import Subject, SubjectKind
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -78,14 +73,9 @@ def by_place(found: list[InputTopic]) -> tuple[InputTopic, ...]:
 
 
 @st.composite
-def application_claims(draw: st.DrawFn) -> ApplicationClaim:
-    request, who = draw(st.just("") | ids), draw(people)
-    return ApplicationClaim(
-        application=draw(ids),
-        demand=demand_id(request, who),
-        request=request,
-        requesters=who,
-        booked=draw(moments),
+def applications(draw: st.DrawFn) -> Application:
+    return Application(
+        id=draw(ids),
         appdef="object-detection-fusion",
         node=draw(ids),
         inputs=MappingProxyType(
@@ -99,24 +89,25 @@ def application_claims(draw: st.DrawFn) -> ApplicationClaim:
     )
 
 
+connections = st.builds(
+    Connection,
+    id=ids,
+    type=st.sampled_from(CONNECTION_TYPES),
+    source=ids,
+    target=ids,
+    broker=st.just("") | ids,
+    topics=st.lists(routes, min_size=1, max_size=4).map(merged_routes),
+)
+
+
 @st.composite
-def connection_claims(draw: st.DrawFn) -> ConnectionClaim:
+def all_claims(draw: st.DrawFn) -> Claim:
     request, who = draw(st.just("") | ids), draw(people)
-    return ConnectionClaim(
-        connection=draw(ids),
-        demand=demand_id(request, who),
-        request=request,
-        requesters=who,
-        booked=draw(moments),
-        type=draw(st.sampled_from(CONNECTION_TYPES)),
-        source=draw(ids),
-        target=draw(ids),
-        broker=draw(st.just("") | ids),
-        topics=MappingProxyType(merge_routes(draw(st.lists(routes, min_size=1, max_size=4)))),
-    )
+    held = draw(applications() | connections)
+    return Claim(held, demand_id(request, who), request, who, draw(moments))
 
 
-claims = application_claims() | connection_claims()
+claims = all_claims()
 
 
 @examples(50)
@@ -156,18 +147,8 @@ def test_two_claims_never_share_a_file(keys: dict[tuple[SubjectKind, str, str], 
 @given(moments, st.integers(-12, 14))
 def test_a_time_is_the_same_moment_in_any_zone(moment: datetime, hours: int) -> None:
     here = moment.astimezone(timezone(timedelta(hours=hours)))
-    claim = ConnectionClaim(
-        connection="a",
-        demand="b",
-        request="",
-        requesters=("c",),
-        booked=here,
-        type=MQTT,
-        source="d",
-        target="e",
-        broker="",
-        topics=MappingProxyType({"/a": Route("/a", "/b")}),
-    )
+    connection = Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"),))
+    claim = Claim(connection, "b", "", ("c",), here)
 
     read = claim_file.read(claim_file.text_of(claim), claim_file.path_of(claim.key))
 

@@ -12,11 +12,12 @@ from types import MappingProxyType
 from typing import Any
 
 from demandops.config.load import load
+from demandops.connections.connection import Connection
 from demandops.connections.connection_types import CONNECTION_TYPES
-from demandops.connections.route import Route, merge_routes
+from demandops.connections.route import Route, merged_routes
 from demandops.decision import Decision, State
-from demandops.demand.claim import ApplicationClaim, Claim, ConnectionClaim
-from demandops.demand.demand_request import InputTopic
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.claim import Claim
 from demandops.demand.lease import LONGEST_S, Lease
 from demandops.identifiers import id_problem
 from demandops.ledger import claim_file
@@ -140,21 +141,19 @@ def claims_of(world: running.World) -> dict[Name, tuple[dict[str, Any], frozense
     found = {}
     for claim in world.state.ledger:
         what: dict[str, Any]
-        if isinstance(claim, ApplicationClaim):
+        held = claim.held
+        if isinstance(held, Application):
             inputs = {
                 role: frozenset((topic.source, topic.topic) for topic in topics)
-                for role, topics in claim.inputs.items()
+                for role, topics in held.inputs.items()
             }
-            what = {"type": claim.appdef, "node": claim.node, "inputs": inputs}
-            what["parameters"] = dict(claim.parameters)
+            what = {"type": held.appdef, "node": held.node, "inputs": inputs}
+            what["parameters"] = dict(held.parameters)
         else:
-            what = {"source": claim.source, "target": claim.target, "topics": _names(claim)}
+            topics = {route.source: route.target for route in held.topics}
+            what = {"source": held.source, "target": held.target, "topics": topics}
         found[name_of(claim)] = what, frozenset(claim.requesters)
     return found
-
-
-def _names(claim: ConnectionClaim) -> dict[str, str]:
-    return {source: route.target for source, route in claim.topics.items()}
 
 
 def restart(world: running.World, random: Random) -> None:
@@ -228,7 +227,7 @@ def test_what_was_promised_is_kept(random: Random, length: int) -> None:
         assert_outcome(taken, expected, promises)
         assert claims_of(world) == promises.claims()
         assert_recorded(world, promises)
-        if isinstance(taken, Decision) and taken.request.operation.adds_claims:
+        if isinstance(taken, Decision) and taken.request.adds_claims:
             again = world.take(goal)
             assert isinstance(again, Decision)
             assert (again.outcome, dict(again.files)) == ("unchanged", {})
@@ -284,44 +283,43 @@ inputs = st.dictionaries(
     ),
 )
 applications = st.builds(
-    ApplicationClaim,
-    application=ids,
+    Application,
+    id=ids,
     appdef=ids,
     node=ids,
     inputs=inputs.map(lambda found: MappingProxyType(dict(sorted(found.items())))),
     parameters=st.dictionaries(ids, values, max_size=3).map(MappingProxyType),
     version=st.just("") | st.sampled_from(["1.0.0", "1e3", "0x10", "next", "on", "2024-01-01"]),
-    **common,
 )
 routes = st.builds(Route, topics, topics, reverse=st.booleans(), qos=st.integers(0, 2))
 connections = st.builds(
-    ConnectionClaim,
-    connection=ids,
+    Connection,
+    id=ids,
     type=st.sampled_from(CONNECTION_TYPES),
     source=ids,
     target=ids,
     broker=st.just("") | ids,
-    topics=st.lists(routes, min_size=1, max_size=3).map(
-        lambda r: MappingProxyType(merge_routes(r))
-    ),
-    **common,
+    topics=st.lists(routes, min_size=1, max_size=3).map(merged_routes),
 )
+all_claims = st.builds(Claim, held=applications | connections, **common)
 
 
 @examples(100)
-@given(applications | connections)
+@given(all_claims)
 def test_a_claim_is_read_as_it_was_written(claim: Claim) -> None:
     path = claim_file.path_of(claim.key)
     text = claim_file.text_of(claim)
     found = claim_file.read(text.encode().decode(), path)
     assert found == claim
     assert claim_file.text_of(found) == text
-    if isinstance(found, ApplicationClaim) and isinstance(claim, ApplicationClaim):
-        assert repr(sorted(found.parameters.items())) == repr(sorted(claim.parameters.items()))
+    if claim.is_on_application:
+        assert repr(sorted(found.application.parameters.items())) == repr(
+            sorted(claim.application.parameters.items())
+        )
 
 
 @examples(35)
-@given(st.lists(applications | connections, max_size=8), chances)
+@given(st.lists(all_claims, max_size=8), chances)
 def test_the_index_is_that_of_a_ledger_built_in_any_order(
     claims: list[Claim], random: Random
 ) -> None:

@@ -11,7 +11,7 @@ from random import Random
 
 import pytest
 from demandops.decision import Decision, State, rendered_files
-from demandops.demand.claim import ApplicationClaim, Claim
+from demandops.demand.claim import Claim
 from demandops.errors import Refused
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
@@ -37,7 +37,7 @@ from tests.model.goals import (
 
 def demand_in(claim: Claim) -> tuple[str, str, Demand]:
     """Return what the model knows a claim by."""
-    kind = "application" if isinstance(claim, ApplicationClaim) else "connection"
+    kind = "application" if claim.is_on_application else "connection"
     return kind, claim.subject.id, (claim.request, claim.requesters)
 
 

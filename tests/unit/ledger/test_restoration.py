@@ -12,7 +12,6 @@ import pytest
 from demandops.config.config import Config
 from demandops.decision import Decision, State, decide
 from demandops.demand.claim import Claim
-from demandops.demand.demand_request import Operation
 from demandops.demand.lease import Lease
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
@@ -27,7 +26,6 @@ LATER = NOW + timedelta(hours=3)
 def back_to(claims: Iterable[Claim], *, drop_newer: bool = False) -> Restoration:
     return Restoration(
         id="",
-        operation=Operation.ROLLBACK,
         to="0" * 40,
         claims=tuple(claims),
         drop_newer=drop_newer,
@@ -115,7 +113,7 @@ def test_what_the_configuration_no_longer_has_is_refused() -> None:
     then = repo.state.ledger
     application = next(c for c in then if c.subject.kind.value == "applications")
     ledger = then.replace(application.key, None)
-    config = _without_node(repo.state.config, application.node)  # type: ignore[union-attr]
+    config = _without_node(repo.state.config, application.application.node)
     state = State(config, repo.state.engine, ledger)
     with pytest.raises(Refused) as told:
         decide(state, back_to(then), LATER, repo.files.get)

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime, timezone
-from types import MappingProxyType
 from typing import Any
 
 import pytest
 import yaml
+from demandops.connections.connection import Connection
 from demandops.connections.connection_type import ConnectionType
 from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
-from demandops.connections.route import Route, merge_routes
+from demandops.connections.route import Route, merged_routes
 from demandops.connections.zenoh import ZENOH
-from demandops.demand.claim import ConnectionClaim, demand_id
-from demandops.demand.demand_request import (
-    ConnectionDemand,
-    DemandRequest,
-    Operation,
-)
+from demandops.demand.claim import Claim, demand_id
+from demandops.demand.demand_request import Demanded, Join, Place
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger import claim_file
 from demandops.ledger.apply import apply
@@ -29,25 +25,14 @@ NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
 STRING = "std_msgs/msg/String"
 
 
-def claim(*routes: Route, kind: ConnectionType = MQTT) -> ConnectionClaim:
-    return ConnectionClaim(
-        connection="c",
-        demand=demand_id("r", ["v"]),
-        request="r",
-        requesters=("v",),
-        booked=NOW,
-        type=kind,
-        source="s",
-        target="t",
-        broker="",
-        topics=MappingProxyType(merge_routes(routes)),
-    )
+def claim(*routes: Route) -> Claim:
+    held = Connection("c", MQTT, "s", "t", "", merged_routes(routes))
+    return Claim(held, demand_id("r", ["v"]), "r", ("v",), NOW)
 
 
 def joined(ledger: Ledger, *routes: Route, who: str = "v", **more: Any) -> Ledger:
-    asked = ConnectionDemand("c", MQTT.number, "s", "t", routes, "", (who,))
-    asked = replace(asked, **more)
-    request = DemandRequest("r", Operation.JOIN, connections=(asked,))
+    asked = replace(Connection("c", MQTT, "s", "t", "", routes), **more)
+    request = Join("r", (Demanded(asked, (who,), Place("connections[0]")),))
     return apply(ledger, request, NOW)[0]
 
 
@@ -152,7 +137,7 @@ def test_a_type_that_is_said_later_is_filled_in_and_kept() -> None:
     ledger = joined(ledger, Route("/a", "/b", type=STRING))
     assert joined(ledger, Route("/a", "/b")) == ledger
     (held,) = ledger.connection_claims("c")
-    assert held.topics == {"/a": Route("/a", "/b", type=STRING)}
+    assert held.connection.topics == (Route("/a", "/b", type=STRING),)
 
 
 def test_what_is_carried_back_arrives_at_the_source() -> None:
@@ -164,9 +149,9 @@ def test_what_is_carried_back_arrives_at_the_source() -> None:
 
 @pytest.mark.parametrize("kind", [ZENOH, ROS])
 def test_links_are_known_at_both_nodes_as_long_as_somebody_holds_them(kind: ConnectionType) -> None:
-    ledger = joined(Ledger(), Route("/a", "/a"), type=kind.number)
-    ledger = joined(ledger, Route("/a", "/a"), type=kind.number, who="w")
-    ledger = joined(ledger, Route("/a", "/a"), type=kind.number, id="d", target="u")
+    ledger = joined(Ledger(), Route("/a", "/a"), type=kind)
+    ledger = joined(ledger, Route("/a", "/a"), type=kind, who="w")
+    ledger = joined(ledger, Route("/a", "/a"), type=kind, id="d", target="u")
     first, second = ledger.connection_claims("c")
     assert (ledger.connections_at(kind, "s"), ledger.connections_at(kind, "t")) == (
         ("c", "d"),

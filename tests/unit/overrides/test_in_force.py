@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 import yaml
 from demandops.decision import decide, rendered_files
-from demandops.demand.claim import Subject, SubjectKind
-from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest, Operation
+from demandops.demand.claim import OVERRIDE_PREFIX
+from demandops.demand.demand_request import Expire
 from demandops.errors import InvalidInput, Refused
 from demandops.plan.views.bookkeeping import bookkeeping
+from demandops.subject import Subject, SubjectKind
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -214,7 +215,7 @@ def test_a_kept_claim_is_the_owners_and_holds_what_the_last_one_did() -> None:
     (claim,) = books.state.ledger.claims_on(subject)
     assert (claim.demand, claim.request) == ("override:tested", "override:tested")
     assert (claim.requesters, claim.lease) == (("petra",), None)
-    assert "ego_data" not in claim.inputs  # type: ignore[union-attr]
+    assert "ego_data" not in claim.application.inputs
 
 
 REGISTRY = """\
@@ -263,7 +264,7 @@ def test_what_a_lease_ends_is_kept_too_and_a_put_that_drops_it_as_well() -> None
     books.send(demand)
     books.send(demand | {"applications": demand["applications"][:1]})
     assert _holders(books) == {"a": ["leased"], "b": ["override:tested"]}
-    over = DemandRequest(id="leased", operation=Operation.EXPIRE, demand="leased")
+    over = Expire(id="leased", demand="leased")
     made = decide(books.state, over, NOW + timedelta(minutes=5), books.files.get)
     books.state = made.state
     assert _holders(books) == {"a": ["override:tested"], "b": ["override:tested"]}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from datetime import timedelta
-from types import MappingProxyType
 
 import pytest
+from demandops.connections.connection import Connection
 from demandops.connections.mqtt import MQTT
 from demandops.connections.route import Route
-from demandops.demand.claim import ConnectionClaim
+from demandops.demand.claim import Claim
 from demandops.demand.lease import Lease
 from demandops.ledger.ledger import Ledger
 from demandops.service.timing.lease_expiry import LeaseClock
@@ -20,18 +20,13 @@ from tests.scenarios.running import START, Clocks, rebuilt
 def leased(*terms: tuple[str, int, int]) -> Ledger:
     """Return a ledger with a claim for each (demand, seconds, slack), asked for at the start."""
     return rebuilt(
-        ConnectionClaim(
-            connection=f"{number}",
-            demand=demand,
-            request=demand,
-            requesters=("a",),
-            booked=START,
-            type=MQTT,
-            source="vehicle00",
-            target="edge",
-            broker="",
-            topics=MappingProxyType({"/a": Route("/a", "/a")}),
-            lease=Lease(seconds, slack, START + timedelta(seconds=seconds)),
+        Claim(
+            Connection(f"{number}", MQTT, "vehicle00", "edge", "", (Route("/a", "/a"),)),
+            demand,
+            demand,
+            ("a",),
+            START,
+            Lease(seconds, slack, START + timedelta(seconds=seconds)),
         )
         for number, (demand, seconds, slack) in enumerate(terms)
     )

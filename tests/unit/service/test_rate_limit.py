@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 
 from demandops.config.config import Config
 from demandops.config.load import load
-from demandops.demand.demand_request import ApplicationDemand, DemandRequest, Operation
+from demandops.demand.application import Application
+from demandops.demand.demand_request import Demanded, Join, Place, Shutdown
 from demandops.service.timing.rate_limit import RateLimit
 
 from tests.kit.config import configuration, edited
@@ -20,15 +20,9 @@ def limited(most: int) -> Config:
     return load(configuration(edited("policy/access-domains.yaml", "    namespace:", quotas)))
 
 
-def request(requester: str) -> DemandRequest:
-    app = ApplicationDemand(
-        id="edge/fusion",
-        appdef="object-detection-fusion",
-        node="edge",
-        requesters=(requester,),
-        inputs={},
-    )
-    return DemandRequest(id="one", operation=Operation.JOIN, applications=(app,))
+def request(requester: str) -> Join:
+    app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
+    return Join("one", (Demanded(app, (requester,), Place("applications[0]")),))
 
 
 class Sending:
@@ -66,7 +60,7 @@ def test_a_hand_in_that_is_judged_again_counts_once() -> None:
 def test_giving_up_is_not_limited() -> None:
     sending = Sending()
     for number in range(5):
-        release = replace(request("vehicle00"), operation=Operation.SHUTDOWN)
+        release = Shutdown("one", request("vehicle00").demanded)
         found = sending.throttle.faults(release, limited(1), f"op-{number}", START)
         assert list(found) == []
 

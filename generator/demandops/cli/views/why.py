@@ -17,7 +17,6 @@ from demandops.cli.output import (
     warn_of,
 )
 from demandops.cli.views import why_answer
-from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import StateRepoError, quoted, suggestion
 from demandops.ledger import claim_file
 from demandops.plan.release import Release
@@ -26,6 +25,7 @@ from demandops.render.gitops.paths import path_of
 from demandops.staterepo import reader
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
+from demandops.subject import Subject, SubjectKind
 
 _KINDS = ("release", "application", "connection")
 

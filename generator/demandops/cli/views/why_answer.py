@@ -7,7 +7,7 @@ from typing import Any
 
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.demand.claim import Claim, Subject
+from demandops.demand.claim import Claim
 from demandops.ledger import claim_file
 from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
 from demandops.plan.release import Release
@@ -16,6 +16,7 @@ from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
+from demandops.subject import Subject
 
 _MOST_CARRIED_OUT = 5
 

@@ -5,90 +5,99 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from demandops.connections import route as routes
+from demandops.connections.connection import Connection
 from demandops.connections.route import Route
-from demandops.demand.claim import ApplicationClaim, ConnectionClaim, Subject, SubjectKind
-from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand
-from demandops.errors import Fault, fault
+from demandops.demand.application import Application
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import Demanded
+from demandops.errors import Fault
 from demandops.ledger.ledger import Ledger
 
 
-def application_conflicts(where: str, app: ApplicationDemand, ledger: Ledger) -> Iterator[Fault]:
-    """Yield why a demanded application contradicts the first existing claim on it, if it does."""
-    claim = ledger.first_claim(Subject(SubjectKind.APPLICATION, app.id))
-    if not isinstance(claim, ApplicationClaim):
+def conflicts(one: Demanded, ledger: Ledger) -> Iterator[Fault]:
+    """Yield why a demanded application or connection contradicts existing claims on it."""
+    if isinstance(one.held, Application):
+        yield from _of_application(one, one.held, ledger)
+    else:
+        yield from _of_connection(one, one.held, ledger)
+
+
+def _of_application(one: Demanded, app: Application, ledger: Ledger) -> Iterator[Fault]:
+    claim = ledger.first_claim(app.subject)
+    if claim is None:
         return
-    held = f"'{app.id}' is held by {', '.join(claim.requesters)}"
-    if claim.node != app.node:
-        yield fault(
-            f"{where}.node",
-            f"'{app.node}' contradicts an existing claim: {held} on '{claim.node}'; ask for "
-            "that node, or wait until it is released",
-            code="conflict",
-        )
-    elif claim.appdef != app.appdef:
-        yield fault(
-            f"{where}.appdef",
-            f"'{app.appdef}' contradicts an existing claim: {held} as '{claim.appdef}'; use "
-            "another application id",
-            code="conflict",
-        )
-    elif claim.version != app.version:
-        yield fault(
-            f"{where}.version",
-            f"'{app.version}' contradicts an existing claim: {held} in version "
-            f"'{claim.version}'; ask for the same, or use another application id",
-            code="conflict",
-        )
+    held, known = f"'{app.id}' is held by {', '.join(claim.requesters)}", claim.application
+    for name, new, current, holding, remedy in (
+        ("node", app.node, known.node, "on", "ask for that node, or wait until it is released"),
+        ("appdef", app.appdef, known.appdef, "as", "use another application id"),
+        (
+            "version",
+            app.version,
+            known.version,
+            "in version",
+            "ask for the same, or use another application id",
+        ),
+    ):
+        if new != current:
+            yield one.fault(
+                name,
+                f"'{new}' contradicts an existing claim: {held} {holding} '{current}'; {remedy}",
+                code="conflict",
+            )
+            return
 
 
-def connection_conflicts(where: str, demanded: ConnectionDemand, ledger: Ledger) -> Iterator[Fault]:
-    """Yield why a demanded connection contradicts existing claims on it."""
+def _of_connection(one: Demanded, demanded: Connection, ledger: Ledger) -> Iterator[Fault]:
     for claim in ledger.connection_claims(demanded.id):
-        held = f"'{demanded.id}' is held by {', '.join(claim.requesters)}"
+        held, known = f"'{demanded.id}' is held by {', '.join(claim.requesters)}", claim.connection
         for name, new, current in (
-            ("type", str(demanded.chosen_type), claim.type.name),
-            ("source", demanded.source, claim.source),
-            ("target", demanded.target, claim.target),
-            ("broker", demanded.broker, claim.broker),
+            ("type", str(demanded.type), str(known.type)),
+            ("source", demanded.source, known.source),
+            ("target", demanded.target, known.target),
+            ("broker", demanded.broker, known.broker),
         ):
             if new == current or (name == "broker" and not (new and current)):
                 continue
-            yield fault(
-                f"{where}.{name}",
+            yield one.fault(
+                name,
                 f"'{new}' contradicts an existing claim: {held} with {name} '{current}'; use "
                 "the same, or another connection id",
                 code="conflict",
             )
             return
-        for index, route in enumerate(demanded.topics):
-            yield from _route_conflicts(f"{where}.topics[{index}]", route, claim, held)
+        yield from _of_routes(one, demanded, claim, held)
 
 
-def _route_conflicts(
-    where: str, demanded: Route, claim: ConnectionClaim, held: str
+def _of_routes(one: Demanded, demanded: Connection, claim: Claim, held: str) -> Iterator[Fault]:
+    by_source = {route.source: route for route in claim.connection.topics}
+    carried_back = {route.target: route for route in claim.connection.topics if route.reverse}
+    for index, route in enumerate(demanded.topics):
+        where, current = f"topics[{index}]", by_source.get(route.source)
+        if current is not None:
+            yield from _of_route(one, where, route, current, held)
+        elif route.reverse and (other := carried_back.get(route.target)):
+            yield one.fault(
+                f"{where}.target",
+                f"'{route.target}' is carried back to '{other.source}' already: {held}; one topic "
+                "goes to one place, use a second connection",
+                code="conflict",
+            )
+
+
+def _of_route(
+    one: Demanded, where: str, route: Route, current: Route, held: str
 ) -> Iterator[Fault]:
-    current = claim.topics.get(demanded.source)
-    if current is None:
-        for route in claim.topics.values() if demanded.reverse else ():
-            if route.reverse and route.target == demanded.target:
-                yield fault(
-                    f"{where}.target",
-                    f"'{demanded.target}' is carried back to '{route.source}' already: {held}; one "
-                    "topic goes to one place, use a second connection",
-                    code="conflict",
-                )
-        return
-    if current.target != demanded.target:
-        yield fault(
+    if current.target != route.target:
+        yield one.fault(
             f"{where}.target",
-            f"'{demanded.source}' goes to '{current.target}' already: {held}; one source topic has "
+            f"'{route.source}' goes to '{current.target}' already: {held}; one source topic has "
             "one target, use a second connection",
             code="conflict",
         )
-    for name, old, new in routes.contradictions(current, demanded):
-        yield fault(
+    for name, old, new in routes.contradictions(current, route):
+        yield one.fault(
             f"{where}.{name}",
-            f"{name} {new} of '{demanded.source}' contradicts an existing claim: {held} with "
+            f"{name} {new} of '{route.source}' contradicts an existing claim: {held} with "
             f"{name} {old}; use the same, or a second connection",
             code="conflict",
         )

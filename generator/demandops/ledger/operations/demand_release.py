@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from demandops.demand.demand_request import DemandRequest
+from demandops.demand.demand_request import Release
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
 from demandops.ledger.operations.ownership import owned_claims
 
 
-def release_demand(ledger: Ledger, request: DemandRequest) -> tuple[Ledger, Changes]:
+def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
     """Release all claims of a demand.
 
     Raises:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import datetime
 
-from demandops.demand.demand_request import DemandRequest
+from demandops.demand.demand_request import Renew
 from demandops.demand.lease import Term
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
 from demandops.ledger.operations.ownership import owned_claims
 
 
-def renew_leases(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+def renew_leases(ledger: Ledger, request: Renew, now: datetime) -> tuple[Ledger, Changes]:
     """Renew each lease of a demand for its own term; claims without a lease stay as they are.
 
     Raises:

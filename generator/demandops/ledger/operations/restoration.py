@@ -7,19 +7,14 @@ are no demand: they are updated as after every change (:mod:`demandops.plan.over
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 
 from demandops.config.config import Config
 from demandops.demand import admission, permission
-from demandops.demand.claim import ApplicationClaim, Claim, is_override_claim
-from demandops.demand.demand_request import (
-    ApplicationDemand,
-    ConnectionDemand,
-    DemandRequest,
-    Operation,
-)
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import Demanded, DemandRequest, Place, Put
 from demandops.demand.lease import Lease, Term
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.claim_file import path_of
@@ -44,17 +39,18 @@ class Restoration(DemandRequest):
     by: str = ""
     email: str = ""
 
+    operation = "rollback"
 
-def restore(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+
+def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
     """Make the ledger what it was.
 
     Raises:
         Refused: if that drops or undoes newer claims, and ``drop_newer`` is not set.
     """
-    assert isinstance(request, Restoration)  # noqa: S101 - apply() checks the operation
     changes = _changes(ledger, request)
     if not request.drop_newer:
-        newer = [c for c in changes if c.before is not None and not is_override_claim(c.before)]
+        newer = [c for c in changes if c.before is not None and c.before.keeping_override is None]
         if newer:
             raise Refused(_newer_faults(newer))
     start = ledger
@@ -75,7 +71,7 @@ def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
 def _same(one: Claim | None, other: Claim | None) -> bool:
     if one is None or other is None:
         return one is other
-    if is_override_claim(one):  # when the override kept it does not matter
+    if one.keeping_override is not None:  # when the override kept it does not matter
         one = replace(one, booked=other.booked)
     return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
 
@@ -108,45 +104,28 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
 def faults(request: Restoration, ledger: Ledger, config: Config) -> Iterator[Fault]:
     """Yield why restored claims are not valid in the current configuration."""
     for change in _changes(ledger, request):
-        if change.after is None or is_override_claim(change.after):  # overrides decide about these
+        if (
+            change.after is None or change.after.keeping_override is not None
+        ):  # overrides decide about these
             continue
         booking = _request_for(change.after)
         for found in (*admission.faults(booking, config), *permission.faults(booking, config)):
-            field = found.field.partition("].")[2] or found.field
-            yield replace(found, field=field).within(path_of(change.key))
+            yield found.within(path_of(change.key))
 
 
-def _request_for(claim: Claim) -> DemandRequest:
+class _Claim(Place):
+    """A claim's own fields."""
+
+    def at(self, path: str) -> str:
+        """Return the field unchanged."""
+        return path
+
+
+def _request_for(claim: Claim) -> Put:
     """Return the request that would book a claim today."""
-    applications: Iterable[ApplicationDemand] = ()
-    connections: Iterable[ConnectionDemand] = ()
-    if isinstance(claim, ApplicationClaim):
-        app = ApplicationDemand(
-            id=claim.application,
-            appdef=claim.appdef,
-            node=claim.node,
-            requesters=claim.requesters,
-            inputs=claim.inputs,
-            parameters=claim.parameters,
-            version=claim.version,
-        )
-        applications = (app,)
-    else:
-        connection = ConnectionDemand(
-            id=claim.connection,
-            type=claim.type.number,
-            source=claim.source,
-            target=claim.target,
-            topics=tuple(claim.topics.values()),
-            broker=claim.broker,
-            requesters=claim.requesters,
-        )
-        connections = (connection,)
-    return DemandRequest(
+    return Put(
         id=claim.request,
-        operation=Operation.PUT,
-        applications=tuple(applications),
-        connections=tuple(connections),
+        demanded=(Demanded(claim.held, claim.requesters, _Claim("")),),
         demand=claim.demand,
         lease_s=claim.lease.seconds if claim.lease else None,
     )

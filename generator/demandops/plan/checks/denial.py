@@ -7,13 +7,14 @@ that they are suspended.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from demandops.config.config import Config
 from demandops.config.override import Override, Selector, format_time
 from demandops.config.policy import matches
-from demandops.demand.claim import Subject, SubjectKind
-from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand, DemandRequest
-from demandops.errors import Fault, fault
+from demandops.demand.application import Application
+from demandops.demand.demand_request import Demanded, DemandRequest
+from demandops.errors import Fault
 from demandops.ledger.ledger import Changes, Ledger
 from demandops.plan.overrides.selectors import Traits, fits, has_labels, traits_of
 from demandops.plan.overrides.suspended_claims import suspended_by
@@ -26,7 +27,7 @@ def faults(
 ) -> Iterator[Fault]:
     """Yield every new application and connection of a request that an override denies."""
     denying = [one for one in reversed(config.active_overrides) if one.deny]
-    if not denying or not request.operation.adds_claims:
+    if not denying or not request.adds_claims:
         return
     renewed = {
         change.key.subject: change.before is not None
@@ -34,80 +35,51 @@ def faults(
         and change.before.booked == change.after.booked
         for change in changes.claims
     }
-    for subject, where, demanded in _listed(request):
-        if renewed.get(subject, True):
+    for one in request.demanded:
+        if renewed.get(one.held.subject, True):
             continue
+        services = list(_service_traits(one, after, config))
         for override in denying:
-            field = _denied_field(
-                override,
-                where,
-                demanded,
-                list(_service_traits(demanded, subject, after, config)),
-                config,
-            )
+            field = _denied_field(override, one, services, config)
             if field:
-                yield fault(field, _message(override), code="denied")
+                yield one.fault(field, _message(override), code="denied")
                 break
 
 
-def _listed(
-    request: DemandRequest,
-) -> Iterator[tuple[Subject, str, ApplicationDemand | ConnectionDemand]]:
-    for index, app in enumerate(request.applications):
-        yield Subject(SubjectKind.APPLICATION, app.id), f"applications[{index}]", app
-    for index, connection in enumerate(request.connections):
-        subject = Subject(SubjectKind.CONNECTION, connection.id)
-        yield subject, f"connections[{index}]", connection
-
-
-def _service_traits(
-    demanded: ApplicationDemand | ConnectionDemand, subject: Subject, after: Ledger, config: Config
-) -> Iterator[Traits]:
+def _service_traits(one: Demanded, after: Ledger, config: Config) -> Iterator[Traits]:
     """Yield the traits of the services that an application needs."""
-    if not isinstance(demanded, ApplicationDemand):
+    if not isinstance(one.held, Application):
         return
-    for key in keys_of_claims(after, config, after.claims_on(subject)):
+    app = traits_of(one)
+    for key in keys_of_claims(after, config, after.claims_on(one.held.subject)):
         if isinstance(key, ServiceKey):
-            yield Traits(
-                (key.node,),
-                demanded.requesters,
-                (demanded.id,),
-                (demanded.appdef,),
-                service=key.service,
-            )
+            yield replace(app, nodes=(key.node,), service=key.service)
 
 
-def _denied_field(
-    override: Override,
-    where: str,
-    demanded: ApplicationDemand | ConnectionDemand,
-    services: list[Traits],
-    config: Config,
-) -> str:
-    """Return the field that makes an override deny a demanded subject, or an empty text."""
+def _denied_field(override: Override, one: Demanded, services: list[Traits], config: Config) -> str:
+    """Return the field that makes an override deny what is demanded, or an empty text."""
     for selector in override.select:
-        for traits in services if selector.services else [traits_of(demanded)]:
+        for traits in services if selector.services else [traits_of(one)]:
             if fits(selector, traits, config):
-                return f"{where}.{_matched_field(selector, demanded, config)}"
+                return _matched_field(selector, one, config)
     return ""
 
 
-def _matched_field(
-    selector: Selector, demanded: ApplicationDemand | ConnectionDemand, config: Config
-) -> str:
+def _matched_field(selector: Selector, one: Demanded, config: Config) -> str:
     """Return the field that a selector matches; of several, the most specific one."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:
         who = selector.requesters
-        index = next(i for i, name in enumerate(demanded.requesters) if matches(name, who))
+        index = next(i for i, name in enumerate(one.requesters) if matches(name, who))
         return f"requesters[{index}]"
     if selector.services or selector.appdefs:
         return "appdef"
-    if isinstance(demanded, ApplicationDemand):
+    if isinstance(one.held, Application):
         return "node"
-    at_source = not selector.nodes or matches(demanded.source, selector.nodes)
-    return "source" if at_source and has_labels(selector, demanded.source, config) else "target"
+    source = one.held.source
+    at_source = not selector.nodes or matches(source, selector.nodes)
+    return "source" if at_source and has_labels(selector, source, config) else "target"
 
 
 def _message(override: Override) -> str:
@@ -122,10 +94,9 @@ def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator
     """Yield a warning for each claim of a demand that an override suspends."""
     if not any(override.deny for override in config.active_overrides):
         return
-    subjects = dict.fromkeys(subject for subject, _, _ in _listed(request))
     claims = [
         *ledger.claims_of_demand(request.demand),
-        *(claim for subject in subjects for claim in ledger.claims_on(subject)),
+        *(claim for subject in request.subjects() for claim in ledger.claims_on(subject)),
     ]
     seen = set()
     requesters = set(request.requesters())

@@ -6,17 +6,19 @@ from collections.abc import Iterable, Iterator
 
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
-from demandops.demand.claim import ApplicationClaim, Claim, Subject, SubjectKind
+from demandops.demand.application import Application
+from demandops.demand.claim import Claim
 from demandops.errors import Fault, fault
 from demandops.ledger.ledger import Changes, Ledger
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import keys_of
+from demandops.subject import Subject, SubjectKind
 
 
 def faults(before: Ledger, after: Ledger, changes: Changes, config: Config) -> Iterator[Fault]:
     """Yield every quota that ``changes`` exceed, unless the count does not grow."""
     booked = [change.after for change in changes.claims if change.after]
-    holders = {(_node(claim), who) for claim in booked for who in claim.requesters}
+    holders = {(claim.held.home, who) for claim in booked for who in claim.requesters}
     domains = {
         (found.name, who): found for node, who in holders if (found := config.domain_of.get(node))
     }
@@ -44,7 +46,7 @@ def _claims(
 
 def _held(requester: str, ledger: Ledger, domain: AccessDomain, config: Config) -> int:
     claims = ledger.claims_of_requester(requester)
-    return sum(config.domain_of.get(_node(claim)) is domain for claim in claims)
+    return sum(config.domain_of.get(claim.held.home) is domain for claim in claims)
 
 
 def _services(node: str, before: Ledger, after: Ledger, config: Config) -> Iterator[Fault]:
@@ -72,14 +74,6 @@ def _exceeded(domain: AccessDomain, quota: str, most: int, usage: str) -> Fault:
     )
 
 
-def _node(claim: Claim) -> str:
-    """Return the node at which a claim counts: the application's, or the connection's target."""
-    return claim.node if isinstance(claim, ApplicationClaim) else claim.target
-
-
 def _nodes(claims: Iterable[Claim]) -> set[str]:
-    nodes = set()
-    for claim in claims:
-        if isinstance(claim, ApplicationClaim):
-            nodes |= {claim.node, *(topic.source for _, topic in claim.all_inputs())}
-    return nodes
+    held = (claim.held for claim in claims)
+    return {node for one in held if isinstance(one, Application) for node in one.needed_nodes()}

@@ -12,7 +12,8 @@ from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.config.policy import matches
-from demandops.demand.demand_request import ApplicationDemand, DemandRequest, InputTopic, Operation
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.demand_request import Demanded, Join, Place
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.release_overrides import apply_effects, effects_on
@@ -37,22 +38,11 @@ def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
 
 
 def _services(appdef: ApplicationDefinition, node: str, config: Config) -> Iterator[ServiceRelease]:
-    request = DemandRequest(
-        id="rehearsal",
-        operation=Operation.JOIN,
-        applications=(
-            ApplicationDemand(
-                id=f"rehearsal/{appdef.name}",
-                appdef=appdef.name,
-                node=node,
-                requesters=("rehearsal",),
-                inputs={
-                    role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", node),)
-                    for role in appdef.inputs
-                },
-            ),
-        ),
-    )
+    inputs = {
+        role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", node),) for role in appdef.inputs
+    }
+    app = Application(f"rehearsal/{appdef.name}", appdef.name, node, inputs)
+    request = Join("rehearsal", (Demanded(app, ("rehearsal",), Place("")),))
     ledger, changes = apply(Ledger(), request, _NEVER)
     for key in affected_keys(Ledger(), ledger, config, changes.claims):
         release = plan(ledger, config, key)

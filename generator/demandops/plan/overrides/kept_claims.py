@@ -13,19 +13,11 @@ from datetime import datetime
 
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.demand.claim import Claim, ClaimKey, Subject, SubjectKind, is_override_claim
-from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest
+from demandops.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
 from demandops.plan.overrides.selectors import selects, traits_of
 from demandops.plan.overrides.suspended_claims import suspended_by
-
-
-def requested_subjects(request: DemandRequest) -> tuple[Subject, ...]:
-    """Return the subjects that a request lists."""
-    return (
-        *(Subject(SubjectKind.APPLICATION, app.id) for app in request.applications),
-        *(Subject(SubjectKind.CONNECTION, one.id) for one in request.connections),
-    )
+from demandops.subject import Subject
 
 
 def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
@@ -85,9 +77,7 @@ def _needed(
 ) -> Claim | None:
     """Return the kept claim that a subject without demands needs, or ``None``."""
     for claim in existing:
-        if any(
-            OVERRIDE_PREFIX + one.name == claim.demand for one in keeping_overrides(claim, config)
-        ):
+        if any(one.name == claim.keeping_override for one in keeping_overrides(claim, config)):
             return claim
     if not before:
         return None
@@ -108,7 +98,7 @@ def keeping_overrides(claim: Claim, config: Config) -> list[Override]:
     A kept claim names the owner as its requester, so ``requesters`` of the selector is ignored: it
     was matched against the original claim.
     """
-    traits, any_requester = traits_of(claim), is_override_claim(claim)
+    traits, any_requester = traits_of(claim), claim.keeping_override is not None
     return [
         one
         for one in reversed(config.active_overrides)

@@ -12,10 +12,11 @@ from datetime import datetime
 
 from demandops.config.config import Config
 from demandops.config.override import Override, format_time
-from demandops.demand.claim import ClaimKey, Subject
+from demandops.demand.claim import ClaimKey
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
+from demandops.subject import Subject
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,6 @@ from dataclasses import replace
 from demandops.config.config import Config
 from demandops.config.override import Override, Shaping
 from demandops.demand.claim import Claim
-from demandops.demand.demand_request import OVERRIDE_PREFIX
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.selectors import Traits, selects
 from demandops.plan.overrides.suspended_claims import denied_by
@@ -30,11 +29,7 @@ def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release
     traits = _traits(release, claims)
     if service_denied_by(release, ledger, config) is not None:
         return None
-    kept = {
-        claim.demand.removeprefix(OVERRIDE_PREFIX)
-        for claim in claims
-        if claim.demand.startswith(OVERRIDE_PREFIX)
-    }
+    kept = {claim.keeping_override for claim in claims}
     by = []
     for override in config.active_overrides:
         effects = effects_on(release, override, config) if selects(override, traits, config) else ()
@@ -90,7 +85,7 @@ def effects_on(release: Release, override: Override, config: Config) -> tuple[st
 def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:
     nodes = (release.node.id,)
     if isinstance(release, ServiceRelease):
-        appdefs = {claim.appdef for claim in claims if hasattr(claim, "appdef")}
+        appdefs = {claim.application.appdef for claim in claims}
         return Traits(
             nodes,
             release.requesters,

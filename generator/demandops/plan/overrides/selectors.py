@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from demandops.config.config import Config
 from demandops.config.override import Override, Selector
 from demandops.config.policy import matches
-from demandops.demand.claim import ApplicationClaim, Claim
-from demandops.demand.demand_request import ApplicationDemand, ConnectionDemand
+from demandops.demand.application import Application
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import Demanded
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,16 +27,12 @@ class Traits:
     service: str = ""
 
 
-def traits_of(subject: Claim | ApplicationDemand | ConnectionDemand) -> Traits:
+def traits_of(one: Claim | Demanded) -> Traits:
     """Return the traits of a claimed or demanded application or connection."""
-    if isinstance(subject, ApplicationClaim):
-        ids = (subject.application,)
-        return Traits((subject.node,), subject.requesters, ids, (subject.appdef,))
-    if isinstance(subject, ApplicationDemand):
-        return Traits((subject.node,), subject.requesters, (subject.id,), (subject.appdef,))
-    name = subject.id if isinstance(subject, ConnectionDemand) else subject.connection
-    ends = (subject.source, subject.target)
-    return Traits(ends, subject.requesters, connections=(name,))
+    held = one.held
+    if isinstance(held, Application):
+        return Traits(held.nodes, one.requesters, (held.id,), (held.appdef,))
+    return Traits(held.nodes, one.requesters, connections=(held.id,))
 
 
 def fits(

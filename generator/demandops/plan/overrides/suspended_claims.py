@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.demand.claim import Claim, ClaimKey, Subject
+from demandops.demand.claim import Claim, ClaimKey
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.selectors import Traits, fits, traits_of
+from demandops.subject import Subject
 
 _MOST_CACHED = 100_000
 """How many results are cached. The claims of a shared service are read often."""

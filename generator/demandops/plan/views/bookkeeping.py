@@ -10,13 +10,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from demandops.config.config import Config
-from demandops.demand.claim import SubjectKind
 from demandops.ledger.ledger import Ledger
 from demandops.plan.connection_clients import connection_topics
 from demandops.plan.overrides.suspended_claims import suspended_claims, without_suspended
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import all_keys
+from demandops.subject import SubjectKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +91,9 @@ def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
         if not claims:
             continue
         connections[id] = ConnectionEntry(
-            source=claims[0].source,
-            target=claims[0].target,
-            topics=tuple(connection_topics(claims)),
+            source=claims[0].connection.source,
+            target=claims[0].connection.target,
+            topics=tuple(route.source for route in connection_topics(claims)),
             requesters=tuple(sorted({who for claim in claims for who in claim.requesters})),
         )
     return Bookkeeping(

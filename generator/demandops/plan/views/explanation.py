@@ -13,12 +13,12 @@ from demandops.config.config import (
 )
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.demand.claim import ApplicationClaim, Claim, Subject, demand_id, is_override_claim
-from demandops.demand.demand_request import OVERRIDE_PREFIX
+from demandops.demand.claim import Claim, demand_id
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Release, ServiceRelease, claims_of
 from demandops.plan.release_keys import all_keys, keys_of
+from demandops.subject import Subject
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,16 +56,14 @@ def _takes(claim: Claim, release: Release) -> bool:
     """Return whether a claim on an application needs this service of it."""
     if not isinstance(release, ServiceRelease) or release.service.each is None:
         return True
-    assert isinstance(claim, ApplicationClaim)  # noqa: S101 - a service is for applications
-    topics = claim.inputs.get(release.service.each, ())
+    topics = claim.application.inputs.get(release.service.each, ())
     return any((t.source, t.topic) == (release.key.source, release.key.topic) for t in topics)
 
 
 def how_to_release(claim: Claim) -> str:
     """Return how the requesters release a claim."""
-    if is_override_claim(claim):
-        name = claim.demand.removeprefix(OVERRIDE_PREFIX)
-        return f"remove keep from {OVERRIDES_ROOT}/{name}.yaml"
+    if claim.keeping_override is not None:
+        return f"remove keep from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):
         return f"send request '{claim.request}' again with shutdown: true"
     return f"send operation: release for demand '{claim.demand}'"
@@ -95,5 +93,4 @@ def denied_release_named(
 
 def keeping_override(claim: Claim, config: Config) -> Override | None:
     """Return the override that keeps this claim, or ``None`` if a demand holds it."""
-    name = claim.demand.removeprefix(OVERRIDE_PREFIX)
-    return config.overrides.get(name) if is_override_claim(claim) else None
+    return config.overrides.get(claim.keeping_override or "")

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 from demandops import strict_yaml
 from demandops.config.config import Config
-from demandops.demand.claim import Subject, SubjectKind
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
@@ -24,6 +23,7 @@ from demandops.render.changes.data_diff import leaf_differences, short_value
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
+from demandops.subject import Subject, SubjectKind
 
 _MOST_FACTS = 20
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demandops.decision import Decision, State, decide
-from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.demand.demand_request import DemandRequest, Put
 from demandops.errors import (
     DemandOpsError,
     InvalidInput,
@@ -151,7 +151,7 @@ class Approvals:
         if proposal is None:
             branch = branch_name(request.demand or request.id, ticket.operation)
             proposal = Proposal(key, ProposalRecord(branch), searched_to=ticket.base)
-        elif request.operation is Operation.PUT and request not in proposal.requests:
+        elif isinstance(request, Put) and request not in proposal.requests:
             replaced, proposal.tickets, proposal.requests = proposal.tickets, [], []
             self._queue.answer((old, Withdrawn(REPLACED)) for old in replaced)
         if not self._queue.set_proposal(ticket, proposal.record):
@@ -165,7 +165,7 @@ class Approvals:
     def withdraw_replaced(self, request: DemandRequest) -> None:
         """Withdraw the proposal of a demand that was put again and needs no approval now."""
         proposal = self._proposals.get(key_of(request))
-        if proposal is not None and request.operation is Operation.PUT:
+        if proposal is not None and isinstance(request, Put):
             self._queue.withdraw_proposed(proposal.tickets, REPLACED)
 
     # ---- after main was read ----

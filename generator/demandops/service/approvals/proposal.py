@@ -10,11 +10,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from demandops.decision import State, admit
-from demandops.demand.approval_rule import subjects_of
-from demandops.demand.claim import Subject
-from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.demand.demand_request import DemandRequest, Release
 from demandops.errors import InvalidInput
 from demandops.service.ticket import ProposalRecord, Ticket
+from demandops.subject import Subject
 
 Key = tuple[str, ...]
 
@@ -56,7 +55,7 @@ class Proposal:
 
     def subjects(self) -> set[Subject]:
         """Return the applications and connections that it requests."""
-        return {subject for request in self.requests for subject in subjects_of(request)}
+        return {subject for request in self.requests for subject in request.subjects()}
 
     def is_released_by(self, request: DemandRequest) -> bool:
         """Return whether a request by one of its requesters releases all of it."""
@@ -64,13 +63,13 @@ class Proposal:
             request.requesters()
         ):
             return False
-        whole = request.operation is Operation.RELEASE
-        return whole or self.subjects() <= set(subjects_of(request))
+        whole = isinstance(request, Release)
+        return whole or self.subjects() <= set(request.subjects())
 
 
 def key_of(request: DemandRequest) -> Key:
     """Return the key of a request's proposal: the demand, or the request and its requesters."""
-    if request.operation.is_reference:
+    if request.is_reference:
         return ("request", request.id, *sorted(request.requesters()))
     return ("demand", request.demand)
 
@@ -78,7 +77,7 @@ def key_of(request: DemandRequest) -> Key:
 def is_release(goal: object) -> bool:
     """Return whether a goal that is not parsed yet is a release."""
     fields = goal if isinstance(goal, dict) else {}
-    return bool(fields.get("shutdown") or fields.get("operation") == Operation.RELEASE.value)
+    return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
 
 
 def admit_or_none(state: State, goal: object) -> DemandRequest | None:

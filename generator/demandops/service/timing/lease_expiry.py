@@ -14,7 +14,7 @@ from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 
 from demandops.demand.claim import Claim
-from demandops.demand.demand_request import DemandRequest, Operation
+from demandops.demand.demand_request import Expire
 from demandops.ledger.ledger import Ledger
 from demandops.service.ticket import Ticket
 
@@ -104,10 +104,7 @@ class LeaseExpiry:
         self._tried = {d: at for d, at in self._tried.items() if at > since and d in ended}
         demands = [demand for demand in ended if demand not in self._tried]
         self._tried |= dict.fromkeys(demands, now)
-        requests = [
-            DemandRequest(id=demand, operation=Operation.EXPIRE, demand=demand)
-            for demand in demands
-        ]
+        requests = (Expire(id=demand, demand=demand) for demand in demands)
         return [
             Ticket(str(uuid.uuid4()), request, now, lambda stage, text: None)
             for request in requests

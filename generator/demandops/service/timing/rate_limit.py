@@ -26,11 +26,10 @@ class RateLimit:
         self, request: DemandRequest, config: Config, operation: str, received: datetime
     ) -> Iterator[Fault]:
         """Count a demand and yield a fault for each quota it exceeds; releases are not limited."""
-        if not request.operation.adds_claims:
+        if not request.adds_claims:
             return
-        nodes = [app.node for app in request.applications]
-        nodes += [connection.target for connection in request.connections]
-        domains = {d.name: d for d in map(config.domain_of.get, nodes) if d is not None}
+        homes = (config.domain_of.get(one.held.home) for one in request.demanded)
+        domains = {domain.name: domain for domain in homes if domain is not None}
         for domain in domains.values():
             most = domain.quotas.demands_per_minute
             for requester in request.requesters() if most else ():

@@ -12,8 +12,7 @@ from dataclasses import replace
 from pygit2 import Commit, Repository
 
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.demand.claim import Claim
-from demandops.demand.demand_request import OVERRIDE_PREFIX
+from demandops.demand.claim import OVERRIDE_PREFIX, Claim
 from demandops.errors import InvalidInput
 from demandops.ledger import claim_file, ended_override_file
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT

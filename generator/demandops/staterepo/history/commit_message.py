@@ -15,14 +15,14 @@ import pygit2
 
 from demandops.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.decision import Decision
-from demandops.demand.claim import ClaimKey, SubjectKind
-from demandops.demand.demand_request import OVERRIDE_PREFIX, DemandRequest, Operation
+from demandops.demand.claim import OVERRIDE_PREFIX, ClaimKey
+from demandops.demand.demand_request import Decommission, DemandRequest, Expire
 from demandops.errors import Fault
 from demandops.ledger import claim_file
-from demandops.ledger.operations.decommission import needs_node
 from demandops.ledger.operations.restoration import Restoration
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.settings import RENDER_VERSION
+from demandops.subject import SubjectKind
 
 GENERATOR_NAME = "DemandOps generator"
 GENERATOR_EMAIL = "generator@demandops.invalid"
@@ -54,12 +54,12 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 
     The author of a rollback or a decommission is the person who ran the command.
     """
-    request, leaving = decision.request, decision.request.decommission_target
+    request = decision.request
     if isinstance(request, Restoration):
         email = re.sub(r"[<>\s]", "", request.email) or GENERATOR_EMAIL
         return pygit2.Signature(_name(request.by), email, int(received.timestamp()), 0)
-    if leaving is not None:
-        return _operator(leaving.by, received)
+    if isinstance(request, Decommission):
+        return _operator(request.by, received)
     names = ", ".join(_requesters(decision))
     demand = decision.changes.claims[0].key.demand
     local = demand if _LOCAL_PART.fullmatch(demand) else claim_file.segment(demand)
@@ -100,7 +100,7 @@ def of_decision(
         body += ["", "Warnings:", *(f"  {warning}" for warning in decision.warnings)]
     claims = decision.changes.claims
     trailers = [
-        ("Operation", request.operation.value),
+        ("Operation", request.operation),
         ("Operation-Id", operation),
         *settled,
         *_of_rollback(request),
@@ -117,11 +117,11 @@ def of_decision(
 
 
 _VERBS = {
-    Operation.JOIN: ("Join", "asks for"),
-    Operation.SHUTDOWN: ("Release", "gives up"),
-    Operation.PUT: ("Put", "asks for"),
-    Operation.RELEASE: ("Release", "gives up"),
-    Operation.RENEW: ("Renew", "renews"),
+    "join": ("Join", "asks for"),
+    "shutdown": ("Release", "gives up"),
+    "put": ("Put", "asks for"),
+    "release": ("Release", "gives up"),
+    "renew": ("Renew", "renews"),
 }
 
 
@@ -129,7 +129,7 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
     """Return the requesters of a demand, else those of the claims that it changed."""
     changes = decision.changes.claims
     claims = [change.after or change.before for change in changes]
-    if decision.request.decommission_target is not None:  # it is a requester only before
+    if isinstance(decision.request, Decommission):  # it is a requester only before
         claims = [change.before for change in changes]
     found = sorted({who for claim in claims if claim for who in claim.requesters})
     return decision.request.requesters() or tuple(found)
@@ -137,27 +137,24 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
 
 def _leaving(decision: Decision) -> list[tuple[str, str]]:
     """Return the trailer of a decommissioned node; a requester has its own trailer."""
-    leaving, befores = (
-        decision.request.decommission_target,
-        [c.before for c in decision.changes.claims],
-    )
-    if leaving is None or "node" not in leaving.kinds:
+    request, befores = decision.request, [change.before for change in decision.changes.claims]
+    if not isinstance(request, Decommission) or "node" not in request.kinds:
         return []
-    needed = any(needs_node(before, leaving.name) for before in befores if before)
-    return [("Node", leaving.name)] if needed else []
+    needed = any(before.held.needs(request.id) for before in befores if before)
+    return [("Node", request.id)] if needed else []
 
 
 def _title(decision: Decision) -> str:
     subjects = ", ".join(subject.id for subject in decision.changes.subjects())
-    operation, leaving = decision.request.operation, decision.request.decommission_target
-    if leaving is not None:
-        return f"Decommission {leaving.name}"
-    if operation is Operation.EXPIRE:
+    request = decision.request
+    if isinstance(request, Decommission):
+        return f"Decommission {request.id}"
+    if isinstance(request, Expire):
         return f"Expire {subjects}"
-    if isinstance(decision.request, Restoration):
-        return f"Roll back to {decision.request.to[:12]}"
-    renewed = operation.adds_claims and _only_leases(decision)
-    return f"{_VERBS[Operation.RENEW if renewed else operation][0]} {subjects}"
+    if isinstance(request, Restoration):
+        return f"Roll back to {request.to[:12]}"
+    renewed = request.adds_claims and _only_leases(decision)
+    return f"{_VERBS['renew' if renewed else request.operation][0]} {subjects}"
 
 
 def _why(decision: Decision, received: datetime) -> str:
@@ -170,7 +167,7 @@ def _why(decision: Decision, received: datetime) -> str:
             f"Why: {request.by} rolled the ledger back to commit {request.to[:12]}, which changes "
             f"{what}: {request.reason}"
         )
-    if request.operation is Operation.EXPIRE:
+    if isinstance(request, Expire):
         ends = [
             c.before.lease.expires_at
             for c in decision.changes.claims
@@ -181,16 +178,16 @@ def _why(decision: Decision, received: datetime) -> str:
             f"Why: the lease of demand '{request.demand}' on {what} in the name of {who} ended "
             f"at {last} and was not renewed."
         )
-    if request.decommission_target is not None:
-        by = f" by {request.decommission_target.by}" if request.decommission_target.by else ""
+    if isinstance(request, Decommission):
+        by = f" by {request.by}" if request.by else ""
         return (
-            f"Why: '{request.decommission_target.name}' was decommissioned{by} on "
-            f"{time}; it held a part of {what} in the name of {who}."
+            f"Why: '{request.id}' was decommissioned{by} on {time}; it held a part of {what} in "
+            f"the name of {who}."
         )
     verb = _VERBS[request.operation][1]
-    if request.operation.adds_claims and _only_leases(decision):
-        verb = _VERBS[Operation.RENEW][1]
-    named = "" if request.operation.is_reference else f" of demand '{request.demand}'"
+    if request.adds_claims and _only_leases(decision):
+        verb = _VERBS["renew"][1]
+    named = "" if request.is_reference else f" of demand '{request.demand}'"
     return (
         f"Why: request '{request.id}'{named}, received {time}, {verb} {what} in the name of {who}."
     )

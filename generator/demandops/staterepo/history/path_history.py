@@ -15,7 +15,6 @@ import git
 from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops import naming
-from demandops.demand.claim import ApplicationClaim
 from demandops.errors import InvalidInput
 from demandops.ledger import claim_file
 from demandops.render.gitops.paths import CLUSTERS_ROOT
@@ -147,9 +146,7 @@ def _names(text: str | None, path: str, node: str) -> bool:
         claim = claim_file.read(text, path)
     except InvalidInput:
         return False
-    if isinstance(claim, ApplicationClaim):
-        return node in (claim.node, *(topic.source for _, topic in claim.all_inputs()))
-    return node in (claim.source, claim.target, claim.broker)
+    return claim.held.needs(node)
 
 
 def _entry(commit: Commit, path: str) -> Oid | None:

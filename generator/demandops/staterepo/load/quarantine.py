@@ -14,13 +14,14 @@ from pygit2 import Repository
 from pygit2.enums import SortMode
 
 from demandops.decision import State, changeset_of_edit
-from demandops.demand.claim import Claim, Subject
+from demandops.demand.claim import Claim
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.render.changes.changeset import FileReader
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
 from demandops.staterepo.load.snapshot import Snapshot
+from demandops.subject import Subject
 
 
 def quarantine_invalid(

@@ -8,7 +8,6 @@ from pygit2 import Oid, Repository
 
 from demandops.config.config import CONFIG_ROOTS
 from demandops.demand.claim import Claim
-from demandops.demand.demand_request import Operation
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.operations.restoration import Restoration
@@ -41,7 +40,6 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
         raise InvalidInput(faults)
     return Restoration(
         id="",
-        operation=Operation.ROLLBACK,
         to=str(commit.id),
         made=datetime.fromtimestamp(commit.commit_time, tz=timezone.utc),
         claims=tuple(claims),

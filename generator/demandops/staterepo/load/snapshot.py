@@ -17,7 +17,7 @@ from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load as load_config
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, try_configuration
-from demandops.demand.claim import Claim, ClaimKey, Subject
+from demandops.demand.claim import Claim, ClaimKey
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger
@@ -26,6 +26,7 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
 from demandops.staterepo.load import last_valid_config
 from demandops.staterepo.load.last_valid_config import ConfigSource
+from demandops.subject import Subject
 
 Progress = Callable[[int, int], None]
 

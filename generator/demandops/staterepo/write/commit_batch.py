@@ -20,7 +20,7 @@ from pygit2 import Oid, Signature
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.decision import Decision, State, changeset_of_edit, rendered_files
-from demandops.demand.claim import ClaimKey, Subject
+from demandops.demand.claim import ClaimKey
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
@@ -46,6 +46,7 @@ from demandops.staterepo.load import (
 )
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Advance, Progress, Snapshot
+from demandops.subject import Subject
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02

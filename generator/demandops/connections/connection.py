@@ -1,0 +1,108 @@
+"""Connections: what a demand asks for, a claim holds, and clients are planned for."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import TYPE_CHECKING
+
+from demandops.connections.route import Route, merged_routes
+from demandops.subject import Subject, SubjectKind
+
+if TYPE_CHECKING:
+    from demandops.connections.connection_type import ConnectionType
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """One connection and the topics that it carries.
+
+    ``type`` is ``None`` if a demand leaves it open, ``broker`` is empty if the program chooses it.
+    In a claim there is a type, and the routes are sorted by their source topic, each once
+    (:meth:`booked`).
+    """
+
+    id: str
+    type: ConnectionType | None
+    source: str
+    target: str
+    broker: str
+    topics: tuple[Route, ...]
+
+    @property
+    def subject(self) -> Subject:
+        """Which connection it is."""
+        return Subject(SubjectKind.CONNECTION, self.id)
+
+    @property
+    def home(self) -> str:
+        """The node whose access domain sets leases and quotas."""
+        return self.target
+
+    @property
+    def nodes(self) -> tuple[str, str]:
+        """The nodes that a selector of an override matches."""
+        return (self.source, self.target)
+
+    @property
+    def known_type(self) -> ConnectionType:
+        """Its type; the caller knows that it is chosen."""
+        assert self.type is not None, self.id  # noqa: S101
+        return self.type
+
+    def route(self, source: str) -> Route | None:
+        """Return the route of a source topic that a claim has, or ``None``."""
+        place = bisect_left(self.topics, source, key=attrgetter("source"))
+        found = self.topics[place : place + 1]
+        return found[0] if found and found[0].source == source else None
+
+    def needs(self, node: str) -> bool:
+        """Return whether it depends on a node."""
+        return node in (self.source, self.target, self.broker)
+
+    def booked(self) -> Connection:
+        """Return it as a claim holds it."""
+        return replace(self, topics=merged_routes(self.topics))
+
+    def extended(self, more: Connection) -> Connection:
+        """Return ``more`` with the topics and the broker that this one has as well."""
+        topics, broker = (*self.topics, *more.topics), more.broker or self.broker
+        return replace(more, topics=topics, broker=broker)
+
+    def is_meant_by(self, listed: object) -> bool:
+        """Return whether a shutdown that lists ``listed`` can mean this one."""
+        return (
+            isinstance(listed, Connection)
+            and listed.source in ("", self.source)
+            and listed.target in ("", self.target)
+            and listed.type in (None, self.type)
+        )
+
+    def without(self, listed: Connection) -> tuple[Connection | None, list[str]]:
+        """Return what remains without the listed topics, if anything, and those it did not have.
+
+        If none is listed, nothing remains.
+        """
+        if not listed.topics:
+            return None, []
+        gone = {route.source for route in listed.topics}
+        missing = sorted(gone - {route.source for route in self.topics})
+        left = tuple(route for route in self.topics if route.source not in gone)
+        remaining = replace(self, topics=left) if left else None
+        return remaining, [f"topic {topic}" for topic in missing]
+
+    def without_node(self, node: str) -> Connection | None:
+        """Return what remains of it without a node, if anything: another broker may do."""
+        return None if node in self.nodes else replace(self, broker="")
+
+    def index_entries(self) -> Iterator[tuple[str, ...]]:
+        """Yield what the ledger finds it by."""
+        for end in self.nodes:
+            yield ("link", str(self.type), end)
+        if self.broker:
+            yield ("broker", self.broker)
+        for route in self.topics:
+            _, taking = route.sender_and_receiver(self.source, self.target)
+            yield ("brings", taking, route.written_topic)

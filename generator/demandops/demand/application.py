@@ -1,0 +1,157 @@
+"""Applications: what a demand asks for, a claim holds, and services are planned for."""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from itertools import islice, takewhile
+from types import MappingProxyType
+
+from demandops.subject import Subject, SubjectKind
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class InputTopic:
+    """An input topic of an application, and the node that publishes it."""
+
+    topic: str
+    source: str
+    type: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
+    """One application: an appdef at a node with inputs by role.
+
+    ``appdef`` is ``#<number>`` if the goal's number is unknown. In a claim the inputs of each role
+    are sorted by topic (:meth:`booked`).
+    """
+
+    id: str
+    appdef: str
+    node: str
+    inputs: Mapping[str, tuple[InputTopic, ...]]
+    parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    version: str = ""
+
+    def __eq__(self, other: object) -> bool:
+        """Compare exactly: in Python 1 equals True and 1.0, but a chart treats them differently."""
+        if not isinstance(other, Application):
+            return NotImplemented
+        same = all(getattr(self, one.name) == getattr(other, one.name) for one in fields(self))
+        return same and _exact(self.parameters) == _exact(other.parameters)
+
+    @property
+    def subject(self) -> Subject:
+        """Which application it is."""
+        return Subject(SubjectKind.APPLICATION, self.id)
+
+    @property
+    def home(self) -> str:
+        """The node whose access domain sets leases and quotas."""
+        return self.node
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """The nodes that a selector of an override matches."""
+        return (self.node,)
+
+    def all_inputs(self) -> list[tuple[str, InputTopic]]:
+        """Return every (role, topic)."""
+        return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
+
+    def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
+        """Return the inputs in a role that are ``topic`` of ``source``; they differ by type."""
+        inputs = self.inputs.get(role, ())
+        start = bisect_left(inputs, InputTopic(topic, source))
+        same = takewhile(
+            lambda one: (one.topic, one.source) == (topic, source), islice(inputs, start, None)
+        )
+        return tuple(same)
+
+    def needs(self, node: str) -> bool:
+        """Return whether it depends on a node."""
+        return self.node == node or any(topic.source == node for _, topic in self.all_inputs())
+
+    def needed_nodes(self) -> set[str]:
+        """Return the nodes that it depends on."""
+        return {self.node, *(topic.source for _, topic in self.all_inputs())}
+
+    def booked(self) -> Application:
+        """Return it as a claim holds it: sorted, each input once."""
+        inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items()) if topics}
+        return self.with_inputs(inputs)
+
+    def with_inputs(self, inputs: Mapping[str, tuple[InputTopic, ...]]) -> Application:
+        """Return it with other inputs; roles without a topic are left out."""
+        kept = {role: topics for role, topics in inputs.items() if topics}
+        return replace(self, inputs=MappingProxyType(kept))
+
+    def extended(self, more: Application) -> Application:
+        """Return ``more`` with the inputs and parameters that this one has as well."""
+        roles = {*self.inputs, *more.inputs}
+        inputs = {role: (*self.inputs.get(role, ()), *more.inputs.get(role, ())) for role in roles}
+        parameters = MappingProxyType({**self.parameters, **more.parameters})
+        return replace(more, inputs=MappingProxyType(inputs), parameters=parameters)
+
+    def is_meant_by(self, listed: object) -> bool:
+        """Return whether a shutdown that lists ``listed`` can mean this one."""
+        return (
+            isinstance(listed, Application)
+            and listed.node in ("", self.node)
+            and listed.appdef == self.appdef
+        )
+
+    def without(self, listed: Application) -> tuple[Application | None, list[str]]:
+        """Return what remains without the listed inputs, if anything, and those it did not have.
+
+        If none is listed, nothing remains.
+        """
+        if not any(listed.inputs.values()):
+            return None, []
+        left, missing = {}, []
+        for role in sorted({*self.inputs, *listed.inputs}):
+            by_name: dict[str, list[InputTopic]] = {}
+            for topic in self.inputs.get(role, ()):
+                by_name.setdefault(topic.topic, []).append(topic)
+            gone: set[InputTopic] = set()
+            for topic in listed.inputs.get(role, ()):
+                named = by_name.get(topic.topic, ())
+                found = {one for one in named if topic.source in ("", one.source)}
+                gone |= found
+                if not found:
+                    missing.append(f"{role} {topic.topic} of {topic.source}")
+            left[role] = tuple(one for one in self.inputs.get(role, ()) if one not in gone)
+        return (self.with_inputs(left) if any(left.values()) else None), missing
+
+    def without_node(self, node: str) -> Application | None:
+        """Return what remains of it without a node, if anything."""
+        if self.node == node:
+            return None
+        left = {
+            role: tuple(topic for topic in topics if topic.source != node)
+            for role, topics in self.inputs.items()
+        }
+        return self.with_inputs(left) if any(left.values()) else None
+
+    def index_entries(self) -> Iterator[tuple[str, ...]]:
+        """Yield what the ledger finds it by."""
+        yield ("node", self.node)
+        for _, topic in self.all_inputs():
+            yield ("takes", topic.source, topic.topic)
+            yield ("node", topic.source)
+
+
+def _exact(values: Mapping[str, object]) -> str:
+    return json.dumps(dict(values), sort_keys=True, default=repr) if values else ""
+
+
+def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
+    """Merge topics by (topic, source); a later type fills in one that is missing."""
+    types: dict[tuple[str, str], str] = {}
+    for topic in topics:
+        key = (topic.topic, topic.source)
+        types[key] = types.get(key) or topic.type
+    return tuple(InputTopic(*key, type) for key, type in sorted(types.items()))

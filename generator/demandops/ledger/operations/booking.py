@@ -1,0 +1,45 @@
+"""The booking of one demanded application or connection."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from demandops.demand.claim import Claim, ClaimKey
+from demandops.demand.demand_request import Demanded
+from demandops.demand.lease import renewed
+from demandops.ledger.ledger import Ledger
+
+
+def book(
+    ledger: Ledger,
+    one: Demanded,
+    request: str,
+    key: ClaimKey,
+    current: Claim | None,
+    now: datetime,
+    *,
+    extend: bool = False,
+) -> Ledger:
+    """Return the ledger with a claim on what is demanded.
+
+    Args:
+        ledger: the claims.
+        one: what to book.
+        request: the id of the request.
+        key: the key of the claim.
+        current: the demand's claim on it before the request.
+        now: when the request was received; a claim that only renews keeps its booking time.
+        extend: whether to keep what the current claim holds.
+    """
+    held = one.held
+    if extend and current:
+        held = current.held.extended(held)  # type: ignore[arg-type]  # it is of the same kind
+    claim = Claim(
+        held=held.booked(),
+        demand=key.demand,
+        request=request,
+        requesters=tuple(sorted(set(one.requesters))),
+        booked=now,
+        lease=renewed(current.lease if current else None, one.term, now),
+    )
+    return ledger.replace(key, claim.after_booking(current))

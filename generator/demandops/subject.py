@@ -1,0 +1,25 @@
+"""Subjects: what claims are on, an application or a connection by its exact id."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class SubjectKind(Enum):
+    """The kinds of subjects; the values are the ledger's folder names."""
+
+    APPLICATION = "applications"
+    CONNECTION = "connections"
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """An application or a connection, by its exact id."""
+
+    kind: SubjectKind
+    id: str
+
+    def __str__(self) -> str:
+        """Return ``application 'edge/fusion'``."""
+        return f"{self.kind.value[:-1]} '{self.id}'"
