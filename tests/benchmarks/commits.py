@@ -40,7 +40,7 @@ def _changed(repo: pygit2.Repository, commit: pygit2.Commit) -> dict[str, str | 
     """The files that one commit changed, with their texts."""
     files: dict[str, str | None] = {}
     before, after = commit.parents[0].tree, commit.tree
-    for path, _ in trees.differences(repo, before, after, ""):
+    for path, _ in trees.differences(before, after):
         files[path] = trees.read_text(after, path)
     return files
 

@@ -18,8 +18,8 @@ from demandops.service.ticket import Listener, Ticket, new_ticket
 from demandops.service.worker import Worker
 from demandops.staterepo.git import repository_choice
 from demandops.staterepo.git.signing import Signer
+from demandops.staterepo.load import state_in_effect
 from demandops.staterepo.load.snapshot import Progress, Snapshot
-from demandops.staterepo.write import commit_batch
 from demandops.staterepo.write.slot import Slot
 
 log = logging.getLogger("demandops")
@@ -65,7 +65,7 @@ class Generator:
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
             repository.signer = signer
-            snapshot = commit_batch.first_snapshot(repository, progress)
+            snapshot = state_in_effect.first_snapshot(repository, progress)
         except BaseException:
             self._slot.close()
             raise

@@ -8,7 +8,7 @@ from datetime import datetime, timezone
 from itertools import islice
 from pathlib import Path
 
-from pygit2 import Commit
+from pygit2 import Tree
 
 from demandops import settings
 from demandops.config.config import Config
@@ -22,13 +22,15 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.address import is_url
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.history import authorship, commit_log, path_history, revisions
+from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.history.path_history import PathHistory
 from demandops.staterepo.load import (
-    in_force_trailers,
     last_valid_config,
+    ledger_files,
     problem_report,
     rollback_target,
+    state_in_effect,
 )
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
@@ -52,7 +54,7 @@ class Reader:
             folder = self._slot.folder
         try:
             self._repository = repository_choice.connect(address, folder)
-            self._tip = self._repository.refresh()
+            self._objects, self._tip = self._repository.objects, self._repository.refresh()
         except BaseException:
             self.close()
             raise
@@ -73,8 +75,7 @@ class Reader:
         Raises:
             StateRepoError: names the version and the remedy.
         """
-        tip = trees.commit_of(self._repository.objects, self._tip)
-        last_valid_config.refuse_other_render_version(tip.tree)
+        last_valid_config.refuse_other_render_version(self._tree())
 
     def commit(self, revision: str | None = None) -> str:
         """Return the commit id of a revision or a time; by default the newest commit.
@@ -85,7 +86,7 @@ class Reader:
         if not revision:
             return str(self._tip)
         now = datetime.now(timezone.utc)
-        return str(revisions.resolve(self._repository.objects, self._tip, revision, now).id)
+        return str(revisions.resolve(self._objects, self._tip, revision, now).id)
 
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``commit`` is ``other`` or a descendant."""
@@ -105,18 +106,13 @@ class Reader:
         Raises:
             InvalidInput, StateRepoError: the commit is not a valid state repo.
         """
-        commit = trees.commit_of(self._repository.objects, self.commit(revision))
-        record = self._generator_record(commit)
-        if record is not None and record.first("In-Force"):
-            return in_force_trailers.snapshot_at(self._repository.objects, commit, record)
-        return snapshots.load(self._repository.objects, commit.id, progress)
+        commit = self.commit(revision)
+        if state_in_effect.record_at(self._objects, commit).first("In-Force"):
+            return state_in_effect.state_at(self._objects, commit, progress)
+        return snapshots.load(self._objects, commit, progress)
 
-    def _generator_record(self, commit: Commit) -> LogEntry | None:
-        """Return the generator's newest commit up to this one, which records what is in effect."""
-        base = commit_log.last_generator_commit(self._repository.objects, commit.id)
-        if base is None:
-            return None
-        return commit_log.entry_of(trees.commit_of(self._repository.objects, base))
+    def _tree(self, revision: str | None = None) -> Tree:
+        return trees.commit_of(self._objects, self.commit(revision)).tree
 
     def problems(self) -> tuple[problem_report.Problem, ...]:
         """Return the problems that the generator reports at the newest commit."""
@@ -140,11 +136,11 @@ class Reader:
         try:
             return self.snapshot(revision, progress)
         except InvalidInput:
-            return snapshots.load_last_valid(self._repository.objects, revision, progress)
+            return state_in_effect.state_at(self._objects, revision, progress)
 
     def file_reader(self, revision: str | None = None) -> FileReader:
         """Return a function that returns the text of a file at a commit."""
-        tree = trees.commit_of(self._repository.objects, self.commit(revision)).tree
+        tree = self._tree(revision)
         return lambda path: trees.read_text(tree, path)
 
     def config(self) -> Config:
@@ -153,9 +149,7 @@ class Reader:
         Raises:
             InvalidInput, StateRepoError: it is not valid.
         """
-        return last_valid_config.config_at(
-            trees.commit_of(self._repository.objects, self._tip).tree
-        )
+        return last_valid_config.config_at(self._tree())
 
     def proposals(self) -> list[PendingProposal]:
         """Return the demands that await approval, by branch.
@@ -168,16 +162,13 @@ class Reader:
     def log(self, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
         since, until = self._sides(spec or "")
-        yield from commit_log.walk(self._repository.objects, until, since)
+        yield from commit_log.walk(self._objects, until, since)
 
     def commits_changing(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
         """Yield the commits of :meth:`log` that changed a file or folder."""
         since, until = self._sides(spec or "")
-        objects = self._repository.objects
-        known = {one.commit for one in commit_log.walk(objects, until, since)} if since else None
-        for change in path_history.changes_to(objects, until, path):
-            if known is None or change.entry.commit in known:
-                yield change.entry
+        for change in path_history.changes_to(self._objects, until, path, since):
+            yield change.entry
 
     def revisions(self, spec: str | None) -> list[str]:
         """Return the commits that ``REV`` or ``A..B`` names, oldest first.
@@ -188,7 +179,7 @@ class Reader:
         since, until = self._sides(spec or "")
         if since is None:
             return [until]
-        walked = commit_log.walk(self._repository.objects, until, since)
+        walked = commit_log.walk(self._objects, until, since)
         return [entry.commit for entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
@@ -214,58 +205,53 @@ class Reader:
             whole: load every commit whole, rather than what differs from the one before.
             progress: called with (commits done, all commits).
         """
-        objects, verdicts = self._repository.objects, list[Verdict]()
-        for verdict in verification.verify(objects, commits, whole=whole):
+        verdicts = list[Verdict]()
+        for verdict in verification.verify(self._objects, commits, whole=whole):
             verdicts.append(verdict)
             progress(len(verdicts), len(commits))
-        return commit_signatures.with_signatures(objects, verdicts)
+        return commit_signatures.with_signatures(self._objects, verdicts)
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
         """Return the history of a file or folder up to a commit."""
-        return path_history.history_of(self._repository.objects, revision, path, most)
+        return path_history.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
         """Return the path of a release, or of the last stopped one of that name."""
-        objects = self._repository.objects
-        current = path_history.release_path(objects, revision, name)
-        return current or path_history.stopped_release_path(objects, revision, name)
+        current = path_history.release_path(self._objects, revision, name)
+        return current or path_history.stopped_release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
         """Return the names of all releases that were ever stopped."""
-        return path_history.stopped_release_names(self._repository.objects, revision)
+        return path_history.stopped_release_names(self._objects, revision)
 
     def changed_files(self, before: str, after: str, root: str) -> dict[str, bool]:
         """Return the files of a folder that differ between two commits: path → exists after."""
-        objects = self._repository.objects
-        sides = [trees.commit_of(objects, revision).tree for revision in (before, after)]
-        changed = trees.differences_below(objects, sides[0], sides[1], root)
+        changed = trees.differences(self._tree(before), self._tree(after), (root,))
         return {path: blob is not None for path, blob in changed}
 
     def changes_node(self, commit: str, node: str) -> bool:
         """Return whether a commit changed what runs on a node, or a claim that names it."""
-        return path_history.changes_node(self._repository.objects, commit, node)
+        return ledger_files.changes_node(self._objects, commit, node)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
         """Return the commits by people that a follow commit renders, newest first."""
         since, follows = entry.first("Since"), entry.first("Follows")
         if not (since and follows):
             return []
-        walked = commit_log.walk(self._repository.objects, follows, since)
-        return list(islice((one for one in walked if not one.by_generator), most))
+        people = commit_log.person_commits(self._objects, follows, since)
+        return [commit_log.entry_of(commit) for commit in islice(people, most)]
 
     def restoration(self, to: str, **more: object) -> Restoration:
         """Return the request to roll back to a commit."""
-        return rollback_target.restoration(self._repository.objects, to, **more)
+        return rollback_target.restoration(self._objects, to, **more)
 
     def config_files_changed_since(self, commit: str) -> list[str]:
         """Return the configuration files that changed since a commit."""
-        return rollback_target.config_files_changed_since(
-            self._repository.objects, commit, self._tip
-        )
+        return rollback_target.config_files_changed_since(self._objects, commit, self._tip)
 
-    def git_user(self) -> tuple[str, str]:
-        """Return the name and e-mail address of the person who runs this program."""
-        return authorship.git_user(self._repository.objects)
+    def operator(self) -> Person:
+        """Return the person who runs this program."""
+        return authorship.operator(self._objects.path)
 
 
 @contextmanager

@@ -14,17 +14,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-import pygit2
-from pygit2 import Repository, Signature
-
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State
+from demandops.demand.claim import ClaimKey
 from demandops.errors import InvalidInput, StateRepoError, fault
-from demandops.ledger import ended_override_file
-from demandops.plan.overrides.lifecycle import LedgerUpdate, update_ledger
+from demandops.plan.overrides.lifecycle import update_ledger
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import planned_releases
 from demandops.render.gitops.controller_switch import SwitchSteps, switch_steps
@@ -33,10 +30,10 @@ from demandops.staterepo import reader
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import Signer
-from demandops.staterepo.history import commit_log, commit_message
-from demandops.staterepo.load import last_valid_config
+from demandops.staterepo.history import authorship, commit_message
+from demandops.staterepo.load import last_valid_config, ledger_files, state_in_effect
 from demandops.staterepo.load import snapshot as snapshots
-from demandops.staterepo.load.snapshot import Progress, Snapshot
+from demandops.staterepo.load.snapshot import Progress
 from demandops.staterepo.write.commit_batch import CommitBatch
 
 _ATTEMPTS = 10
@@ -68,6 +65,16 @@ class Upgrade:
         return switch_steps(self.old, self.new)
 
 
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """An upgrade, the batch to commit it in, the state after it, and the claims that may change."""
+
+    upgrade: Upgrade
+    batch: CommitBatch
+    state: State
+    keys: tuple[ClaimKey, ...]
+
+
 def plan(
     address: str,
     request: UpgradeRequest,
@@ -81,7 +88,7 @@ def plan(
         StateRepoError: the state repo cannot be read.
     """
     with reader.opened(address) as repo:
-        return _plan_upgrade(repo.repository, request, now, progress)[0]
+        return _plan(repo.repository, request, now, progress).upgrade
 
 
 def upgrade(
@@ -108,16 +115,16 @@ def upgrade(
         repository = repo.repository
         repository.signer = signer
         for attempt in range(1, _ATTEMPTS + 1):
-            made, batch, applied = _plan_upgrade(repository, request, now, progress)
-            if not made.files:
-                return made
-            author = _person(repository.objects, now)
-            state = replace(batch.head.state, ledger=applied.ledger, config=applied.config)
-            commit = batch.commit_files(
-                made.files, state, _message(made, applied), author, now, applied.keys
-            )
-            if batch.publish():
-                return Upgrade(commit, made.old, made.new, made.files)
+            planned = _plan(repository, request, now, progress)
+            files = planned.upgrade.files
+            if not files:
+                return planned.upgrade
+            who = authorship.operator(repository.objects.path)
+            author = commit_message.signature(who.name, who.email, now)
+            text = _message(planned.upgrade, planned.keys)
+            commit = planned.batch.commit_files(files, planned.state, text, author, now)
+            if planned.batch.publish():
+                return replace(planned.upgrade, commit=commit)
             time.sleep(_PAUSE_S * attempt * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
             repository.refresh()
     raise StateRepoError(
@@ -126,9 +133,9 @@ def upgrade(
     )
 
 
-def _plan_upgrade(
+def _plan(
     repository: StateRepository, request: UpgradeRequest, now: datetime, progress: Progress
-) -> tuple[Upgrade, CommitBatch, LedgerUpdate]:
+) -> _Plan:
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
     batch, old = CommitBatch(repository, snapshot), snapshot.state.config
@@ -136,35 +143,20 @@ def _plan_upgrade(
     files = trees.texts(tree, CONFIG_ROOTS)
     before = files[ROOT_FILE]
     files[ROOT_FILE] = _root(before, old, request)
-    marked = last_valid_config.end_markers_at(tree)
-    config = load(files).with_ended_overrides(ended_override_file.read(marked))
+    config = load(files).with_ended_overrides(last_valid_config.ended_overrides_at(tree))
     state = State.of(config, snapshot.state.ledger)
-    applied = _with_changes_by_people(repository, snapshot, state, marked, now)
+    # what people changed since the generator's last commit is carried out too
+    known = state_in_effect.start_at(objects, tip).state
+    subjects = ledger_files.changed_subjects(known.ledger, state.ledger)
+    applied = update_ledger(known, state, subjects, last_valid_config.end_markers_at(tree), now)
     state = replace(state, ledger=applied.ledger, config=applied.config)
     if old.repo_settings.gitops != config.repo_settings.gitops:
         _refuse_held(state)
     changed = dict(batch.render_all(state, applied.files).files)
     if files[ROOT_FILE] != before:
         changed[ROOT_FILE] = files[ROOT_FILE]
-    return Upgrade(str(tip), old, state.config, dict(sorted(changed.items()))), batch, applied
-
-
-def _with_changes_by_people(
-    repository: StateRepository,
-    tip: Snapshot,
-    state: State,
-    marked: Mapping[str, str],
-    now: datetime,
-) -> LedgerUpdate:
-    """Return the state with what people changed since the generator's last commit."""
-    objects = repository.objects
-    last = commit_log.last_generator_commit(objects, tip.commit)
-    before = tip.state if last is None else snapshots.load_last_valid(objects, last).state
-    after = state.ledger
-    keys = {claim.key for ledger in (before.ledger, after) for claim in ledger}
-    subjects = {key.subject for key in keys if before.ledger.get(key) != after.get(key)}
-    old = (before.ledger, before.config)
-    return update_ledger(old, (after, state.config), sorted(subjects, key=str), marked, now)
+    upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))
+    return _Plan(upgrade, batch, state, applied.keys)
 
 
 def _refuse_held(state: State) -> None:
@@ -206,16 +198,7 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
     return text
 
 
-def _person(objects: Repository, now: datetime) -> Signature:
-    """Return the person who runs the command, from git's configuration; else the generator."""
-    try:
-        who = objects.default_signature
-    except (KeyError, ValueError, pygit2.GitError):
-        return commit_message.generator_signature(now)
-    return Signature(who.name, who.email, int(now.timestamp()), 0)
-
-
-def _message(made: Upgrade, applied: LedgerUpdate) -> str:
+def _message(made: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
     old, new = made.old.repo_settings, made.new.repo_settings
     switched = old.gitops != new.gitops
     title = "Render everything again"
@@ -227,27 +210,21 @@ def _message(made: Upgrade, applied: LedgerUpdate) -> str:
     if switched:
         why += f", for {_NAMES[new.gitops]} instead of {_NAMES[old.gitops]}"
     counts = Counter("/".join(path.split("/")[:_FOLDER_DEPTH]) for path in made.files)
-    lines = [
-        title,
-        "",
-        f"Why: `demandops upgrade` renders everything {why}.",
-        "",
-        "Files written or removed:",
-        *(f"  {count} in {folder}" for folder, count in sorted(counts.items())),
-        "",
-        "Operation: upgrade",
-        f"From-Render-Version: {old.render_version}",
-        *([f"From-Gitops: {old.gitops}"] if switched else []),
-        f"Gitops: {new.gitops}",
-        *(
-            f"{key}: {path}"
-            for key, path in commit_message.override_trailers(
-                commit_message.keep_override_paths(applied.keys)
-            )
-        ),
-        f"Render-Version: {new.render_version}",
+    trailers = [
+        ("Operation", "upgrade"),
+        ("From-Render-Version", str(old.render_version)),
+        ("From-Gitops", old.gitops if switched else ""),
+        ("Gitops", new.gitops),
+        *commit_message.override_trailers(commit_message.keep_override_paths(keys)),
+        ("Render-Version", str(new.render_version)),
     ]
-    return "\n".join(lines) + "\n"
+    files = [f"  {count} in {folder}" for folder, count in sorted(counts.items())]
+    paragraphs = [
+        [title],
+        [f"Why: `demandops upgrade` renders everything {why}."],
+        ["Files written or removed:", *files],
+    ]
+    return commit_message.compose(paragraphs, trailers)
 
 
 _NAMES = {"flux": "Flux", "argocd": "Argo CD"}

@@ -7,10 +7,14 @@ finds the same, and every commit verifies by what its trailers say.
 from __future__ import annotations
 
 from pathlib import Path
+from random import Random
 from typing import Any
 
+import pygit2
 import pytest
 import yaml
+from demandops.service import Generator
+from demandops.staterepo.load import state_in_effect
 
 from tests.kit import rig
 from tests.kit.repo import read as text
@@ -156,4 +160,57 @@ def test_half_of_an_application_definition_is_not_taken_in(bare: Path, person: P
         rig.book(generator, goal(2))
         assert text(bare, DETECTION) == before
         assert yaml.safe_load(text(bare, ".demandops/reports/problems.yaml"))
+    rig.assert_sound(bare)
+
+
+def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
+    """A change by a person, which may be valid, break a file, or break what others need."""
+    start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
+    claim = random.choice([path for path in rig.claims(bare) if "applications" in path])
+    changes: list[dict[str, str | None]] = [
+        {"overrides/two.yaml": TWO.replace("2", str(random.randint(2, 9)))},
+        {"overrides/broken.yaml": BROKEN},
+        {"overrides/broken.yaml": BROKEN.replace("many", "3")},
+        {IMAGES: tagged(bare, f"v{random.randint(1, 9)}")},
+        {IMAGES: tagged(bare, "v1").replace("kind: Images", "kind: Imags")},
+        {NODES: nodes[:start] + nodes[end:]},
+        {NODES: nodes},
+        {claim: "kind: nonsense\n"},
+        {claim: text(bare, claim).replace("node: edge\n", "node: nowhere\n")},
+        {claim: None},
+    ]
+    first, second = random.sample(changes[:7], 2)
+    chosen = first | second if random.random() < 0.3 else random.choice(changes)
+    return {**chosen, "README.md": str(random.random())}
+
+
+def followed(generator: Generator, person: Person) -> bool:
+    made = rig.git(person.folder, "rev-parse", "HEAD")
+    return generator.includes(str(generator.snapshot.commit), made)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.limit(60)
+def test_a_start_at_any_commit_finds_what_the_running_generator_has(
+    bare: Path, person: Person, seed: int
+) -> None:
+    """What is in effect follows from history alone, whoever asks and whenever."""
+    random, nodes = Random(seed), text(bare, NODES) + "\n"
+    with rig.running(bare) as generator:
+        rig.book(generator, *(goal(number) for number in range(6)))
+        repo = pygit2.Repository(str(bare))
+        for _ in range(10):
+            files = _change(random, bare, nodes)
+            made = person.change(files)
+            alone = state_in_effect.state_at(repo, made)
+            generator.fetch_now()
+            rig.wait_until(lambda: followed(generator, person), f"{made} is followed")
+            running = generator.snapshot
+            again = state_in_effect.state_at(repo, running.commit)
+            for found in (alone, again):
+                assert found.state.config == running.state.config, files
+                assert {c.key: c for c in found.state.ledger} == {
+                    c.key: c for c in running.state.ledger
+                }, files
+            assert bool(alone.problems) == bool(running.problems)
     rig.assert_sound(bare)

@@ -57,7 +57,7 @@ def decommission(
     are decommissioned.
     """
     goal = decommission_goal.as_data(
-        name, (kinds,) if kinds else ("node", "requester"), authorship.operator()
+        name, (kinds,) if kinds else ("node", "requester"), str(authorship.operator())
     )
     try:
         if dry_run:

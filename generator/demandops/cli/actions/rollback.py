@@ -25,6 +25,7 @@ from demandops.ledger import claim_file
 from demandops.service import Generator
 from demandops.service import rollback_goal as rollbacks
 from demandops.staterepo import reader
+from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.reader import Reader
 
 _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
@@ -37,7 +38,7 @@ class _Target:
     to: str
     drop_newer: bool
     reason: str
-    person: tuple[str, str]
+    person: Person
 
 
 @click.command()
@@ -71,7 +72,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - one for each option
     if not (dry_run or (reason and reason.strip())):
         raise click.UsageError("give the reason: -m TEXT")
     with reader.opened(state_repo) as repo:
-        target = _Target(repo.commit(revision), drop_newer, reason or "", repo.git_user())
+        target = _Target(repo.commit(revision), drop_newer, reason or "", repo.operator())
         base = repo.commit()
         result: dict[str, Any] = {"to": target.to, "outcome": "refused", "commit": None}
         result |= _consequences(None)

@@ -23,6 +23,7 @@ from demandops.plan.release import Release
 from demandops.plan.views import explanation
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo import reader
+from demandops.staterepo.load import ledger_files
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
 from demandops.subject import Subject, SubjectKind
@@ -139,7 +140,7 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Match]:
 def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Match:
     path = path.rstrip("/")
     text = repo.file_reader(str(snapshot.commit))(path)
-    key = snapshot.keys.get(path)
+    key = ledger_files.key_of(path, snapshot.state.ledger)
     if key is not None:
         return _Match("claim", key.demand, path, subject=key.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")

@@ -7,8 +7,9 @@ that was in effect with a commit of its own.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import datetime
+from typing import Protocol
 
 from demandops.config.config import Config
 from demandops.config.override import Override, format_time
@@ -17,6 +18,18 @@ from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 from demandops.subject import Subject
+
+
+class LedgerAndConfig(Protocol):
+    """Ledger and configuration at one time, for example :class:`demandops.decision.State`."""
+
+    @property
+    def ledger(self) -> Ledger:
+        """What is booked."""
+
+    @property
+    def config(self) -> Config:
+        """What people wrote."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +41,13 @@ class LedgerUpdate:
 
     ledger: Ledger
     config: Config
-    keys: tuple[ClaimKey, ...]
-    files: Mapping[str, str | None]
+    keys: tuple[ClaimKey, ...] = ()
+    files: Mapping[str, str | None] = field(default_factory=dict)
 
 
 def update_ledger(
-    before: tuple[Ledger, Config],
-    after: tuple[Ledger, Config],
+    before: LedgerAndConfig,
+    after: LedgerAndConfig,
     subjects: Iterable[Subject],
     markers: Mapping[str, str],
     now: datetime,
@@ -47,8 +60,8 @@ def update_ledger(
         markers: the current markers, path → text.
         now: new overrides that end by then do not apply.
     """
-    ledger, config = after
-    known = {one.name: one for one in before[1].active_overrides}
+    config = after.config
+    known = {one.name: one for one in before.config.active_overrides}
     expired = [
         one
         for one in expired_overrides(config, now)
@@ -65,26 +78,22 @@ def update_ledger(
     files: dict[str, str | None] = dict.fromkeys(stale)
     for override in expired:
         files |= _marker(override)
-    touched = (*subjects, *kept_claims.kept_subjects(before[0]), *kept_claims.kept_subjects(ledger))
+    kept = (*kept_claims.kept_subjects(before.ledger), *kept_claims.kept_subjects(after.ledger))
     updated, keys = kept_claims.update_kept_claims(
-        before[0], ledger, dict.fromkeys(touched), config, now
+        before.ledger, after.ledger, dict.fromkeys((*subjects, *kept)), config, now
     )
-    files |= changed_claim_files(ledger, updated, keys)
+    files |= changed_claim_files(after.ledger, updated, keys)
     return LedgerUpdate(updated, config, tuple(keys), files)
 
 
-def end_override(state: tuple[Ledger, Config], override: Override, now: datetime) -> LedgerUpdate:
+def end_override(state: LedgerAndConfig, override: Override, now: datetime) -> LedgerUpdate:
     """Return the update that ends an override."""
-    ledger, config = state
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
-    after = config.with_ended_overrides(
-        {**config.ended_overrides, override.name: format_time(override.end)}
-    )
-    update = update_ledger(state, (ledger, after), (), {}, now)
-    return LedgerUpdate(
-        update.ledger, update.config, update.keys, {**update.files, **_marker(override)}
-    )
+    ended = {**state.config.ended_overrides, override.name: format_time(override.end)}
+    after = LedgerUpdate(state.ledger, state.config.with_ended_overrides(ended))
+    update = update_ledger(state, after, (), {}, now)
+    return replace(update, files={**update.files, **_marker(override)})
 
 
 def _marker(override: Override) -> dict[str, str]:

@@ -9,22 +9,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from pygit2 import Commit, Repository
+from pygit2 import Commit
 
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.demand.claim import OVERRIDE_PREFIX, Claim
-from demandops.errors import InvalidInput
+from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.ledger import claim_file, ended_override_file
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import LogEntry
+from demandops.staterepo.load import ledger_files
 
 _OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
 _ENDING = ("follow", "upgrade", "expire-override")
 """Operations that may add or remove the marker of an ended override."""
 
 
-def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> tuple[str, ...]:
+def disallowed_files(commit: Commit, entry: LogEntry) -> tuple[str, ...]:
     """Return the files that a commit changed although its message does not account for them.
 
     These are files that people write, claims of demands that the message does not name, and claims
@@ -32,13 +32,13 @@ def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> tuple
     """
     if not commit.parents:
         return ()
-    return tuple(sorted(_disallowed(repo, commit, entry)))
+    return tuple(sorted(_disallowed(commit, entry)))
 
 
-def _disallowed(repo: Repository, commit: Commit, entry: LogEntry) -> Iterator[str]:
+def _disallowed(commit: Commit, entry: LogEntry) -> Iterator[str]:
     before, operation = commit.parents[0].tree, entry.first("Operation")
     named = _named(entry)
-    for path, blob in trees.differences(repo, before, commit.tree, ""):
+    for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
         if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
             continue
@@ -64,7 +64,9 @@ def _named(entry: LogEntry) -> set[str]:
 
 def _only_starts_lease(commit: Commit, path: str) -> bool:
     """Return whether a claim changed only in that its lease started, after approval."""
-    before, after = (_claim(one, path) for one in (commit.parents[0], commit))
+    before, after = (
+        ledger_files.valid_claim_at(one.tree, path) for one in (commit.parents[0], commit)
+    )
     if before is None or after is None or before.lease is None or after.lease is None:
         return False
     started = not before.lease.has_started and after.lease.has_started
@@ -77,13 +79,5 @@ def _is_marker(commit: Commit, path: str) -> bool:
 
 
 def _is_canonical(commit: Commit, path: str) -> bool:
-    claim = _claim(commit, path)
+    claim = ledger_files.valid_claim_at(commit.tree, path)
     return claim is not None and claim_file.text_of(claim) == trees.read_text(commit.tree, path)
-
-
-def _claim(commit: Commit, path: str) -> Claim | None:
-    text = trees.read_text(commit.tree, path)
-    try:
-        return claim_file.read(text, path) if text is not None else None
-    except InvalidInput:
-        return None

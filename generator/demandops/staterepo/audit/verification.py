@@ -17,9 +17,8 @@ from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.decision import State, rendered_files
-from demandops.demand.claim import Claim
 from demandops.errors import InvalidInput
-from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import ClaimChange
 from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.release import Release
@@ -30,9 +29,8 @@ from demandops.render.gitops.paths import path_of
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.staterepo.audit import allowed_changes
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history.commit_log import LogEntry, entry_of
-from demandops.staterepo.history.commit_message import PROPOSAL
-from demandops.staterepo.load import in_force_trailers
+from demandops.staterepo.history.commit_log import PROPOSAL, LogEntry, entry_of
+from demandops.staterepo.load import ledger_files, state_in_effect
 
 _CHARTS = "/_charts/"
 
@@ -58,59 +56,80 @@ class Verdict:
     signature: str = ""
 
 
-@dataclass(slots=True)
 class _Proof:
     """A commit that was rendered again, and what the proof of the next one reuses."""
 
-    tree: Tree
-    state: State
-    claims: dict[str, Claim]
-    plan: IncrementalPlan
-    planned: dict[ReleaseKey, tuple[str, Oid]]
-    held: dict[ReleaseKey, Release]
-    """Releases whose files an override holds: they depend on the parent commit."""
-    undemanded: dict[str, Oid]
-    """Files that exist without any demand."""
-    committed: dict[str, Oid]
-    """The commit's files in the generated folders."""
+    def __init__(self, state: State, commit: Commit) -> None:
+        """Render a commit whole."""
+        self.state, self._commit = state, commit
+        self._plan = IncrementalPlan(state.config)
+        self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
+        self._held: dict[ReleaseKey, Release] = {}
+        """Releases whose files an override holds: they depend on the parent commit."""
+        base_files = manifests.base_files(state.config, state.engine)
+        self._undemanded = {path: _blob(text) for path, text in base_files.items()}
+        self._committed = _generated_files(commit.tree)
+        self._render(())
 
-    def advance(self, state: State, changes: Sequence[ClaimChange], before: Tree | None) -> None:
-        """Plan and render what the changes affect.
+    def is_reconfigured(self, commit: Commit) -> bool:
+        """Return whether configuration, ended overrides or the problem report changed."""
+        roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
+        return trees.differ(self._commit.tree, commit.tree, roots)
 
-        Args:
-            state: ledger and configuration after the changes.
-            changes: every claim that changed.
-            before: the commit's parent, whose files overrides may hold.
+    def advance(self, commit: Commit) -> None:
+        """Render what a later commit changed in the ledger, and record which files it changed.
+
+        Raises:
+            _Unreadable: a claim file is not valid.
         """
-        self.state = state
-        for key, release in self.plan.advance(state.ledger, changes).items():
-            self.planned.pop(key, None)
-            self.held.pop(key, None)
-            if release is not None and release.shaping.held:
-                self.held[key] = release
-            elif release is not None:
-                self.planned[key] = _rendered(release, state, None)
-        for key, release in self.held.items():
-            self.planned[key] = _rendered(release, state, before)
+        before, after = self._commit.tree, commit.tree
+        try:
+            changes = [
+                ClaimChange(*(ledger_files.claim_at(tree, path) for tree in (before, after)))
+                for path in ledger_files.changed_files(before, after)
+            ]
+        except InvalidInput as error:
+            raise _Unreadable(error.faults[0]) from None
+        ledger = self.state.ledger
+        for change in changes:
+            ledger = ledger.replace(change.key, change.after)
+        for path, blob in trees.differences(before, after, GENERATED_ROOTS):
+            self._committed.pop(path, None)
+            if blob is not None:
+                self._committed[path] = blob
+        self.state, self._commit = replace(self.state, ledger=ledger), commit
+        self._render(changes)
 
-    def differing(self, before: Tree | None) -> tuple[str, ...]:
+    def _render(self, changes: Sequence[ClaimChange]) -> None:
+        """Plan and render what the changes affect, and what overrides hold."""
+        for key, release in self._plan.advance(self.state.ledger, changes).items():
+            self._planned.pop(key, None)
+            self._held.pop(key, None)
+            if release is not None and release.shaping.held:
+                self._held[key] = release
+            elif release is not None:
+                self._planned[key] = self._rendered(release, None)
+        for key, release in self._held.items():
+            self._planned[key] = self._rendered(release, trees.parent_tree(self._commit))
+
+    def _rendered(self, release: Release, before: Tree | None) -> tuple[str, Oid]:
+        path, state = path_of(release), self.state
+        current = trees.read_text(before, path)
+        return path, _blob(release_file.release_text(release, state.config, state.engine, current))
+
+    def differing(self) -> tuple[str, ...]:
         """Return the files that differ from what was rendered."""
-        wanted = self.undemanded | dict(self.planned.values())
-        if before is not None and any(one.hold for one in self.state.config.active_overrides):
+        wanted = self._undemanded | dict(self._planned.values())
+        before = trees.parent_tree(self._commit)
+        if before is not None and _holds(self.state.config):
             charts = {
-                path: trees.read_text(before, path) or ""
-                for path, _ in _generated_files(before)
+                path: trees.text_of(blob)
+                for path, blob in trees.blobs(before, GENERATED_ROOTS)
                 if _CHARTS in path and path not in wanted
             }
             kept = release_file.kept_charts({}, charts, self.state.config)
             wanted |= {path: _blob(text) for path, text in kept.items()}
-        return _differing(wanted, self.committed)
-
-
-def _rendered(release: Release, state: State, before: Tree | None) -> tuple[str, Oid]:
-    path = path_of(release)
-    current = trees.read_text(before, path) if before is not None else None
-    return path, _blob(release_file.release_text(release, state.config, state.engine, current))
+        return _differing(wanted, self._committed)
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
@@ -127,7 +146,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         if verdict.skipped:
             yield verdict
             continue
-        touched = allowed_changes.disallowed_files(repo, commit, entry)
+        touched = allowed_changes.disallowed_files(commit, entry)
         whole_commit = whole or place == len(commits) or bool(entry.first("In-Force"))
         try:
             differing = proofs.differing(commit, entry, whole=whole_commit)
@@ -163,24 +182,22 @@ class _Proofs:
         """
         proof, self._proof = self._proof, None
         if whole:
-            state = self._loaded(commit, entry)
-            files = rendered_files(state, _held_from(commit, state.config))
+            state = self._loaded(entry)
+            before = trees.parent_tree(commit) if _holds(state.config) else None
+            held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
+            files = rendered_files(state, held)
             wanted = {path: _blob(text) for path, text in files.items()}
-            return _differing(wanted, dict(_generated_files(commit.tree)))
-        if proof is None or _reconfigured(proof, commit):
-            proof = _prove_whole(self._loaded(commit, entry), commit)
+            return _differing(wanted, _generated_files(commit.tree))
+        if proof is None or proof.is_reconfigured(commit):
+            proof = _Proof(self._loaded(entry), commit)
         else:
-            try:
-                changes = _claims_changed(self._repo, proof, commit)
-            except InvalidInput as error:
-                raise _Unreadable(error.faults[0]) from None
-            _advance(self._repo, proof, commit, changes)
+            proof.advance(commit)
         self._proof = proof  # not reached, and so None, if the commit could not be read
-        return proof.differing(_parent(commit))
+        return proof.differing()
 
-    def _loaded(self, commit: Commit, entry: LogEntry) -> State:
+    def _loaded(self, entry: LogEntry) -> State:
         try:
-            return in_force_trailers.snapshot_at(self._repo, commit, entry).state
+            return state_in_effect.recorded_state(self._repo, entry).state
         except InvalidInput as error:
             raise _Unreadable(error.faults[0]) from None
 
@@ -202,98 +219,12 @@ def _skip_reason(entry: LogEntry) -> str:
     return ""
 
 
-def _parent(commit: Commit) -> Tree | None:
-    return commit.parents[0].tree if commit.parents else None
+def _holds(config: Config) -> bool:
+    return any(override.hold for override in config.active_overrides)
 
 
-def _held_from(commit: Commit, config: Config) -> dict[str, str]:
-    """Return the files of the commit's parent if overrides hold some of them."""
-    before = _parent(commit)
-    if before is None or not any(override.hold for override in config.active_overrides):
-        return {}
-    return trees.texts(before, GENERATED_ROOTS)
-
-
-def _reconfigured(proof: _Proof, commit: Commit) -> bool:
-    """Return whether configuration, ended overrides or the problem report changed."""
-
-    def ids(tree: Tree) -> list[Oid | None]:
-        objects = [trees.child(tree, root) for root in (*CONFIG_ROOTS, NOTES_ROOT)]
-        ledger = trees.child(tree, claim_file.LEDGER_ROOT)
-        if isinstance(ledger, Tree):
-            objects.append(trees.child(ledger, ended_override_file.MARKERS_ROOT.rsplit("/", 1)[-1]))
-        return [entry.id if entry else None for entry in objects]
-
-    return ids(proof.tree) != ids(commit.tree)
-
-
-def _claims_changed(repo: Repository, proof: _Proof, commit: Commit) -> list[ClaimChange]:
-    """Return the claims that differ from those of the commit proven before.
-
-    Raises:
-        InvalidInput: a claim file is not valid.
-    """
-    changes = []
-    for path, blob in trees.differences_below(
-        repo, proof.tree, commit.tree, claim_file.LEDGER_ROOT
-    ):
-        if claim_file.kind_of(path) is None:
-            continue
-        known = proof.claims.get(path)
-        claim = claim_file.read(_text(commit, path), path) if blob else None
-        if known or claim:
-            changes.append(ClaimChange(known, claim))
-    return changes
-
-
-def _prove_whole(state: State, commit: Commit) -> _Proof:
-    """Render a commit whole, so that the next can be proven by its differences."""
-    undemanded = manifests.base_files(state.config, state.engine)
-    proof = _Proof(
-        tree=commit.tree,
-        state=state,
-        claims={claim_file.path_of(claim.key): claim for claim in state.ledger},
-        plan=IncrementalPlan(state.config),
-        planned={},
-        held={},
-        undemanded={path: _blob(text) for path, text in undemanded.items()},
-        committed=dict(_generated_files(commit.tree)),
-    )
-    proof.advance(state, (), _parent(commit))
-    return proof
-
-
-def _advance(
-    repo: Repository, proof: _Proof, commit: Commit, changes: Sequence[ClaimChange]
-) -> None:
-    """Render what a commit changed in the ledger, and record which files it changed."""
-    ledger = proof.state.ledger
-    for change in changes:
-        ledger = ledger.replace(change.key, change.after)
-        path = claim_file.path_of(change.key)
-        proof.claims.pop(path, None)
-        if change.after is not None:
-            proof.claims[path] = change.after
-    for root in GENERATED_ROOTS:
-        for path, blob in trees.differences_below(repo, proof.tree, commit.tree, root):
-            proof.committed.pop(path, None)
-            if blob is not None:
-                proof.committed[path] = blob
-    proof.tree = commit.tree
-    proof.advance(replace(proof.state, ledger=ledger), changes, _parent(commit))
-
-
-def _generated_files(tree: Tree) -> Iterator[tuple[str, Oid]]:
-    for root in GENERATED_ROOTS:
-        entry = trees.child(tree, root)
-        if isinstance(entry, Tree):
-            yield from trees.files_below(entry, f"{root}/")
-        elif entry is not None:
-            yield root, entry.id
-
-
-def _text(commit: Commit, path: str) -> str:
-    return trees.read_text(commit.tree, path) or ""
+def _generated_files(tree: Tree) -> dict[str, Oid]:
+    return {path: blob.id for path, blob in trees.blobs(tree, GENERATED_ROOTS)}
 
 
 def _blob(text: str) -> Oid:

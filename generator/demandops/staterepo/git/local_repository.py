@@ -23,6 +23,8 @@ log = logging.getLogger("demandops")
 class LocalRepository(StateRepository):
     """A bare repository on this disk, written in place and fsynced."""
 
+    always_current = True
+
     def __init__(self, path: Path) -> None:
         self.address = str(path)
         try:
@@ -38,12 +40,6 @@ class LocalRepository(StateRepository):
                 f"{path} has no branch '{MAIN_BRANCH}'; make a state repo with "
                 "`demandops init DIR --bare`"
             )
-
-    def tip(self) -> Oid:
-        """Return the branch's commit, read each time because other processes may move it."""
-        target = self.objects.references[MAIN].target
-        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
-        return target
 
     def refresh(self) -> Oid:
         """Return the tip, which is always current."""
@@ -68,11 +64,6 @@ class LocalRepository(StateRepository):
             if time.time() - lock.stat().st_mtime > _STALE_LOCK_S:
                 log.warning("removing %s, which a killed process left behind", lock)
                 lock.unlink()
-
-    @property
-    def always_current(self) -> bool:
-        """Return true: there is no copy that could be out of date."""
-        return True
 
 
 def _refuse_checked_out(path: Path) -> None:

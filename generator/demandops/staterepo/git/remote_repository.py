@@ -51,6 +51,9 @@ log = logging.getLogger("demandops")
 class RemoteRepository(StateRepository):
     """A bare clone of a remote; git runs with the user's configuration."""
 
+    always_current = False
+    main_reference = _REMOTE_MAIN
+
     def __init__(self, url: str, folder: Path, notify: Notify, allow_offline: bool) -> None:
         self.address = without_secrets(url)
         self._url = url
@@ -94,24 +97,8 @@ class RemoteRepository(StateRepository):
         partial.rename(self._folder)
 
     def _fetch(self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False) -> None:
-        try:
-            # given here, not configured, so that a push that outlives its generator moves no ref
-            spec = f"+{MAIN}:{_REMOTE_MAIN}"
-            self._run_git(repo, "fetch", "--no-tags", "--quiet", "origin", spec, urgent=urgent)
-        except git.GitCommandError as error:
-            text = without_secrets(str(error.stderr))
-            if "couldn't find remote ref" in text:
-                raise StateRepoError(
-                    f"{self.address} has no branch '{MAIN_BRANCH}'; push one made by "
-                    "`demandops init DIR`"
-                ) from None
-            raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
-
-    def tip(self) -> Oid:
-        """Return the remote's commit at the last fetch or push."""
-        target = self.objects.references[_REMOTE_MAIN].target
-        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
-        return target
+        # given here, not configured, so that a push that outlives its generator moves no ref
+        self._read(repo, ("fetch", "--no-tags"), f"+{MAIN}:{_REMOTE_MAIN}", urgent=urgent)
 
     def refresh(self) -> Oid:
         """Fetch and return the remote's commit."""
@@ -148,11 +135,7 @@ class RemoteRepository(StateRepository):
         Raises:
             RemoteAway: the remote cannot be reached.
         """
-        try:
-            out, _ = self._run_git(self._git, "ls-remote", "--quiet", "origin", *patterns)
-        except git.GitCommandError as error:
-            text = without_secrets(str(error.stderr))
-            raise RemoteAway(f"{self.address} cannot be read: {_last_line(text)}") from None
+        out = self._read(self._git, ("ls-remote",), *patterns)
         pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
@@ -163,11 +146,7 @@ class RemoteRepository(StateRepository):
             RemoteAway: the remote cannot be reached.
         """
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
-        try:
-            self._run_git(self._git, "fetch", "--no-tags", "--quiet", "--prune", "origin", spec)
-        except git.GitCommandError as error:
-            text = without_secrets(str(error.stderr))
-            raise RemoteAway(f"{self.address} cannot be fetched: {_last_line(text)}") from None
+        self._read(self._git, ("fetch", "--no-tags", "--prune"), spec)
 
     def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
         """Push one reference and return git's output.
@@ -190,6 +169,32 @@ class RemoteRepository(StateRepository):
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
         """Return the error for a failed push: unreachable (try again) or denied."""
         return self._push_error(without_secrets(f"{error.stdout}\n{error.stderr}"))
+
+    def _read(
+        self,
+        repo: git.Repo,
+        command: Sequence[str],
+        *references: str,
+        urgent: Callable[[], bool] = lambda: False,
+    ) -> str:
+        """Return the output of a git command that reads from the remote.
+
+        Raises:
+            RemoteAway: the remote cannot be reached.
+            StateRepoError: it has no main branch.
+        """
+        command = (*command, "--quiet", "origin", *references)
+        try:
+            return self._run_git(repo, *command, urgent=urgent)[0]
+        except git.GitCommandError as error:
+            text = without_secrets(str(error.stderr))
+        if "couldn't find remote ref" in text:
+            raise StateRepoError(
+                f"{self.address} has no branch '{MAIN_BRANCH}'; push one made by "
+                "`demandops init DIR`"
+            )
+        failed = "read" if command[0] == "ls-remote" else "fetched"
+        raise RemoteAway(f"{self.address} cannot be {failed}: {_last_line(text)}")
 
     def _run_git(
         self, repo: git.Repo, *command: str, urgent: Callable[[], bool] = lambda: False
@@ -234,11 +239,6 @@ class RemoteRepository(StateRepository):
             return PushDenied(f"{self.address} rejects the push: {_last_line(text)}")
         reason = rejected[1] if rejected else _last_line(text)
         return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
-
-    @property
-    def always_current(self) -> bool:
-        """Return false: the remote may have moved since the last fetch."""
-        return False
 
 
 def _wait_for(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:

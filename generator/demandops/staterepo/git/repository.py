@@ -12,10 +12,11 @@ from contextlib import suppress
 
 import git
 import pygit2
-from pygit2 import Oid, Repository
+from pygit2 import Oid, Repository, Tree
 
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.signing import Signer
 
 MAIN = f"refs/heads/{MAIN_BRANCH}"
@@ -42,10 +43,19 @@ class StateRepository(ABC):
     address: str
     signer: Signer | None = None
     """Signs the commits made here; None: they are not signed."""
+    always_current: bool
+    """Whether :meth:`tip` is never out of date (a repository on this disk)."""
+    main_reference = MAIN
+    """The branch, or what was last fetched of it."""
 
-    @abstractmethod
     def tip(self) -> Oid:
-        """Return the newest published commit that is known here; does not ask the remote."""
+        """Return the newest published commit that is known here; does not ask the remote.
+
+        It is read each time because other processes may move it.
+        """
+        target = self.objects.references[self.main_reference].target
+        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
+        return target
 
     @abstractmethod
     def refresh(self) -> Oid:
@@ -89,22 +99,27 @@ class StateRepository(ABC):
 
         May be called from any thread.
         """
-        objects = Repository(self.objects.path)
-        one, two = (_under(objects, name, path) for name in (commit, other))
-        return one is not None and one == two
+        found = self._trees(commit, other)
+        if found is None:
+            return False
+        if path in ("", "."):
+            return found[0].id == found[1].id
+        return trees.entry(found[0], path) is not None and not trees.differ(*found, (path,))
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
         """Return the paths in which two commits differ; None if one is not known here.
 
         May be called from any thread.
         """
+        found = self._trees(since, commit)
+        return None if found is None else sorted(path for path, _ in trees.differences(*found))
+
+    def _trees(self, one: str, other: str) -> tuple[Tree, Tree] | None:
         objects = Repository(self.objects.path)
         try:
-            diff = objects.diff(objects[since].id, objects[commit].id)
-        except (pygit2.GitError, KeyError, ValueError):
+            return trees.commit_of(objects, one).tree, trees.commit_of(objects, other).tree
+        except StateRepoError:
             return None
-        ends = (end for delta in diff.deltas for end in (delta.old_file, delta.new_file))
-        return sorted({end.path for end in ends})
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End the running transfer with a remote, if any."""
@@ -113,20 +128,6 @@ class StateRepository(ABC):
         """Have git pack loose objects if there are many."""
         with suppress(git.GitCommandError), git.Repo(self.objects.path) as repo:
             _git(repo, "gc", "--auto", "--quiet")
-
-    @property
-    @abstractmethod
-    def always_current(self) -> bool:
-        """Whether :meth:`tip` is never out of date (a repository on this disk)."""
-
-
-def _under(objects: Repository, commit: str, path: str) -> Oid | None:
-    """Return the id of the file or folder at a path in a commit, or None."""
-    try:
-        tree = objects[commit].peel(pygit2.Tree)
-        return tree.id if path in ("", ".") else tree[path].id
-    except (pygit2.GitError, KeyError, ValueError):
-        return None
 
 
 def _git(repo: git.Repo, *command: str) -> None:

@@ -1,11 +1,11 @@
-"""Git trees: reading a commit's files, comparing trees, writing only the changed parts."""
+"""Git trees: looking up a path, reading files, comparing trees, writing only the changed parts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import pygit2
-from pygit2 import Commit, Oid, Repository, Tree
+from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
 from pygit2.enums import FileMode
 
 from demandops.errors import StateRepoError
@@ -30,97 +30,99 @@ def commit_of(repo: Repository, revision: str | Oid) -> Commit:
         ) from None
 
 
-def read_text(tree: Tree, path: str) -> str | None:
-    """Return the text of a file, or None. Invalid UTF-8 is replaced, so that it is visible."""
+def parent_tree(commit: Commit) -> Tree | None:
+    """Return the tree of a commit's first parent, or None."""
+    return commit.parents[0].tree if commit.parents else None
+
+
+def entry(tree: Tree | None, path: str) -> Object | None:
+    """Return the file or folder at a path, or None."""
     try:
-        entry = tree[path]
-    except KeyError:
-        return None
-    return entry.data.decode("utf-8", "replace") if isinstance(entry, pygit2.Blob) else None
-
-
-def blob_id(tree: Tree, path: str) -> Oid | None:
-    """Return the id of a file, or None."""
-    entry = child(tree, path)
-    return entry.id if isinstance(entry, pygit2.Blob) else None
-
-
-def entry_id(tree: Tree, name: str) -> Oid | None:
-    """Return the id of a file or folder, or None."""
-    entry = child(tree, name)
-    return entry.id if entry is not None else None
-
-
-def child(tree: Tree, name: str) -> pygit2.Object | None:
-    """Return the entry ``name`` of a tree, or None."""
-    try:
-        return tree[name]
+        return tree[path] if tree is not None else None
     except KeyError:
         return None
 
 
-def files_below(tree: Tree, prefix: str = "") -> Iterator[tuple[str, Oid]]:
-    """Yield (path, blob id) of every file below a tree, in Git's order."""
-    for entry in tree:
-        path = f"{prefix}{entry.name}"
-        if isinstance(entry, Tree):
-            yield from files_below(entry, f"{path}/")
-        elif isinstance(entry, pygit2.Blob):
-            yield path, entry.id
+def entry_id(tree: Tree | None, path: str) -> Oid | None:
+    """Return the id of the file or folder at a path, or None."""
+    found = entry(tree, path)
+    return found.id if found is not None else None
 
 
-def texts(tree: Tree, roots: tuple[str, ...]) -> dict[str, str]:
-    """Return path → text of every file below the top-level entries ``roots``."""
-    contents: dict[str, str] = {}
+def read_text(tree: Tree | None, path: str) -> str | None:
+    """Return the text of a file, or None."""
+    found = entry(tree, path)
+    return text_of(found) if isinstance(found, Blob) else None
+
+
+def text_of(blob: Object) -> str:
+    """Return the text of a file. Invalid UTF-8 is replaced, so that it is visible."""
+    return blob.data.decode("utf-8", "replace") if isinstance(blob, Blob) else ""
+
+
+def blobs(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Blob]]:
+    """Yield (path, file) of every file at or below the paths ``roots``, in Git's order."""
     for root in roots:
-        if root not in tree:
-            continue
-        entry = tree[root]
-        if isinstance(entry, Tree):
-            for path, _ in files_below(entry, f"{root}/"):
-                contents[path] = read_text(tree, path) or ""
-        elif isinstance(entry, pygit2.Blob):
-            contents[root] = entry.data.decode("utf-8", "replace")
-    return contents
+        found = entry(tree, root)
+        if isinstance(found, Tree):
+            yield from _blobs_below(found, f"{root}/")
+        elif isinstance(found, Blob):
+            yield root, found
+
+
+def _blobs_below(tree: Tree, prefix: str) -> Iterator[tuple[str, Blob]]:
+    for found in tree:
+        path = f"{prefix}{found.name}"
+        if isinstance(found, Tree):
+            yield from _blobs_below(found, f"{path}/")
+        elif isinstance(found, Blob):
+            yield path, found
+
+
+def texts(tree: Tree, roots: Iterable[str]) -> dict[str, str]:
+    """Return path → text of every file at or below the paths ``roots``."""
+    return {path: text_of(blob) for path, blob in blobs(tree, roots)}
+
+
+def differ(one: Tree | None, other: Tree | None, paths: Iterable[str]) -> bool:
+    """Return whether any of the files or folders ``paths`` differs."""
+    return any(entry_id(one, path) != entry_id(other, path) for path in paths)
 
 
 def differences(
-    repo: Repository, before: Tree | None, after: Tree | None, prefix: str
+    before: Tree | None, after: Tree | None, roots: Iterable[str] = ()
 ) -> Iterator[tuple[str, Oid | None]]:
-    """Yield (path, new blob id or None) of each file that differs; skip equal subtrees."""
-    if before is not None and after is not None and before.id == after.id:
-        return
-    old = {str(entry.name): entry for entry in before} if before is not None else {}
-    new = {str(entry.name): entry for entry in after} if after is not None else {}
+    """Yield (path, new blob id or None) of each file that differs; skip equal subtrees.
+
+    Compares what is at or below the paths ``roots``, by default everything.
+    """
+    if not roots:
+        yield from _differences_below(before, after, "")
+    for root in roots:
+        yield from _differences_at(entry(before, root), entry(after, root), root)
+
+
+def _differences_below(
+    before: Tree | None, after: Tree | None, prefix: str
+) -> Iterator[tuple[str, Oid | None]]:
+    old = {str(found.name): found for found in before or ()}
+    new = {str(found.name): found for found in after or ()}
     for name in sorted({*old, *new}):
-        left, right = old.get(name), new.get(name)
-        if left is not None and right is not None and left.id == right.id:
-            continue
-        path = f"{prefix}{name}"
-        if isinstance(left, Tree) or isinstance(right, Tree):
-            yield from differences(
-                repo,
-                left if isinstance(left, Tree) else None,
-                right if isinstance(right, Tree) else None,
-                f"{path}/",
-            )
-        if isinstance(right, pygit2.Blob):
-            yield path, right.id
-        elif isinstance(left, pygit2.Blob):
-            yield path, None
+        yield from _differences_at(old.get(name), new.get(name), f"{prefix}{name}")
 
 
-def differences_below(
-    repo: Repository, before: Tree, after: Tree, root: str
+def _differences_at(
+    old: Object | None, new: Object | None, path: str
 ) -> Iterator[tuple[str, Oid | None]]:
-    """Yield (path, new blob id or None) of each file that differs at or below a top-level entry."""
-    old, new = child(before, root), child(after, root)
-    if isinstance(new, pygit2.Blob) and (old is None or old.id != new.id):
-        yield root, new.id
-    elif isinstance(old, pygit2.Blob) and not isinstance(new, pygit2.Blob):
-        yield root, None
-    sides = [entry if isinstance(entry, Tree) else None for entry in (old, new)]
-    yield from differences(repo, sides[0], sides[1], f"{root}/")
+    if old is not None and new is not None and old.id == new.id:
+        return
+    if isinstance(old, Tree) or isinstance(new, Tree):
+        before, after = (found if isinstance(found, Tree) else None for found in (old, new))
+        yield from _differences_below(before, after, f"{path}/")
+    if isinstance(new, Blob):
+        yield path, new.id
+    elif isinstance(old, Blob):
+        yield path, None
 
 
 def is_readme(path: str) -> bool:

@@ -7,22 +7,21 @@ A commit is by a person if no generator made it, on any machine.
 from __future__ import annotations
 
 import getpass
+import os
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
-from datetime import datetime, timezone
+from collections.abc import Iterable, Sequence
+from datetime import datetime
+from typing import NamedTuple
 
 import git
 import pygit2
-from pygit2 import Commit, Oid, Repository, Tree
-from pygit2 import Config as GitConfig
-from pygit2.enums import SortMode
+from pygit2 import Commit, Oid, Repository
 
 from demandops.config.config import CONFIG_ROOTS
 from demandops.ledger.claim_file import LEDGER_ROOT
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history import commit_message
+from demandops.staterepo.history import commit_log, commit_message
 
 _ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _MOST_NAMED = 20
@@ -31,87 +30,64 @@ _UNFIT = re.compile(r"[<>\x00-\x1f\x7f]")
 _EMAIL = re.compile(r"[^\s<>\x00-\x1f\x7f]+")
 
 
-@dataclass(frozen=True, slots=True)
-class PersonCommit:
-    """A commit by a person: its id, author and time."""
+class Person(NamedTuple):
+    """Name and e-mail address of a person; as text ``name <email>``, as git shows it."""
 
-    commit: str
     name: str
     email: str
-    time: datetime
 
-    @property
-    def who(self) -> str:
-        """Return ``name <email>``, as git shows it."""
+    def __str__(self) -> str:
+        """Return ``name <email>``."""
         return f"{self.name} <{self.email}>"
 
 
-def person_commits_since(repo: Repository, known: Oid, to: Oid) -> tuple[PersonCommit, ...]:
+def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
     """Return the commits by people up to ``to`` that ``known`` does not include, newest first.
 
     Leaves out commits that change nothing the generator reads (a README).
     """
-    return tuple(
-        person_commit_of(commit)
-        for commit in _person_commits(repo, known, to)
-        if _touches(commit, _ROOTS)
-    )
+    commits = commit_log.person_commits(repo, to, known)
+    return [commit for commit in commits if _touches(commit, _ROOTS)]
 
 
 class FaultOrigins:
     """Finds the commit by a person since ``known`` that last changed a path."""
 
     def __init__(self, repo: Repository, known: Oid, to: Oid) -> None:
-        self._range = (repo, known, to)
+        self._range = (repo, to, known)
         self._commits: list[Commit] | None = None
 
     def __call__(self, path: str) -> tuple[str, str] | None:
         """Return commit and author of the last change to ``path``, else of any change."""
         if self._commits is None:  # read late: most reports exist already and need no commits
-            self._commits = list(_person_commits(*self._range))
+            self._commits = list(commit_log.person_commits(*self._range))
         for paths in ((path,) if path else (), _ROOTS):
             for commit in self._commits:
                 if _touches(commit, paths):
-                    found = person_commit_of(commit)
-                    return found.commit, found.who
+                    return str(commit.id), str(author_of(commit))
         return None
 
 
-def _person_commits(repo: Repository, known: Oid, to: Oid) -> Iterable[Commit]:
-    walker = repo.walk(to, SortMode.TOPOLOGICAL)
-    walker.hide(known)
-    return (commit for commit in walker if not commit_message.is_by_generator(commit.message))
-
-
 def _touches(commit: Commit, paths: Iterable[str]) -> bool:
-    parent = commit.parents[0].tree if commit.parents else None
-    return any(_entry_id(parent, path) != _entry_id(commit.tree, path) for path in paths)
+    return trees.differ(trees.parent_tree(commit), commit.tree, paths)
 
 
-def _entry_id(tree: Tree | None, path: str) -> Oid | None:
-    entry = trees.child(tree, path) if tree is not None else None
-    return entry.id if entry is not None else None
-
-
-def person_commit_of(commit: Commit) -> PersonCommit:
-    """Return a commit and its author, without characters that trailers and signatures forbid."""
+def author_of(commit: Commit) -> Person:
+    """Return the author of a commit, without characters that trailers and signatures forbid."""
     name = _UNFIT.sub("", commit.author.name).strip(" .,:;\"'\\") or "unnamed"
     email = commit.author.email if _EMAIL.fullmatch(commit.author.email or "") else ""
-    time = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
-    return PersonCommit(
-        str(commit.id), name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL, time
-    )
+    return Person(name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL)
 
 
-def caused_by_trailers(causes: tuple[PersonCommit, ...]) -> list[tuple[str, str]]:
+def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
     """Return ``Caused-By: <commit> <name> <email>`` for each commit, oldest first.
 
     Only the newest are named if there are many; the trailer ``Since`` bounds the others.
     """
-    return [("Caused-By", f"{one.commit} {one.who}") for one in reversed(causes[:_MOST_NAMED])]
+    return [("Caused-By", f"{one.id} {author_of(one)}") for one in reversed(causes[:_MOST_NAMED])]
 
 
-def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Signature:
+def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
     """Return the author of a follow commit: the people whose commits it renders.
 
     One person keeps name and address, so that ``git log --author`` finds both commits. Several
@@ -119,38 +95,29 @@ def follow_author(causes: tuple[PersonCommit, ...], now: datetime) -> pygit2.Sig
     """
     if not causes:
         return commit_message.generator_signature(now)
-    people = list(dict.fromkeys((cause.name, cause.email) for cause in reversed(causes)))
-    name = ", ".join(dict.fromkeys(name for name, _ in people))
+    people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))
+    name = ", ".join(dict.fromkeys(one.name for one in people))
     if len(name) > _MOST_AUTHOR:
         name = name[: _MOST_AUTHOR - 1].rstrip(" ,") + "…"
-    email = people[0][1] if len(people) == 1 else commit_message.GENERATOR_EMAIL
-    return pygit2.Signature(name, email, int(causes[0].time.timestamp()), 0)
+    email = people[0].email if len(people) == 1 else commit_message.GENERATOR_EMAIL
+    return pygit2.Signature(name, email, causes[0].commit_time, 0)
 
 
-def operator() -> str:
-    """Return ``name <email>`` of the person who runs this program; empty if git does not know."""
-    try:
-        ident = git.Git().execute(
-            ["git", "-c", "user.useConfigOnly=true", "var", "GIT_AUTHOR_IDENT"]
-        )
-    except git.GitCommandError:
-        return ""
-    return str(ident).rsplit("> ", 1)[0] + ">"
+def operator(folder: str | None = None) -> Person:
+    """Return the person who runs this program, from git or else the login.
 
-
-def git_user(repo: Repository) -> tuple[str, str]:
-    """Return the name and e-mail address of this program's user, from git or else the login."""
-    settings = repo.config.snapshot()
+    Args:
+        folder: a repository whose configuration counts too; by default that of this directory.
+    """
     try:
         login = getpass.getuser()
     except (KeyError, OSError):  # a container's user has no passwd entry
         login = "unknown"
-    name = _setting(settings, "user.name") or login
-    return name, _setting(settings, "user.email") or f"{login}@demandops.invalid"
 
+    def known(variable: str, key: str) -> str:
+        setting = git.Git(folder).config("--get", key, with_exceptions=False)
+        return os.environ.get(variable) or str(setting)
 
-def _setting(settings: GitConfig, key: str) -> str:
-    try:
-        return settings[key] or ""
-    except KeyError:
-        return ""
+    name = known("GIT_AUTHOR_NAME", "user.name") or login
+    email = known("GIT_AUTHOR_EMAIL", "user.email") or f"{login}@demandops.invalid"
+    return Person(name, email)

@@ -15,7 +15,9 @@ from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
 from demandops.staterepo.git.tree import commit_of
-from demandops.staterepo.history.commit_message import PROPOSAL
+
+PROPOSAL = "Proposal"
+"""The trailer of a commit that needs approval: the branch that it was proposed on."""
 
 _WHY = "Why: "
 
@@ -37,7 +39,11 @@ class LogEntry:
 
     @property
     def by_generator(self) -> bool:
-        """Whether the generator made the commit, so that its files match its ledger."""
+        """Whether the generator made the commit, so that its files match its ledger.
+
+        A proposal does not count: a person merges it, maybe onto other changes, so it is read
+        again.
+        """
         return "Render-Version" in self.trailers and PROPOSAL not in self.trailers
 
 
@@ -73,13 +79,35 @@ def _why(message: str) -> str:
     return next(lines, "").removeprefix(_WHY)
 
 
-def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> Iterator[LogEntry]:
+def commits(
+    repo: Repository, tip: str | Oid, until: str | Oid | None = None
+) -> Iterator[tuple[Commit, LogEntry]]:
     """Yield the commits that ``tip`` includes and ``until`` does not, newest first."""
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
     if until is not None:
         walker.hide(commit_of(repo, until).id)
-    for commit in walker:
-        yield entry_of(commit)
+    return ((commit, entry_of(commit)) for commit in walker)
+
+
+def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> Iterator[LogEntry]:
+    """Yield the log entries of :func:`commits`."""
+    return (entry for _, entry in commits(repo, tip, until))
+
+
+def person_commits(
+    repo: Repository, tip: str | Oid, until: str | Oid | None = None
+) -> Iterator[Commit]:
+    """Yield those of :func:`commits` that no generator made, on any machine."""
+    return (commit for commit, entry in commits(repo, tip, until) if not entry.by_generator)
+
+
+def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
+    """Yield a commit, its first parent, that one's first parent and so on."""
+    commit = commit_of(repo, tip)
+    yield commit
+    while commit.parents:
+        commit = commit.parents[0]
+        yield commit
 
 
 _OUTCOMES: dict[str, Literal["changed", "unchanged", "refused"]] = {
@@ -119,9 +147,5 @@ def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Recorde
 
 def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
     """Return the newest commit of the generator along the first parents, or None."""
-    commit: Commit | None = commit_of(repo, tip)
-    while commit is not None:
-        if entry_of(commit).by_generator:
-            return commit.id
-        commit = commit.parents[0] if commit.parents else None
-    return None
+    entries = (entry_of(commit) for commit in first_parents(repo, tip))
+    return next((Oid(hex=entry.commit) for entry in entries if entry.by_generator), None)

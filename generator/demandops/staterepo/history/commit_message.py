@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from datetime import datetime, timezone
+from datetime import datetime
 
 import pygit2
 
@@ -22,31 +22,36 @@ from demandops.ledger import claim_file
 from demandops.ledger.operations.restoration import Restoration
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.settings import RENDER_VERSION
+from demandops.staterepo.history import revisions
 from demandops.subject import SubjectKind
 
 GENERATOR_NAME = "DemandOps generator"
 GENERATOR_EMAIL = "generator@demandops.invalid"
 
-PROPOSAL = "Proposal"
-"""The trailer of a commit that needs approval: the branch that it was proposed on."""
-
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
 _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+_UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 
 
-def is_by_generator(message: str) -> bool:
-    """Return whether a commit is the generator's, so that its files match its ledger.
-
-    A proposal does not count: a person merges it, maybe onto other changes, so it is read again.
-    """
-    return "\nRender-Version: " in message and f"\n{PROPOSAL}: " not in message
+def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
+    """Return a person and a time, without what Git does not accept in them."""
+    email = _UNFIT.sub("", email) or GENERATOR_EMAIL
+    return pygit2.Signature(_name(name), email, int(time.timestamp()), 0)
 
 
 def generator_signature(time: datetime) -> pygit2.Signature:
     """Return the committer of the generator's commits."""
-    return pygit2.Signature(GENERATOR_NAME, GENERATOR_EMAIL, int(time.timestamp()), 0)
+    return signature(GENERATOR_NAME, GENERATOR_EMAIL, time)
+
+
+def compose(paragraphs: Iterable[Iterable[str]], trailers: Iterable[tuple[str, str]]) -> str:
+    """Return a message of paragraphs, each a list of lines, and trailers; leave out empty ones."""
+    lines = [f"{key}: {value}" for key, value in trailers if value]
+    texts = ["\n".join(paragraph) for paragraph in (*paragraphs, lines)]
+    return "\n\n".join(text for text in texts if text) + "\n"
 
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
@@ -56,30 +61,20 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
     """
     request = decision.request
     if isinstance(request, Restoration):
-        email = re.sub(r"[<>\s]", "", request.email) or GENERATOR_EMAIL
-        return pygit2.Signature(_name(request.by), email, int(received.timestamp()), 0)
+        return signature(request.by, request.email, received)
     if isinstance(request, Decommission):
-        return _operator(request.by, received)
+        name, _, email = request.by.removesuffix(">").rpartition(" <")
+        return signature(name, email, received) if name else generator_signature(received)
     names = ", ".join(_requesters(decision))
     demand = decision.changes.claims[0].key.demand
     local = demand if _LOCAL_PART.fullmatch(demand) else claim_file.segment(demand)
-    email = f"{local}@demandops.invalid"
-    return pygit2.Signature(_name(names), email, int(received.timestamp()), 0)
+    return signature(names, f"{local}@demandops.invalid", received)
 
 
 def _name(names: str) -> str:
-    """Return a name that git accepts: no angle brackets, no punctuation at its ends."""
-    plain = _clipped(names.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
-    return plain.strip(" .,:;\"'\\") or "unnamed"
-
-
-def _operator(by: str, received: datetime) -> pygit2.Signature:
-    """Return the person who ran a command, or the generator if that is not known."""
-    name, _, email = by.removesuffix(">").rpartition(" <")
-    try:
-        return pygit2.Signature(name, email, int(received.timestamp()), 0)
-    except (ValueError, pygit2.GitError):
-        return generator_signature(received)
+    """Return a name without angle brackets, control characters and punctuation at its ends."""
+    plain = _CONTROL.sub("", names.replace("<", "(").replace(">", ")"))
+    return _clipped(plain, _MAX_AUTHOR).strip(" .,:;\"'\\") or "unnamed"
 
 
 def of_decision(
@@ -88,16 +83,13 @@ def of_decision(
     """Return the message of a demand's commit; ``settled`` are trailers of demands before it."""
     request = decision.request
     subjects = decision.changes.subjects()
-    body = [_clipped(_title(decision), _MAX_SUBJECT), "", _why(decision, received), ""]
-    body += _desired_state(decision.releases)
-    if decision.changes.not_held:
-        body += [
-            "",
-            "Listed, but not held by the requester:",
-            *(f"  {item}" for item in decision.changes.not_held),
-        ]
-    if decision.warnings:
-        body += ["", "Warnings:", *(f"  {warning}" for warning in decision.warnings)]
+    paragraphs = [
+        [_clipped(_title(decision), _MAX_SUBJECT)],
+        [_why(decision, received)],
+        _desired_state(decision.releases),
+        _list("Listed, but not held by the requester:", decision.changes.not_held),
+        _list("Warnings:", decision.warnings),
+    ]
     claims = decision.changes.claims
     trailers = [
         ("Operation", request.operation),
@@ -113,7 +105,13 @@ def of_decision(
         *_overrides(decision),
         ("Render-Version", str(RENDER_VERSION)),
     ]
-    return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
+    return compose(paragraphs, trailers)
+
+
+def _list(head: str, items: Iterable[object]) -> list[str]:
+    """Return a paragraph with a line for each item; nothing if there are none."""
+    lines = [f"  {item}" for item in items]
+    return [head, *lines] if lines else []
 
 
 _VERBS = {
@@ -159,25 +157,20 @@ def _title(decision: Decision) -> str:
 
 def _why(decision: Decision, received: datetime) -> str:
     request = decision.request
-    time = received.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
-    who = ", ".join(_requesters(decision))
-    what = _counted(decision)
+    who, what = ", ".join(_requesters(decision)), _counted(decision)
     if isinstance(request, Restoration):
         return (
             f"Why: {request.by} rolled the ledger back to commit {request.to[:12]}, which changes "
             f"{what}: {request.reason}"
         )
     if isinstance(request, Expire):
-        ends = [
-            c.before.lease.expires_at
-            for c in decision.changes.claims
-            if c.before and c.before.lease
-        ]
-        last = max(ends).astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
+        befores = [change.before for change in decision.changes.claims]
+        last = max(one.lease.expires_at for one in befores if one and one.lease)
         return (
             f"Why: the lease of demand '{request.demand}' on {what} in the name of {who} ended "
-            f"at {last} and was not renewed."
+            f"at {revisions.format_time(last)} and was not renewed."
         )
+    time = revisions.format_time(received)
     if isinstance(request, Decommission):
         by = f" by {request.by}" if request.by else ""
         return (
@@ -223,10 +216,12 @@ def of_follow(
     title = _follow_title(releases, cause)
     if not releases and reports:
         title = "Report invalid files" if problems else "Report that all files are valid"
-    body = [title, "", why]
-    body += ["", *_desired_state(releases)] if releases else []
-    if problems:
-        body += ["", "Not applied, because not valid:", *(f"  {problem}" for problem in problems)]
+    paragraphs = [
+        [title],
+        [why],
+        _desired_state(releases) if releases else [],
+        _list("Not applied, because not valid:", problems),
+    ]
     trailers = [
         ("Operation", "follow"),
         ("Follows", cause),
@@ -234,7 +229,7 @@ def of_follow(
         *more,
         ("Render-Version", str(RENDER_VERSION)),
     ]
-    return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
+    return compose(paragraphs, trailers)
 
 
 def _follow_title(releases: tuple[ReleaseChange, ...], cause: str) -> str:
@@ -255,13 +250,14 @@ def of_override_end(
 
     ``kept`` are the claims that changed with it and that ``keep`` overrides add.
     """
-    body = [
-        f"End override {override.name}",
-        "",
+    why = (
         f"Why: {override.path} by {override.owner} ({override.reason}) expired at "
-        f"{format_time(override.end) if override.end else ''}.",
-        "",
-        *(_desired_state(releases) if releases else ["Desired state: unchanged."]),
+        f"{format_time(override.end) if override.end else ''}."
+    )
+    paragraphs = [
+        [f"End override {override.name}"],
+        [why],
+        _desired_state(releases) if releases else ["Desired state: unchanged."],
     ]
     trailers = [
         ("Operation", "expire-override"),
@@ -269,7 +265,7 @@ def of_override_end(
         *more,
         ("Render-Version", str(RENDER_VERSION)),
     ]
-    return "\n".join([*body, "", *_trailers(trailers)]) + "\n"
+    return compose(paragraphs, trailers)
 
 
 def override_trailers(paths: Iterable[str]) -> list[tuple[str, str]]:
@@ -287,10 +283,6 @@ def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
     """Return the files of the ``keep`` overrides that add these claims."""
     demands = (key.demand for key in keys if key.demand.startswith(OVERRIDE_PREFIX))
     return [f"{OVERRIDES_ROOT}/{demand.removeprefix(OVERRIDE_PREFIX)}.yaml" for demand in demands]
-
-
-def _trailers(pairs: Iterable[tuple[str, str]]) -> list[str]:
-    return [f"{key}: {value}" for key, value in pairs if value]
 
 
 def _counted(decision: Decision) -> str:

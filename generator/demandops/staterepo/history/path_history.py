@@ -1,24 +1,20 @@
 """The history of one path: which commits added, changed and removed it.
 
-Like ``git log -- <path>``. Compares tree entries by their ids, so it reads no file.
+``git log -- <path>`` finds them.
 """
 
 from __future__ import annotations
 
-import heapq
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import count
 
 import git
-from pygit2 import Commit, Oid, Repository, Tree
+from pygit2 import Oid, Repository
 
-from demandops import naming
-from demandops.errors import InvalidInput
-from demandops.ledger import claim_file
 from demandops.render.gitops.paths import CLUSTERS_ROOT
-from demandops.staterepo.git.tree import child, commit_of, differences_below, files_below, read_text
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history.commit_log import LogEntry, entry_of
 
 _NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
@@ -47,28 +43,14 @@ class PathHistory:
     stopped: LogEntry | None
 
 
-def changes_to(repo: Repository, tip: str | Oid, path: str) -> Iterator[PathChange]:
-    """Yield the commits that changed a file or folder, newest first.
-
-    At a merge it follows the parent that has the same file, like Git.
-    """
-    start = commit_of(repo, tip)
-    order = count()  # so that no two entries of the heap are equal
-    waiting = [(-start.commit_time, next(order), start, _entry(start, path))]
-    seen = {start.id}
-    while waiting:
-        _, _, commit, current = heapq.heappop(waiting)
-        parents = [(parent, _entry(parent, path)) for parent in commit.parents]
-        same = next((pair for pair in parents if pair[1] == current), None)
-        if same is not None:
-            parents = [same]
-        elif current is not None or parents:
-            before = any(entry is not None for _, entry in parents)
-            yield PathChange(entry_of(commit), before, current is not None)
-        for parent, entry in parents:
-            if parent.id not in seen:
-                seen.add(parent.id)
-                heapq.heappush(waiting, (-parent.commit_time, next(order), parent, entry))
+def changes_to(
+    repo: Repository, tip: str | Oid, path: str, until: str | None = None
+) -> Iterator[PathChange]:
+    """Yield the commits after ``until`` that changed a file or folder, newest first, like Git."""
+    for revision in _git_log(repo, tip, until, "--format=%H", f":(literal){path}"):
+        commit = commit_of(repo, revision)
+        before = any(trees.entry(parent.tree, path) is not None for parent in commit.parents)
+        yield PathChange(entry_of(commit), before, trees.entry(commit.tree, path) is not None)
 
 
 def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHistory:
@@ -104,53 +86,20 @@ def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
 
 def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[str]:
     """Return the paths of releases that commits removed, newest first."""
-    commit = str(commit_of(repo, tip).id)
+    options = ("--diff-filter=D", "--no-renames", *more, "--format=", "--name-only")
+    return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
+
+
+def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -> list[str]:
+    """Return what ``git log`` prints about a path, which is the last of ``query``."""
+    *options, path = query
+    commits = [str(commit_of(repo, tip).id), *([f"^{until}"] if until else [])]
     with git.Repo(repo.path) as opened:
-        output = opened.git.log(
-            *("--no-show-signature", "--diff-filter=D", "--no-renames", *more),
-            *("--format=", "--name-only", "-z", commit),
-            *("--", f":(glob){CLUSTERS_ROOT}/*/*/*/{file}"),
-        )
-    return [path for path in output.split("\0") if path]
+        output = opened.git.log("--no-show-signature", "-z", *options, *commits, "--", path)
+    return [found for found in output.split("\0") if found]
 
 
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
     """Return the path of the release of a name in a commit, or None."""
-    clusters = child(commit_of(repo, tip).tree, CLUSTERS_ROOT)
-    files = files_below(clusters, f"{CLUSTERS_ROOT}/") if isinstance(clusters, Tree) else ()
+    files = trees.blobs(commit_of(repo, tip).tree, (CLUSTERS_ROOT,))
     return next((path for path, _ in files if path.endswith(f"/{name}.yaml")), None)
-
-
-def changes_node(repo: Repository, revision: str | Oid, node: str) -> bool:
-    """Return whether a commit changed what runs on a node, or a claim that names it."""
-    commit = commit_of(repo, revision)
-    if not commit.parents:
-        return False
-    before, after = commit.parents[0].tree, commit.tree
-    folder = naming.object_name("", node)
-    for path, _ in differences_below(repo, before, after, CLUSTERS_ROOT):
-        parts = path.split("/")
-        if len(parts) == 5 and parts[3] == folder:
-            return True
-    changed = differences_below(repo, before, after, claim_file.LEDGER_ROOT)
-    return any(
-        _names(read_text(tree, path), path, node) for path, _ in changed for tree in (before, after)
-    )
-
-
-def _names(text: str | None, path: str, node: str) -> bool:
-    """Return whether a claim's file names a node."""
-    if text is None or claim_file.kind_of(path) is None:
-        return False
-    try:
-        claim = claim_file.read(text, path)
-    except InvalidInput:
-        return False
-    return claim.held.needs(node)
-
-
-def _entry(commit: Commit, path: str) -> Oid | None:
-    try:
-        return commit.tree[path].id
-    except KeyError:
-        return None

@@ -7,14 +7,16 @@ without a zone is UTC, like all times that the program prints.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 
 import pygit2
-from pygit2 import Commit, Oid, Repository
+from pygit2 import Commit, Object, Oid, Reference, Repository
 
 from demandops.config.policy import seconds_of
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.history import commit_log
 
 TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
 """Examples of the times that :func:`parse_time` accepts."""
@@ -72,13 +74,13 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     Raises:
         StateRepoError: it is neither, or a time before the first commit.
     """
-    named = _reference(repo, text)
+    named = _found(repo.lookup_reference_dwim, text)
     if named is not None:
         return named
     at = parse_time(text, now, end=True)
     if at is not None:
         return commit_at_time(repo, tip, at)
-    found = _revision(repo, _MAIN.sub(str(tip), text))
+    found = _found(repo.revparse_single, _MAIN.sub(str(tip), text))
     if found is None:
         raise StateRepoError(
             f"'{text}' is neither a commit of the state repo nor a time; `demandops log` lists the "
@@ -93,17 +95,15 @@ def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
     Raises:
         StateRepoError: there was no commit yet.
     """
-    commit = repo[tip].peel(Commit)
     latest = int(at.timestamp())
-    while commit.commit_time > latest:
-        if not commit.parents:
-            first = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
-            raise StateRepoError(
-                f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
-                f"{format_time(first)}"
-            )
-        commit = commit.parents[0]
-    return commit
+    for commit in commit_log.first_parents(repo, tip):
+        if commit.commit_time <= latest:
+            return commit
+    first = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
+    raise StateRepoError(
+        f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
+        f"{format_time(first)}"
+    )
 
 
 def format_time(at: datetime) -> str:
@@ -111,15 +111,8 @@ def format_time(at: datetime) -> str:
     return at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def _reference(repo: Repository, text: str) -> Commit | None:
+def _found(find: Callable[[str], Reference | Object], text: str) -> Commit | None:
     try:
-        return repo.lookup_reference_dwim(text).peel(Commit)
-    except (KeyError, ValueError, pygit2.GitError):
-        return None
-
-
-def _revision(repo: Repository, text: str) -> Commit | None:
-    try:
-        return repo.revparse_single(text).peel(Commit)
+        return find(text).peel(Commit)
     except (KeyError, ValueError, pygit2.GitError):
         return None

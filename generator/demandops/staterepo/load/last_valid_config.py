@@ -7,11 +7,10 @@ definition. All other changes apply. If the result is not valid either, no chang
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from pygit2 import Blob, Commit, Oid, Repository, Tree
-from pygit2.enums import SortMode
+from pygit2 import Oid, Repository, Tree
 
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS, Config
@@ -21,6 +20,7 @@ from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import ended_override_file
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history import commit_log
 
 NO_STATE_REPO = (
     "this is not a state repo, because it has no demandops.yaml; `demandops init DIR` makes one"
@@ -37,18 +37,20 @@ class ConfigSource:
     commit: Oid
     replacements: Replacements = field(default_factory=dict)
 
-    def blobs(self, repo: Repository) -> dict[str, Oid]:
+    def files(self, repo: Repository) -> dict[str, Oid]:
         """Return path → blob of every file in effect."""
-        blobs = dict(_blobs(repo, self.commit))
-        for path, blob in self.replacements.items():
-            blobs.pop(path, None)
-            if blob is not None:
-                blobs[path] = blob
-        return blobs
+        tree = trees.commit_of(repo, self.commit).tree
+        files = {path: blob.id for path, blob in trees.blobs(tree, CONFIG_ROOTS)}
+        return _replaced(files, self.replacements)
 
     def texts(self, repo: Repository) -> dict[str, str]:
         """Return path → text of every file in effect."""
-        return {path: _text(repo, blob) for path, blob in self.blobs(repo).items()}
+        return {path: trees.text_of(repo[blob]) for path, blob in self.files(repo).items()}
+
+
+def _replaced(files: Mapping[str, Oid], replacements: Replacements) -> dict[str, Oid]:
+    wanted = {**files, **replacements}
+    return {path: blob for path, blob in wanted.items() if blob is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +72,17 @@ def config_at(tree: Tree) -> Config:
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
-    return load_config(files).with_ended_overrides(ended_override_file.read(end_markers_at(tree)))
+    return load_config(files).with_ended_overrides(ended_overrides_at(tree))
 
 
 def end_markers_at(tree: Tree) -> dict[str, str]:
     """Return path → text of the markers of ended overrides."""
     return trees.texts(tree, (ended_override_file.MARKERS_ROOT,))
+
+
+def ended_overrides_at(tree: Tree) -> dict[str, str]:
+    """Return override → the time at which it ended."""
+    return ended_override_file.read(end_markers_at(tree))
 
 
 def refuse_other_render_version(tree: Tree) -> None:
@@ -100,33 +107,10 @@ def refuse_other_render_version(tree: Tree) -> None:
     )
 
 
-def newest_valid_config(commit: Commit, fault: InvalidInput) -> Config:
-    """Return the configuration of the newest ancestor where it was valid.
-
-    Raises:
-        InvalidInput: ``fault``, if there is no such ancestor.
-    """
-    seen = {_config_ids(commit.tree)}
-    while commit.parents:
-        commit = commit.parents[0]
-        if _config_ids(commit.tree) in seen:
-            continue
-        seen.add(_config_ids(commit.tree))
-        try:
-            return config_at(commit.tree)
-        except (InvalidInput, StateRepoError):
-            continue
-    raise fault
-
-
-def _config_ids(tree: Tree) -> tuple[str, ...]:
-    return tuple(str(trees.entry_id(tree, root)) for root in CONFIG_ROOTS)
-
-
 def load_last_valid_config(
     repo: Repository,
     before: ConfigSource,
-    last_valid_commit: Oid | None,
+    last_valid_commit: Oid,
     to: Oid,
     load: Callable[[Mapping[str, str]], Config],
 ) -> LastValidConfig:
@@ -138,38 +122,37 @@ def load_last_valid_config(
         to: the commit.
         load: makes a configuration from texts, or raises ``InvalidInput``.
     """
-    known = before.blobs(repo)
-    blobs = dict(_blobs(repo, to))
-    merged = {path for path in {*known, *blobs} if known.get(path) != blobs.get(path)}
-    replacements: dict[str, Oid | None] = {}
-    faults: list[Fault] = []
+    known, source = before.files(repo), ConfigSource(to)
+    files = source.files(repo)
+    merged = {path for path in {*known, *files} if known.get(path) != files.get(path)}
+    faults: dict[Fault, None] = {}
     while True:
         try:
-            config = load({path: _text(repo, blob) for path, blob in blobs.items()})
+            config = load(source.texts(repo))
         except InvalidInput as error:
-            faults += error.faults
-            broken = {one.file for one in error.faults} & (merged - set(replacements))
+            faults |= dict.fromkeys(error.faults)
+            broken = {one.file for one in error.faults} & merged - set(source.replacements)
             if not broken:
-                return LastValidConfig(None, before, tuple(dict.fromkeys(faults)))
-            for path in merged & _with_files_merged_together(repo, broken, last_valid_commit, to):
-                replacements[path] = known.get(path)
-                blobs.pop(path, None)
-                if path in known:
-                    blobs[path] = known[path]
+                return LastValidConfig(None, before, tuple(faults))
+            together = merged & _with_files_merged_together(repo, broken, last_valid_commit, to)
+            more = {path: known.get(path) for path in together}
+            source = ConfigSource(to, {**source.replacements, **more})
         else:
-            return LastValidConfig(
-                config, ConfigSource(to, replacements), tuple(dict.fromkeys(faults))
-            )
+            return LastValidConfig(config, source, tuple(faults))
 
 
 def _with_files_merged_together(
-    repo: Repository, broken: Iterable[str], last_valid_commit: Oid | None, to: Oid
+    repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
     """Return files and those merged in the same commits or of the same definition."""
     together = set(broken)
-    merges = list(_merges(repo, last_valid_commit, to))
+    merges = [
+        {path for path, _ in trees.differences(commit.parents[0].tree, commit.tree, CONFIG_ROOTS)}
+        for commit, _ in commit_log.commits(repo, to, last_valid_commit)
+        if commit.parents  # a merge changes all files of its branch
+    ]
     known = {
-        path for commit in (to, last_valid_commit) if commit for path, _ in _blobs(repo, commit)
+        path for commit in (to, last_valid_commit) for path in ConfigSource(commit).files(repo)
     }
     size = 0
     while size != len(together):
@@ -182,33 +165,3 @@ def _with_files_merged_together(
         )
         together |= {path for path in known if path.startswith(folders)} if folders else set()
     return together
-
-
-def _merges(repo: Repository, last_valid_commit: Oid | None, to: Oid) -> Iterator[set[str]]:
-    """Yield the files that each commit changed; a merge changes all files of its branch."""
-    walker = repo.walk(to, SortMode.TOPOLOGICAL)
-    if last_valid_commit is not None:
-        walker.hide(last_valid_commit)
-    for commit in walker:
-        if commit.parents:
-            before, after = commit.parents[0].tree, commit.tree
-            yield {
-                path
-                for root in CONFIG_ROOTS
-                for path, _ in trees.differences_below(repo, before, after, root)
-            }
-
-
-def _blobs(repo: Repository, commit: Oid) -> Iterator[tuple[str, Oid]]:
-    tree = repo[commit].peel(Commit).tree
-    for root in CONFIG_ROOTS:
-        entry = trees.child(tree, root)
-        if isinstance(entry, Tree):
-            yield from trees.files_below(entry, f"{root}/")
-        elif isinstance(entry, Blob):
-            yield root, entry.id
-
-
-def _text(repo: Repository, blob: Oid) -> str:
-    content = repo[blob]
-    return content.data.decode("utf-8", "replace") if isinstance(content, Blob) else ""

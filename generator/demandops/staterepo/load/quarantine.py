@@ -1,63 +1,121 @@
 """Claims that a person changed and that cannot be planned: quarantined, file by file.
 
 The edited file stays in the repo, for example a claim that names an unknown node, but the last
-valid version of the claim is in effect. That is the version that the generator wrote last, even
-if it wrote it after the edit.
+valid version of the claim is in effect (:func:`ledger_files.last_valid_claims`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
-from pygit2 import Repository
-from pygit2.enums import SortMode
+from pygit2 import Repository, Tree
 
 from demandops.decision import State, changeset_of_edit
-from demandops.demand.claim import Claim
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
-from demandops.render.changes.changeset import FileReader
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history import commit_message
-from demandops.staterepo.load.snapshot import Snapshot
+from demandops.staterepo.load import ledger_files
+from demandops.staterepo.load.snapshot import Advance, Snapshot
 from demandops.subject import Subject
 
+Faults = Mapping[Subject, tuple[Fault, ...]]
 
-def quarantine_invalid(
-    repo: Repository,
-    snapshot: Snapshot,
-    before: Snapshot,
-    subjects: Iterable[Subject],
-    read: FileReader,
-) -> tuple[Snapshot, list[Subject], list[Fault]]:
-    """Quarantine the subjects that cannot be planned with the new or the old configuration.
 
-    Returns:
-        The snapshot with the last valid claims, the subjects that are not quarantined, and the
-        faults of those that are.
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """A snapshot with the last valid claims, and the changed subjects that are in effect in it."""
+
+    snapshot: Snapshot
+    subjects: tuple[Subject, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What people changed, and why subjects cannot be planned with the new configuration or old.
+
+    A subject is at fault if it cannot be planned with either: else the configuration is.
     """
-    good, faults = [], list[Fault]()
-    for subject in subjects:
-        subject_faults = _faults(snapshot.state, before, subject, read)
-        if subject_faults and _faults(
-            replace(before.state, ledger=snapshot.state.ledger), before, subject, read
-        ):
-            faults += _located_in_claim_files(subject_faults, snapshot, before, subject)
-            snapshot = _with_last_valid_claims(repo, snapshot, before, subject)
-        else:
-            good.append(subject)
-    return snapshot, good, faults
+
+    repo: Repository
+    before: Snapshot
+    advance: Advance
+    with_new: Faults
+    with_old: Faults
+    old: State
+    """The new ledger with the configuration that was in effect before."""
+
+    def with_new_config(self) -> Accepted:
+        """Return what is in effect with the new configuration."""
+        faults = {
+            subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
+        }
+        return self._without(Accepted(self.advance.snapshot, self.advance.subjects), faults)
+
+    def with_old_config(self, faults: Iterable[Fault]) -> Accepted:
+        """Return what is in effect because of ``faults`` of the new configuration."""
+        accepted = self.with_new_config()
+        ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
+        snapshot = replace(
+            accepted.snapshot,
+            state=replace(self.old, ledger=ledger),
+            problems=(*problems, *faults),
+            last_valid_commit=self.before.last_valid_commit,
+            other_config_source=self.before.config_source,
+        )
+        return self._without(Accepted(snapshot, accepted.subjects), self.with_old)
+
+    def _without(self, accepted: Accepted, faults: Faults) -> Accepted:
+        snapshot, before = accepted.snapshot, self.before
+        problems, ledger = list(snapshot.problems), snapshot.state.ledger
+        quarantined = dict.fromkeys(snapshot.quarantined_files)
+        for subject in (subject for subject in accepted.subjects if subject in faults):
+            claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
+            keys = {claim_file.path_of(claim.key): claim.key for claim in claims}
+            problems += _located_in_claim_files(faults[subject], snapshot, before, subject)
+            last_valid = ledger_files.last_valid_claims(
+                self.repo, before.last_valid_commit, snapshot.commit, keys
+            )
+            for path, key in keys.items():
+                ledger = ledger.replace(key, last_valid[path])
+            quarantined |= dict.fromkeys(keys)
+        snapshot = replace(
+            snapshot,
+            state=replace(snapshot.state, ledger=ledger),
+            problems=tuple(problems),
+            last_valid_commit=before.last_valid_commit if problems else snapshot.commit,
+            quarantined_files=tuple(quarantined),
+        )
+        good = tuple(subject for subject in accepted.subjects if subject not in faults)
+        return Accepted(snapshot, good)
 
 
-def _faults(
-    state: State, before: Snapshot, subject: Subject, read: FileReader
-) -> tuple[Fault, ...]:
-    try:
-        changeset_of_edit(state, before.state.ledger, [subject], read)
-    except InvalidInput as error:
-        return error.faults
-    return ()
+def judge(repo: Repository, advance: Advance, before: Snapshot, tree: Tree) -> Judgement:
+    """Return which of the subjects that people changed cannot be planned.
+
+    Args:
+        before: the state in effect before.
+        tree: the generated files, some of which overrides may hold.
+    """
+    state, ledger = advance.snapshot.state, before.state.ledger
+    ended = state.config.ended_overrides
+    config = before.state.config.with_ended_overrides(ended)
+    old = replace(before.state, ledger=state.ledger, config=config)
+
+    def faults_in(state: State) -> Faults:
+        found = {}
+        for subject in advance.subjects:
+            try:
+                changeset_of_edit(
+                    state, ledger, [subject], lambda path: trees.read_text(tree, path)
+                )
+            except InvalidInput as error:
+                found[subject] = error.faults
+        return found
+
+    with_new = faults_in(state)
+    with_old = faults_in(old) if state.config != config else with_new
+    return Judgement(repo, before, advance, with_new, with_old, old)
 
 
 def _located_in_claim_files(
@@ -68,47 +126,3 @@ def _located_in_claim_files(
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
     paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]
     return [fault.within(paths[0]) if paths else fault for fault in faults]
-
-
-def _with_last_valid_claims(
-    repo: Repository, snapshot: Snapshot, before: Snapshot, subject: Subject
-) -> Snapshot:
-    ledger, keys = snapshot.state.ledger, snapshot.keys
-    claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
-    known = {claim_file.path_of(claim.key): claim.key for claim in claims}
-    generated = _claims_by_generator(repo, snapshot, before, known)
-    for path, key in known.items():
-        claim = generated[path] if path in generated else before.state.ledger.get(key)
-        ledger = ledger.replace(key, claim)
-        if claim is not None:
-            keys = keys.insert(path, key)
-    quarantined = tuple(dict.fromkeys((*snapshot.quarantined_files, *known)))
-    return replace(
-        snapshot,
-        state=replace(snapshot.state, ledger=ledger),
-        keys=keys,
-        quarantined_files=quarantined,
-    )
-
-
-def _claims_by_generator(
-    repo: Repository, snapshot: Snapshot, before: Snapshot, paths: Iterable[str]
-) -> dict[str, Claim | None]:
-    """Return path → the claim that a generator last wrote there since ``before``."""
-    walker = repo.walk(snapshot.commit, SortMode.TOPOLOGICAL)
-    walker.hide(before.commit)
-    claims: dict[str, Claim | None] = {}
-    left = set(paths)
-    for commit in walker:
-        if not commit.parents or not commit_message.is_by_generator(commit.message):
-            continue
-        old, new = commit.parents[0].tree, commit.tree
-        for path in sorted(left):
-            if trees.blob_id(old, path) != trees.blob_id(new, path):
-                claims[path] = _claim(trees.read_text(new, path), path)
-                left.remove(path)
-    return claims
-
-
-def _claim(text: str | None, path: str) -> Claim | None:
-    return claim_file.read(text, path) if text is not None else None

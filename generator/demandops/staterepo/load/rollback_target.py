@@ -7,12 +7,12 @@ from datetime import datetime, timezone
 from pygit2 import Oid, Repository
 
 from demandops.config.config import CONFIG_ROOTS
-from demandops.demand.claim import Claim
-from demandops.errors import Fault, InvalidInput
+from demandops.errors import InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.operations.restoration import Restoration
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.tree import commit_of
+from demandops.staterepo.load import ledger_files
 
 
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
@@ -27,22 +27,14 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
         StateRepoError: there is no such commit.
     """
     commit = commit_of(repo, to)
-    claims: list[Claim] = []
-    faults: list[Fault] = []
-    for path, text in trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items():
-        if claim_file.kind_of(path) is None:
-            continue
-        try:
-            claims.append(claim_file.read(text, path))
-        except InvalidInput as error:
-            faults += error.faults
-    if faults:
-        raise InvalidInput(faults)
+    found = ledger_files.read(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())
+    if found.faults:
+        raise InvalidInput(found.faults)
     return Restoration(
         id="",
         to=str(commit.id),
         made=datetime.fromtimestamp(commit.commit_time, tz=timezone.utc),
-        claims=tuple(claims),
+        claims=found.claims,
         **more,  # type: ignore[arg-type]
     )
 
@@ -50,5 +42,4 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
 def config_files_changed_since(repo: Repository, commit: str | Oid, tip: str | Oid) -> list[str]:
     """Return the configuration files that changed since ``commit``."""
     before, after = commit_of(repo, commit).tree, commit_of(repo, tip).tree
-    changed = trees.differences(repo, before, after, "")
-    return sorted(path for path, _ in changed if path.split("/")[0] in CONFIG_ROOTS)
+    return sorted(path for path, _ in trees.differences(before, after, CONFIG_ROOTS))

@@ -6,26 +6,24 @@ last valid version stays in effect and the file is reported.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from pygit2 import Commit, Oid, Repository, Tree
-from pygit2.enums import SortMode
-from rpds import HashTrieMap
+from pygit2 import Blob, Oid, Repository, Tree
 
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load as load_config
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, try_configuration
-from demandops.demand.claim import Claim, ClaimKey
+from demandops.demand.claim import Claim
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history import commit_message
-from demandops.staterepo.load import last_valid_config
-from demandops.staterepo.load.last_valid_config import ConfigSource
+from demandops.staterepo.history import commit_log
+from demandops.staterepo.load import last_valid_config, ledger_files
+from demandops.staterepo.load.last_valid_config import ConfigSource, LastValidConfig
 from demandops.subject import Subject
 
 Progress = Callable[[int, int], None]
@@ -35,7 +33,6 @@ Progress = Callable[[int, int], None]
 class Snapshot:
     """A commit and its state: configuration and ledger.
 
-    ``keys``: the claim of each ledger file, so that the claim of a removed file is known.
     ``problems``: what is not valid; the last valid versions are in effect instead.
     ``last_valid_commit``: the newest commit without problems.
     ``quarantined_files``: ledger files whose content at this commit is not in effect.
@@ -44,9 +41,8 @@ class Snapshot:
 
     commit: Oid
     state: State
-    keys: HashTrieMap[str, ClaimKey]
+    last_valid_commit: Oid
     problems: tuple[Fault, ...] = ()
-    last_valid_commit: Oid | None = None
     quarantined_files: tuple[str, ...] = ()
     other_config_source: ConfigSource | None = None
 
@@ -55,19 +51,10 @@ class Snapshot:
         """The source of the configuration in effect."""
         return self.other_config_source or ConfigSource(self.commit)
 
-    def with_commit(self, commit: Oid, state: State, changes: Iterable[ClaimKey]) -> Snapshot:
+    def with_commit(self, commit: Oid, state: State) -> Snapshot:
         """Return the snapshot of a new commit by this program, whose state is known."""
-        keys = self.keys
-        for key in changes:
-            path = claim_file.path_of(key)
-            if state.ledger.get(key) is not None:
-                keys = keys.insert(path, key)
-            elif path in keys:
-                keys = keys.remove(path)
         last_valid_commit = self.last_valid_commit if self.problems else commit
-        return replace(
-            self, commit=commit, state=state, keys=keys, last_valid_commit=last_valid_commit
-        )
+        return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,162 +88,90 @@ def load(
     """
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
-    ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
-    if faults:
-        raise InvalidInput(faults)
-    return Snapshot(commit.id, State.of(config, ledger), keys, last_valid_commit=commit.id)
+    found = ledger_files.read(_claim_texts(commit.tree, progress))
+    if found.faults:
+        raise InvalidInput(found.faults)
+    return Snapshot(commit.id, State.of(config, found.ledger()), commit.id)
 
 
-def load_last_valid(
-    repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
-) -> Snapshot:
-    """Load a commit, with last valid versions of the files that are not valid.
+def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
+    blobs: list[tuple[str, Blob]] = [
+        (path, blob)
+        for path, blob in trees.blobs(tree, (claim_file.LEDGER_ROOT,))
+        if claim_file.kind_of(path)
+    ]
+    for done, (path, blob) in enumerate(blobs):
+        if done % 200 == 0:
+            progress(done, len(blobs))
+        yield path, trees.text_of(blob)
+    progress(len(blobs), len(blobs))
 
-    Raises:
-        InvalidInput, StateRepoError: there never was a valid configuration.
+
+def advance(
+    repo: Repository, before: Snapshot, to: Oid, recorded: ConfigSource | None = None
+) -> Advance:
+    """Advance a snapshot to another commit, reading only what differs.
+
+    What is not valid stays as it was and is listed in the new snapshot's problems.
+
+    Args:
+        recorded: the source of the configuration in effect at ``to``, if that is known.
     """
-    commit = trees.commit_of(repo, revision)
-    problems: list[Fault] = []
-    try:
-        config = last_valid_config.config_at(commit.tree)
-    except InvalidInput as error:
-        problems += error.faults
-        config = last_valid_config.newest_valid_config(commit, error)
-        config = config.with_ended_overrides(
-            ended_override_file.read(last_valid_config.end_markers_at(commit.tree))
-        )
-    ledger, keys, faults = _ledger_at(repo, commit.tree, progress)
-    for path in dict.fromkeys(found.file for found in faults):
-        claim = _last_valid_claim(commit, path)
-        if claim is not None:
-            ledger, keys = ledger.replace(claim.key, claim), keys.insert(path, claim.key)
-    problems += faults
-    last_valid_commit = None if problems else commit.id
-    quarantined = tuple(dict.fromkeys(fault.file for fault in faults))
-    return Snapshot(
-        commit.id, State.of(config, ledger), keys, tuple(problems), last_valid_commit, quarantined
+    old, new = trees.commit_of(repo, before.commit).tree, trees.commit_of(repo, to).tree
+    state, known = before.state, LastValidConfig(None, before.config_source, ())
+    if recorded is not None:
+        known = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
+    elif before.problems or trees.differ(old, new, CONFIG_ROOTS):
+        known = _last_valid_config(repo, before, to)
+    config = (known.config or state.config).with_ended_overrides(
+        last_valid_config.ended_overrides_at(new)
     )
-
-
-def _last_valid_claim(commit: Commit, path: str) -> Claim | None:
-    while commit.parents:
-        commit = commit.parents[0]
-        text = trees.read_text(commit.tree, path)
-        if text is None:
-            return None
+    config_changed = config != state.config or _has_manual_edit(repo, before.commit, to)
+    state = State.of(config, state.ledger) if known.config else replace(state, config=config)
+    problems, claims, invalid = list(known.faults), dict[str, Claim | None](), list[str]()
+    for path in sorted({*ledger_files.changed_files(old, new), *before.quarantined_files}):
         try:
-            return claim_file.read(text, path)
-        except InvalidInput:
-            continue
-    return None
+            claims[path] = ledger_files.claim_at(new, path)
+        except InvalidInput as error:
+            problems += error.faults
+            invalid.append(path)
+    claims |= ledger_files.last_valid_claims(repo, before.last_valid_commit, to, invalid)
+    ledger, subjects = state.ledger, list[Subject]()
+    for path in sorted(claims):
+        claim = claims[path]
+        held = claim or ledger_files.valid_claim_at(old, path)
+        key = held.key if held else ledger_files.key_of(path, ledger)
+        if key is not None and ledger.get(key) != claim:
+            ledger = ledger.replace(key, claim)
+            subjects.append(key.subject)
+    snapshot = Snapshot(
+        to,
+        replace(state, ledger=ledger),
+        before.last_valid_commit if problems else to,
+        tuple(problems),
+        tuple(invalid),
+        known.source if known.faults or recorded else None,
+    )
+    return Advance(snapshot, tuple(dict.fromkeys(subjects)), config_changed)
+
+
+def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValidConfig:
+    return last_valid_config.load_last_valid_config(
+        repo,
+        before.config_source,
+        before.last_valid_commit,
+        to,
+        lambda files: _load_and_rehearse(files, before.state),
+    )
 
 
 def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
     """Return whether a person changed generated files between two commits."""
-    walker = repo.walk(to, SortMode.TOPOLOGICAL)
-    walker.hide(before)
-    for commit in walker:
-        if commit_message.is_by_generator(commit.message) or not commit.parents:
-            continue
-        if _differ(commit.parents[0].tree, commit.tree, GENERATED_ROOTS):
-            return True
-    return False
-
-
-def _ledger_at(
-    repo: Repository, tree: Tree, progress: Progress
-) -> tuple[Ledger, HashTrieMap[str, ClaimKey], list[Fault]]:
-    paths = [(path, blob) for path, blob in _ledger_files(tree) if claim_file.kind_of(path)]
-    ledger, faults = Ledger(), list[Fault]()
-    keys: HashTrieMap[str, ClaimKey] = HashTrieMap()
-    for done, (path, blob) in enumerate(paths):
-        if done % 200 == 0:
-            progress(done, len(paths))
-        try:
-            claim = claim_file.read(_text(repo, blob), path)
-        except InvalidInput as error:
-            faults += error.faults
-            continue
-        ledger = ledger.replace(claim.key, claim)
-        keys = keys.insert(path, claim.key)
-    progress(len(paths), len(paths))
-    return ledger, keys, faults
-
-
-def _ledger_files(tree: Tree) -> Iterable[tuple[str, Oid]]:
-    root = claim_file.LEDGER_ROOT
-    if root in tree and isinstance(tree[root], Tree):
-        yield from trees.files_below(tree[root], f"{root}/")  # type: ignore[arg-type]
-
-
-def _text(repo: Repository, blob: Oid) -> str:
-    return repo[blob].data.decode("utf-8", "replace")  # type: ignore[attr-defined,no-any-return]
-
-
-def advance(repo: Repository, snapshot: Snapshot, to: Oid) -> Advance:
-    """Advance a snapshot to another commit, reading only what differs.
-
-    What is not valid stays as it was and is listed in the new snapshot's problems.
-    """
-    before, after = trees.commit_of(repo, snapshot.commit).tree, trees.commit_of(repo, to).tree
-    last_valid_config.refuse_other_render_version(after)
-    state, problems = snapshot.state, list[Fault]()
-    config_changed = _has_manual_edit(repo, snapshot.commit, to)
-    source = snapshot.other_config_source
-    if snapshot.problems or _differ(before, after, CONFIG_ROOTS):
-        valid = last_valid_config.load_last_valid_config(
-            repo,
-            snapshot.config_source,
-            snapshot.last_valid_commit,
-            to,
-            lambda files: _load_and_rehearse(files, state),
-        )
-        problems += valid.faults
-        source = valid.source if problems else None
-        if valid.config is not None:
-            config = valid.config.with_ended_overrides(state.config.ended_overrides)
-            config_changed = config_changed or config != state.config
-            state = State(config, State.of(config, state.ledger).engine, state.ledger)
-    ended = ended_override_file.read(last_valid_config.end_markers_at(after))
-    if ended != state.config.ended_overrides:
-        state = replace(state, config=state.config.with_ended_overrides(ended))
-        config_changed = True
-    ledger, keys, subjects, invalid = state.ledger, snapshot.keys, list[Subject](), list[str]()
-    changed = dict(
-        trees.differences(repo, _subtree(before, "ledger"), _subtree(after, "ledger"), "ledger/")
+    return any(
+        trees.differ(commit.parents[0].tree, commit.tree, GENERATED_ROOTS)
+        for commit in commit_log.person_commits(repo, to, before)
+        if commit.parents
     )
-    changed |= {path: trees.blob_id(after, path) for path in snapshot.quarantined_files}
-    for path, blob in sorted(changed.items()):
-        if claim_file.kind_of(path) is None:
-            continue
-        known = keys.get(path)
-        if blob is None:
-            if known is not None:
-                ledger = ledger.replace(known, None)
-                subjects.append(known.subject)
-                keys = keys.remove(path)
-            continue
-        try:
-            claim = claim_file.read(_text(repo, blob), path)
-        except InvalidInput as error:
-            problems += error.faults
-            invalid.append(path)
-            continue
-        if ledger.get(claim.key) != claim:
-            ledger = ledger.replace(claim.key, claim)
-            subjects.append(claim.subject)
-        keys = keys.insert(path, claim.key)
-    state = replace(state, ledger=ledger)
-    last_valid_commit = snapshot.last_valid_commit if problems else to
-    return Advance(
-        Snapshot(to, state, keys, tuple(problems), last_valid_commit, tuple(invalid), source),
-        tuple(dict.fromkeys(subjects)),
-        config_changed,
-    )
-
-
-def _differ(one: Tree, other: Tree, roots: Iterable[str]) -> bool:
-    return any(trees.entry_id(one, root) != trees.entry_id(other, root) for root in roots)
 
 
 def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
@@ -267,11 +182,6 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
     if config.with_ended_overrides(state.config.ended_overrides) != state.config:
         try_configuration(State.of(config, Ledger()))
     return config
-
-
-def _subtree(tree: Tree, name: str) -> Tree | None:
-    entry = trees.child(tree, name)
-    return entry if isinstance(entry, Tree) else None
 
 
 class ReadAhead:
@@ -285,7 +195,12 @@ class ReadAhead:
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        """Return what differs between ``before`` and ``tip``."""
+        """Return what differs between ``before`` and ``tip``.
+
+        Raises:
+            StateRepoError: ``tip`` has another render version.
+        """
+        last_valid_config.refuse_other_render_version(trees.commit_of(repo, tip).tree)
         known = self._known
         if known is None or self._start != before.commit:
             known = Advance(before, (), False)

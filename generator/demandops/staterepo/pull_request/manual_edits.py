@@ -12,7 +12,6 @@ from demandops.config.override import OVERRIDES_ROOT
 from demandops.errors import Fault, fault
 from demandops.ledger import claim_file
 from demandops.plan.release import Release
-from demandops.render.changes import merge_preview
 from demandops.render.changes.override_suggestion import (
     Suggestion,
     same_override_fits,
@@ -27,16 +26,8 @@ _LOST = "is generated, so a manual edit is lost; revert it"
 _MOST_LEFT = 5
 
 
-def changed_paths(files: Mapping[str, str], before: Mapping[str, str]) -> list[str]:
-    """Return the files that only the generator may write and that changed, sorted."""
-    return [
-        path
-        for path in sorted({*files, *before})
-        if files.get(path) != before.get(path) and _is_written_by_generator(path)
-    ]
-
-
-def _is_written_by_generator(path: str) -> bool:
+def is_written_by_generator(path: str) -> bool:
+    """Return whether only the generator may write a file."""
     root = path.split("/", maxsplit=1)[0]
     if trees.is_readme(path):
         return False
@@ -56,7 +47,7 @@ def faults_and_suggestions(
         paths: the generated files that were edited.
         owner: who edited them.
     """
-    releases = _by_path(base)
+    releases = {path_of(release): release for release in base.releases().values()}
     used = {path for path in files if path.startswith(f"{OVERRIDES_ROOT}/")}
     faults, suggestions = list[Fault](), list[Suggestion]()
     for path in paths:
@@ -81,13 +72,6 @@ def faults_and_suggestions(
 
 def _fits(release: Release | None, other: Release) -> bool:
     return release is not None and same_override_fits(release, other)
-
-
-def _by_path(base: Base) -> dict[str, Release]:
-    if base.state is None:
-        return {}
-    known = merge_preview.planned_releases(base.state.ledger, base.state.config)
-    return {path_of(release): release for release in known.values()}
 
 
 def _unused_path(name: str, used: set[str]) -> str:

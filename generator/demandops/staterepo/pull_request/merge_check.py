@@ -7,7 +7,7 @@ the commit that it started from. The result also previews desired state and book
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,11 +19,9 @@ from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.lifecycle import expired_overrides, update_ledger
-from demandops.plan.release import Release
-from demandops.plan.release_keys import ReleaseKey
 from demandops.plan.views.bookkeeping import bookkeeping
 from demandops.plan.views.bookkeeping_diff import EntryChange, bookkeeping_changes
 from demandops.plan.views.override_report import override_report, warnings
@@ -32,6 +30,7 @@ from demandops.render.changes.merge_preview import MergePreview
 from demandops.render.changes.override_suggestion import Suggestion
 from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.load import ledger_files
 from demandops.staterepo.pull_request import manual_edits
 from demandops.staterepo.pull_request.worktree import Base, author_of, base_of, files_of
 
@@ -69,142 +68,141 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
-    before = start.files if start else files
-    ledger = _ledger(files, faults)
+    edit = _Edit(files, start, now or datetime.now(timezone.utc))
+    claims = ledger_files.read(sorted(files.items()))
+    faults += claims.faults
     result = CheckResult((), base=start.commit if start else None)
     result = replace(result, base_valid=start is None or start.valid)
-    edited = manual_edits.changed_paths(files, before)
+    edited = [path for path in edit.changed if manual_edits.is_written_by_generator(path)]
+
+    def with_faults(edited: list[str]) -> CheckResult:
+        found, suggestions = faults, tuple[Suggestion, ...]()
+        if start is not None and edited:
+            manual, suggestions = manual_edits.faults_and_suggestions(
+                files, start, edited, author_of(folder)
+            )
+            found = [*faults, *manual]
+        ordered = tuple(sorted(dict.fromkeys(found), key=lambda fault: fault.file))
+        return replace(result, faults=ordered, suggestions=suggestions)
+
     try:
-        now = now or datetime.now(timezone.utc)
-        state = _state(files, before, ledger, faults, now)
-        changed = [path for path in {*files, *before} if files.get(path) != before.get(path)]
-        state = _applied(state, start, changed, files, now)
-        current = {
-            path: text
-            for path, text in before.items()
-            if _generated(path) and not trees.is_readme(path)
-        }
-        wanted = _rendered(state, current, changed)
+        config = edit.config()
+        faults += edit.unversioned_charts(config)
+        state = edit.merged_state(config, claims.ledger())
+        wanted = edit.rendered(state)
     except InvalidInput as error:
-        refused, suggested = _manual_edits(folder, files, start, edited)
         faults += error.faults
-        return replace(result, faults=_ordered([*faults, *refused]), suggestions=suggested)
+        return with_faults(edited)
     # a proposal or an upgrade contains exactly what the generator would write: not a manual edit
     edited = [
         path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
     ]
-    refused, suggested = _manual_edits(folder, files, start, edited)
     new = merge_preview.planned_releases(state.ledger, state.config)
-    old = new if start is None else _releases(start)
+    old = new if start is None else start.releases()
+    idle = warnings(override_report(state.ledger, state.config, edit.now))
     return replace(
-        result,
-        faults=_ordered([*faults, *refused]),
-        suggestions=suggested,
-        preview=merge_preview.preview(old, new, current, wanted),
+        with_faults(edited),
+        preview=merge_preview.preview(old, new, edit.generated, wanted),
         bookkeeping=_bookkeeping_changes(start, state),
-        warnings=_warnings(state, now),
+        warnings=tuple(fault("", text).within(path) for path, text in idle),
     )
-
-
-def _ordered(faults: list[Fault]) -> tuple[Fault, ...]:
-    return tuple(sorted(dict.fromkeys(faults), key=lambda fault: fault.file))
 
 
 def _generated(path: str) -> bool:
     return path.split("/", maxsplit=1)[0] in GENERATED_ROOTS
 
 
-def _ledger(files: Mapping[str, str], faults: list[Fault]) -> Ledger:
-    ledger = Ledger()
-    for path, text in sorted(files.items()):
-        if claim_file.kind_of(path) is None:
-            continue
+@dataclass(frozen=True, slots=True)
+class _Edit:
+    """The files of an edit, the commit that it started from, and the time of the check."""
+
+    files: Mapping[str, str]
+    start: Base | None
+    now: datetime
+
+    @property
+    def before(self) -> Mapping[str, str]:
+        """The files before the edit."""
+        return self.start.files if self.start else self.files
+
+    @property
+    def changed(self) -> list[str]:
+        """The paths that the edit changed, sorted."""
+        before, after = self.before, self.files
+        return sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
+
+    @property
+    def generated(self) -> dict[str, str]:
+        """The generated files before the edit."""
+        return {
+            path: text
+            for path, text in self.before.items()
+            if _generated(path) and not trees.is_readme(path)
+        }
+
+    def config(self) -> Config:
+        """Return the configuration, without overrides that have ended or expired."""
+        files = {p: text for p, text in self.files.items() if p.split("/")[0] in CONFIG_ROOTS}
+        config = load(files)
+        version = config.repo_settings.render_version
+        if version < RENDER_VERSION:
+            message = (
+                f"is {version}, but this program renders version {RENDER_VERSION}; check with the "
+                "generator's version of the program, or run `demandops upgrade` to render "
+                "everything again"
+            )
+            raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
+        config = config.with_ended_overrides(ended_override_file.read(self._markers()))
+        ended = expired_overrides(config, self.now)
+        expired = {one.name: format_time(one.end) for one in ended if one.end}
+        return config.with_ended_overrides({**config.ended_overrides, **expired})
+
+    def _markers(self) -> dict[str, str]:
+        root = f"{ended_override_file.MARKERS_ROOT}/"
+        return {path: text for path, text in self.files.items() if path.startswith(root)}
+
+    def merged_state(self, config: Config, ledger: Ledger) -> State:
+        """Return the state after the generator has applied the edit."""
+        state = State.of(config, ledger)
+        try_configuration(state)
+        if self.start is None or self.start.state is None:
+            return state
+        old = self.start.state
+        subjects = ledger_files.changed_subjects(old.ledger, ledger)
+        applied = update_ledger(old, state, subjects, self._markers(), self.now)
+        return replace(state, ledger=applied.ledger, config=applied.config)
+
+    def rendered(self, state: State) -> dict[str, str]:
+        """Return every generated file, or raise the faults of every release."""
         try:
-            claim = claim_file.read(text, path)
+            return rendered_files(state, self.generated)
         except InvalidInput as error:
-            faults += error.faults
-        else:
-            ledger = ledger.replace(claim.key, claim)
-    return ledger
+            found = merge_preview.render_faults(
+                state.ledger, state.config, state.engine, self.changed
+            )
+            raise InvalidInput(found or error.faults) from None
 
-
-def _state(
-    files: Mapping[str, str],
-    before: Mapping[str, str],
-    ledger: Ledger,
-    faults: list[Fault],
-    now: datetime,
-) -> State:
-    """Return the state of the files; add faults that do not prevent rendering to ``faults``."""
-    config = load({p: t for p, t in files.items() if p.split("/")[0] in CONFIG_ROOTS})
-    version = config.repo_settings.render_version
-    if version < RENDER_VERSION:
-        message = (
-            f"is {version}, but this program renders version {RENDER_VERSION}; check with the "
-            "generator's version of the program, or run `demandops upgrade` to render everything "
-            "again"
-        )
-        raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
-    faults += _unversioned_charts(config, files, before)
-    config = _with_ended(config, files, now)
-    state = State.of(config, ledger)
-    try_configuration(state)
-    return state
-
-
-def _applied(
-    state: State,
-    start: Base | None,
-    changed: Collection[str],
-    files: Mapping[str, str],
-    now: datetime,
-) -> State:
-    """Return the state after the generator has applied the change."""
-    if start is None or start.state is None:
-        return state
-    old, new = start.state.ledger, state.ledger
-    subjects = [
-        claim.subject
-        for ledger in (old, new)
-        for claim in ledger
-        if claim_file.path_of(claim.key) in changed
-    ]
-    before, after = (old, start.state.config), (new, state.config)
-    applied = update_ledger(before, after, dict.fromkeys(subjects), _marked(files), now)
-    return replace(state, ledger=applied.ledger, config=applied.config)
-
-
-def _marked(files: Mapping[str, str]) -> dict[str, str]:
-    return {
-        p: text for p, text in files.items() if p.startswith(f"{ended_override_file.MARKERS_ROOT}/")
-    }
-
-
-def _with_ended(config: Config, files: Mapping[str, str], now: datetime) -> Config:
-    """Return the configuration without overrides that have ended or expired."""
-    config = config.with_ended_overrides(ended_override_file.read(_marked(files)))
-    expired = {one.name: format_time(one.end) for one in expired_overrides(config, now) if one.end}
-    return config.with_ended_overrides({**config.ended_overrides, **expired})
-
-
-def _warnings(state: State, now: datetime) -> tuple[Fault, ...]:
-    idle = warnings(override_report(state.ledger, state.config, now))
-    return tuple(fault("", text).within(path) for path, text in idle)
-
-
-def _rendered(state: State, current: Mapping[str, str], edited: Collection[str]) -> dict[str, str]:
-    """Return every generated file, or raise the faults of every release."""
-    try:
-        return rendered_files(state, current)
-    except InvalidInput as error:
-        faults = merge_preview.render_faults(state.ledger, state.config, state.engine, edited)
-        raise InvalidInput(faults or error.faults) from None
-
-
-def _releases(start: Base) -> dict[ReleaseKey, Release]:
-    if start.state is None:
-        return {}
-    return merge_preview.planned_releases(start.state.ledger, start.state.config)
+    def unversioned_charts(self, config: Config) -> Iterator[Fault]:
+        """Yield a fault for each chart that changed and still has its version."""
+        sources = {
+            source.folder: (name, source)
+            for name, chart in sorted(config.charts.items())
+            for source in chart.sources()
+            if source.folder
+        }
+        edited = self.changed
+        for folder, (name, source) in sorted(sources.items()):
+            metadata, prefix = f"{folder}/Chart.yaml", f"{folder}/"
+            changed = [path for path in edited if path.startswith(prefix)]
+            if not changed or metadata not in self.before:
+                continue
+            if _version(self.before[metadata]) == source.version:
+                yield fault(
+                    "version",
+                    f"is still {source.version}, but {changed[0].removeprefix(prefix)} changed; "
+                    f"raise it here and at charts.{name} in registry/charts.yaml, or no cluster "
+                    "applies it",
+                ).within(metadata)
 
 
 def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
@@ -217,40 +215,6 @@ def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange,
     except InvalidInput:
         return None
     return bookkeeping_changes(old, bookkeeping(state.ledger, state.config))
-
-
-def _manual_edits(
-    folder: Path, files: Mapping[str, str], start: Base | None, edited: list[str]
-) -> tuple[list[Fault], tuple[Suggestion, ...]]:
-    if start is None or not edited:
-        return [], ()
-    return manual_edits.faults_and_suggestions(files, start, edited, author_of(folder))
-
-
-def _unversioned_charts(
-    config: Config, files: Mapping[str, str], before: Mapping[str, str]
-) -> Iterator[Fault]:
-    sources = {
-        source.folder: (name, source)
-        for name, chart in sorted(config.charts.items())
-        for source in chart.sources()
-        if source.folder
-    }
-    for folder, (name, source) in sorted(sources.items()):
-        metadata, prefix = f"{folder}/Chart.yaml", f"{folder}/"
-        if metadata not in before:
-            continue
-        changed = [
-            path
-            for path in sorted({*files, *before})
-            if path.startswith(prefix) and files.get(path) != before.get(path)
-        ]
-        if changed and _version(before[metadata]) == source.version:
-            yield fault(
-                "version",
-                f"is still {source.version}, but {changed[0].removeprefix(prefix)} changed; raise "
-                f"it here and at charts.{name} in registry/charts.yaml, or no cluster applies it",
-            ).within(metadata)
 
 
 def _version(text: str) -> object:

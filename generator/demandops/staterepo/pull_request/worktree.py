@@ -13,9 +13,12 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.decision import State
 from demandops.errors import Fault, InvalidInput, StateRepoError, fault
 from demandops.ledger import claim_file
+from demandops.plan.release import Release
+from demandops.plan.release_keys import ReleaseKey
+from demandops.render.changes import merge_preview
 from demandops.settings import GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.load import snapshot as snapshots
+from demandops.staterepo.load import state_in_effect
 
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
@@ -34,6 +37,12 @@ class Base:
     state: State | None
     valid: bool
     """Whether its files are valid; if not, ``state`` is from an earlier commit."""
+
+    def releases(self) -> dict[ReleaseKey, Release]:
+        """Return the releases of its state."""
+        if self.state is None:
+            return {}
+        return merge_preview.planned_releases(self.state.ledger, self.state.config)
 
 
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
@@ -88,7 +97,7 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
     commit = _started_from(repo, revision)
     files = trees.texts(commit.tree, _ROOTS)
     try:
-        snapshot = snapshots.load_last_valid(repo, commit.id)
+        snapshot = state_in_effect.state_at(repo, commit.id)
     except (InvalidInput, StateRepoError):
         return Base(str(commit.id), files, None, False)
     return Base(str(commit.id), files, snapshot.state, not snapshot.problems)
@@ -98,25 +107,22 @@ def _started_from(repo: Repository, revision: str | None) -> Commit:
     """Return the common ancestor of HEAD and the merge target."""
     head = repo.head.peel(Commit)
     known = [name for name in _DEFAULTS if name in repo.references]
-    if revision is None and not known:
-        if repo.is_shallow:
-            raise StateRepoError(_SHALLOW)
-        return head
+    target = revision or next(iter(known), "")
     try:
-        target = trees.commit_of(repo, revision or known[0])
-        common = repo.merge_base(head.id, target.id)
+        common = repo.merge_base(head.id, trees.commit_of(repo, target).id) if target else None
     except (StateRepoError, pygit2.GitError, KeyError):
         if repo.is_shallow:
-            raise StateRepoError(f"'{revision or known[0]}': {_SHALLOW}") from None
+            raise StateRepoError(f"'{target}': {_SHALLOW}") from None
         raise
-    if common is None:
-        if repo.is_shallow:
-            raise StateRepoError(_SHALLOW)
-        raise StateRepoError(
-            f"HEAD and {revision or known[0]} have no commit in common; name the merge target with "
-            "--base"
-        )
-    return trees.commit_of(repo, common)
+    if common is not None:
+        return trees.commit_of(repo, common)
+    if repo.is_shallow:
+        raise StateRepoError(_SHALLOW)
+    if not target:
+        return head
+    raise StateRepoError(
+        f"HEAD and {target} have no commit in common; name the merge target with --base"
+    )
 
 
 def author_of(folder: Path) -> str:

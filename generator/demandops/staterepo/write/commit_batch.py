@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from types import MappingProxyType
 from typing import Literal
@@ -17,13 +17,11 @@ from typing import Literal
 import pygit2
 from pygit2 import Oid, Signature
 
-from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.decision import Decision, State, changeset_of_edit, rendered_files
 from demandops.demand.claim import ClaimKey
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
-from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.lifecycle import (
     LedgerUpdate,
@@ -39,17 +37,25 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.history import authorship, commit_log, commit_message
 from demandops.staterepo.load import (
-    in_force_trailers,
     last_valid_config,
     problem_report,
     quarantine,
+    state_in_effect,
 )
-from demandops.staterepo.load import snapshot as snapshots
-from demandops.staterepo.load.snapshot import Advance, Progress, Snapshot
-from demandops.subject import Subject
+from demandops.staterepo.load.quarantine import Accepted
+from demandops.staterepo.load.snapshot import Advance, Snapshot
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class _Followed:
+    """What follows from people's changes: the state in effect, the files, the kept claims."""
+
+    snapshot: Snapshot
+    change: Changeset
+    keys: tuple[ClaimKey, ...]
 
 
 class CommitBatch:
@@ -80,14 +86,13 @@ class CommitBatch:
         Args:
             proposal: the branch that it awaits approval on; empty if it needs no approval.
         """
-        more = [*self._settled, *in_force_trailers.trailers_of(self.head)]
+        more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
-            more.append((commit_message.PROPOSAL, proposal))
+            more.append((commit_log.PROPOSAL, proposal))
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
         made = self._write(decision.files, text, commit_message.author(decision, received), now)
-        keys = [change.key for change in decision.changes.claims]
-        self.head = self.head.with_commit(made, decision.state, keys)
+        self.head = self.head.with_commit(made, decision.state)
         return str(made)
 
     def commit_files(
@@ -97,14 +102,10 @@ class CommitBatch:
         text: str,
         author: Signature,
         now: datetime,
-        keys: Iterable[ClaimKey] = (),
     ) -> str:
-        """Commit files and return the commit's id.
-
-        ``state`` is the state after the commit, ``keys`` are the claims that it changes.
-        """
+        """Commit files and return the commit's id; ``state`` is the state after the commit."""
         made = self._write(files, text, author, now)
-        self.head = self.head.with_commit(made, state, keys)
+        self.head = self.head.with_commit(made, state)
         return str(made)
 
     def note_settled(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
@@ -121,84 +122,74 @@ class CommitBatch:
         What cannot be planned or rendered (a claim's node was removed from the inventory) stays
         as it was and is listed in the head's problems.
         """
-        snapshot, good, faults = self._quarantine(advance.snapshot, before, advance.subjects)
-        state, problems = snapshot.state, [*snapshot.problems, *faults]
-        change = Changeset({}, ())
-        keys: tuple[ClaimKey, ...] = ()
-        whole = advance.config_changed
-        if whole:
-            try:
-                state, change, keys = self._render_for_new_config(state, before, good, now)
-            except InvalidInput as error:
-                problems += error.faults
-                config = before.state.config.with_ended_overrides(state.config.ended_overrides)
-                state = replace(before.state, ledger=state.ledger, config=config)
-                snapshot, good, faults = self._quarantine(
-                    replace(snapshot, state=state), before, good
-                )
-                state, whole = snapshot.state, False
-                snapshot = replace(snapshot, other_config_source=before.config_source)
-                problems += faults
-        if not whole:
-            state, change, keys = self._render_subjects(state, before, good, problems, now)
-        state, started = _start_leases(state, now)
-        change = replace(change, files={**change.files, **started})
-        last_valid_commit = before.last_valid_commit if problems else snapshot.commit
-        self.head = replace(
-            snapshot, state=state, problems=tuple(problems), last_valid_commit=last_valid_commit
+        followed = self._followed(advance, before, now)
+        self.head = followed.snapshot
+        report = self._report(followed.snapshot.problems, before)
+        files = {**followed.change.files, **report}
+        if not files:
+            return
+        overrides = [
+            *changed_override_files(before.state.config, followed.snapshot.state.config),
+            *followed.change.overrides,
+            *commit_message.keep_override_paths(followed.keys),
+        ]
+        tip = followed.snapshot.commit
+        causes = authorship.person_commits_since(self._objects, before.last_valid_commit, tip)
+        text = commit_message.of_follow(
+            followed.change.releases,
+            str(tip),
+            str(before.commit),
+            followed.snapshot.problems,
+            [
+                *commit_message.override_trailers(overrides),
+                *authorship.caused_by_trailers(causes),
+                *state_in_effect.trailers_of(followed.snapshot),
+            ],
+            reports=bool(report),
         )
-        report = self._report(problems, before)
-        files = {**change.files, **report}
-        if files:
-            overrides = [
-                *changed_override_files(before.state.config, state.config),
-                *change.overrides,
-            ]
-            overrides += commit_message.keep_override_paths(keys)
-            causes = authorship.person_commits_since(
-                self._objects, before.last_valid_commit or before.commit, snapshot.commit
-            )
-            text = commit_message.of_follow(
-                change.releases,
-                str(snapshot.commit),
-                str(before.commit),
-                problems,
-                [
-                    *commit_message.override_trailers(overrides),
-                    *authorship.caused_by_trailers(causes),
-                    *in_force_trailers.trailers_of(self.head),
-                ],
-                reports=bool(report),
-            )
-            made = self._write(files, text, authorship.follow_author(causes, now), now)
-            self.head = self.head.with_commit(made, state, keys)
+        author = authorship.follow_author(causes, now)
+        self.commit_files(files, followed.snapshot.state, text, author, now)
 
-    def _quarantine(
-        self, snapshot: Snapshot, before: Snapshot, subjects: Iterable[Subject]
-    ) -> tuple[Snapshot, list[Subject], list[Fault]]:
-        return quarantine.quarantine_invalid(self._objects, snapshot, before, subjects, self.read)
+    def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
+        """Return what follows, with the old configuration if the new one cannot be planned."""
+        judgement = quarantine.judge(self._objects, advance, before, self._tree)
+        accepted = judgement.with_new_config()
+        if advance.config_changed:
+            try:
+                return self._rendered_whole(accepted, before, now)
+            except InvalidInput as error:
+                accepted = judgement.with_old_config(error.faults)
+        return self._rendered_subjects(accepted, before, now)
+
+    def _rendered_whole(self, accepted: Accepted, before: Snapshot, now: datetime) -> _Followed:
+        """Render everything, because the configuration changed."""
+        marked = last_valid_config.end_markers_at(self._tree)
+        state = accepted.snapshot.state
+        applied = update_ledger(before.state, state, accepted.subjects, marked, now)
+        state = _updated(state, applied)
+        change = self.render_all(state, applied.files)
+        return _with_started_leases(accepted.snapshot, state, change, applied.keys, now)
+
+    def _rendered_subjects(self, accepted: Accepted, before: Snapshot, now: datetime) -> _Followed:
+        """Render the subjects that people changed."""
+        state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
+        ledger, keys = kept_claims.update_kept_claims(
+            old, state.ledger, subjects, state.config, now
+        )
+        files = changed_claim_files(state.ledger, ledger, keys)
+        state = replace(state, ledger=ledger)
+        change = changeset_of_edit(state, old, subjects, self.read)
+        change = replace(change, files={**files, **change.files})
+        return _with_started_leases(accepted.snapshot, state, change, keys, now)
 
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
         """Return the problem report, if it changed."""
         current = self.read(problem_report.PATH)
-        origin = authorship.FaultOrigins(
-            self._objects, before.last_valid_commit or before.commit, self.start.commit
-        )
+        origin = authorship.FaultOrigins(self._objects, before.last_valid_commit, self.start.commit)
         wanted = problem_report.write(
             problem_report.with_origins(problems, problem_report.read(current), origin)
         )
         return {} if wanted == current else {problem_report.PATH: wanted}
-
-    def _render_for_new_config(
-        self, state: State, before: Snapshot, subjects: Iterable[Subject], now: datetime
-    ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
-        """Render everything for a changed configuration."""
-        marked = last_valid_config.end_markers_at(self._tree)
-        applied = update_ledger(
-            _ledger_and_config(before.state), _ledger_and_config(state), subjects, marked, now
-        )
-        state = _with_ledger_and_config(state, applied)
-        return state, self.render_all(state, applied.files), applied.keys
 
     def end_override(self, override: Override, now: datetime) -> None:
         """Commit the end of an expired override, and what it changes.
@@ -207,46 +198,12 @@ class CommitBatch:
             Refused, InvalidInput: the state without the override cannot be planned or rendered.
         """
         state = self.head.state
-        applied = end_override(_ledger_and_config(state), override, now)
-        state = _with_ledger_and_config(state, applied)
+        applied = end_override(state, override, now)
+        state = _updated(state, applied)
         change = self.render_all(state, applied.files)
-        more = in_force_trailers.trailers_of(self.head)
+        more = state_in_effect.trailers_of(self.head)
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
-        made = self._write(change.files, text, commit_message.generator_signature(now), now)
-        self.head = self.head.with_commit(made, state, applied.keys)
-
-    def _render_subjects(
-        self,
-        state: State,
-        before: Snapshot,
-        subjects: Iterable[Subject],
-        problems: list[Fault],
-        now: datetime,
-    ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
-        """Plan and render the subjects that people changed; one that fails stays as it was.
-
-        Adds the faults of those that fail to ``problems``.
-        """
-        good, keys = list[Subject](), list[ClaimKey]()
-        old = before.state.ledger
-        files: dict[str, str | None] = {}
-        for subject in subjects:
-            ledger, changed = kept_claims.update_kept_claims(
-                old, state.ledger, [subject], state.config, now
-            )
-            tried = replace(state, ledger=ledger)
-            try:
-                changeset_of_edit(tried, old, [subject], self.read)
-            except InvalidInput as error:
-                problems += error.faults
-                state = replace(state, ledger=state.ledger.with_claims_from(subject, old))
-                continue
-            files |= changed_claim_files(state.ledger, ledger, changed)
-            state = tried
-            good.append(subject)
-            keys += changed
-        change = changeset_of_edit(state, old, good, self.read)
-        return state, replace(change, files={**files, **change.files}), tuple(keys)
+        self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
 
     def render_all(
         self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
@@ -310,43 +267,22 @@ class CommitBatch:
         return self._repository.publish(self.start.commit, self.head.commit)
 
 
-def _start_leases(state: State, now: datetime) -> tuple[State, dict[str, str]]:
-    """Start the leases of claims that a person approved; return state and changed files.
+def _with_started_leases(
+    snapshot: Snapshot, state: State, change: Changeset, keys: Iterable[ClaimKey], now: datetime
+) -> _Followed:
+    """Start the leases of claims that a person approved.
 
     They start at approval because a lease could otherwise end before the demand is approved.
     """
-    ledger, files = state.ledger, {}
+    ledger, files = state.ledger, dict(change.files)
     for claim in ledger.unstarted_claims():
         assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
         started = replace(claim, lease=claim.lease.restarted(now))
         ledger = ledger.replace(claim.key, started)
         files[claim_file.path_of(claim.key)] = claim_file.text_of(started)
-    return replace(state, ledger=ledger), files
+    snapshot = replace(snapshot, state=replace(state, ledger=ledger))
+    return _Followed(snapshot, replace(change, files=files), tuple(keys))
 
 
-def _ledger_and_config(state: State) -> tuple[Ledger, Config]:
-    return state.ledger, state.config
-
-
-def _with_ledger_and_config(state: State, applied: LedgerUpdate) -> State:
-    return replace(state, ledger=applied.ledger, config=applied.config)
-
-
-def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
-    """Return the snapshot of the generator's last commit.
-
-    :func:`demandops.staterepo.load.snapshot.advance` then applies what people changed since.
-
-    Raises:
-        InvalidInput: that commit never had a valid configuration.
-        StateRepoError: it is not a state repo.
-    """
-    tip = repository.tip()
-    last_valid_config.refuse_other_render_version(trees.commit_of(repository.objects, tip).tree)
-    base = commit_log.last_generator_commit(repository.objects, tip)
-    base = base or tip
-    made = trees.commit_of(repository.objects, base)
-    record = commit_log.entry_of(made)
-    if record.first("In-Force"):
-        return in_force_trailers.snapshot_at(repository.objects, made, record)
-    return snapshots.load_last_valid(repository.objects, base, progress)
+def _updated(state: State, update: LedgerUpdate) -> State:
+    return replace(state, ledger=update.ledger, config=update.config)

@@ -23,7 +23,6 @@ from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import MAIN, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
-from demandops.staterepo.history.commit_message import PROPOSAL
 
 PREFIX = "demand/"
 _HEADS = "refs/heads/"
@@ -34,6 +33,9 @@ _MAX_SLUG = 40
 
 class BranchMoved(StateRepoError):
     """Raised when a branch is not at the commit that the generator put there."""
+
+    def __init__(self, branch: str) -> None:
+        super().__init__(f"{branch} was changed by someone other than the generator")
 
 
 def branch_name(name: str, operation: str) -> str:
@@ -84,11 +86,7 @@ class ProposalBranches:
             BranchMoved: the branch is not at ``expected``.
             RemoteAway, PushDenied: it could not be pushed for another reason.
         """
-        if self._remote is None:
-            self._move(branch, commit, expected)
-            return ""
-        reference = f"{_HEADS}{branch}"
-        return self._push(f"{commit}:{reference}", branch, str(commit), expected, options)
+        return self._set(branch, commit, expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
         """Delete a branch, if it exists.
@@ -97,45 +95,42 @@ class ProposalBranches:
             BranchMoved: the branch is at another commit.
             RemoteAway, PushDenied: the deletion could not be pushed for another reason.
         """
-        if self._remote is None:
-            self._move(branch, None, expected)
-            return
-        self._push(f":{_HEADS}{branch}", branch, "", expected)
+        self._set(branch, None, expected)
 
-    def _push(
-        self, spec: str, branch: str, wanted: str, expected: str, options: Sequence[str] = ()
+    def _set(
+        self, branch: str, commit: Oid | None, expected: str, options: Sequence[str] = ()
     ) -> str:
-        """Push; if that fails, check whether the branch is as wanted nevertheless."""
-        assert self._remote is not None  # noqa: S101 - checked by the callers
-        lease = f"{_HEADS}{branch}:{expected}"
+        """Move or delete a branch; if a push fails, check whether it is as wanted nevertheless."""
+        reference, wanted = f"{_HEADS}{branch}", str(commit or "")
+        if self._remote is None:
+            self._set_here(reference, commit, expected)
+            return ""
         try:
+            spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
             return _link(self._remote.push(spec, lease, options))
         except git.GitCommandError as error:
             if options and _NO_OPTIONS.search(str(error.stderr)):
-                return self._push(spec, branch, wanted, expected)
+                return self._set(branch, commit, expected)
             now = self.heads().branches.get(branch, "")
             if now == wanted:
                 return ""  # the push succeeded, but the answer was lost
             if now != expected:
-                raise BranchMoved(
-                    f"{branch} was changed by someone other than the generator"
-                ) from None
+                raise BranchMoved(branch) from None
             raise self._remote.push_error(error) from None
 
-    def _move(self, branch: str, commit: Oid | None, expected: str) -> None:
+    def _set_here(self, reference: str, commit: Oid | None, expected: str) -> None:
         references = self._repository.objects.references
-        name = f"{_HEADS}{branch}"
-        now = str(references[name].target) if name in references else ""
+        now = str(references[reference].target) if reference in references else ""
         if commit is None and not now:
             return
         if now != expected:
-            raise BranchMoved(f"{branch} was changed by someone other than the generator")
+            raise BranchMoved(reference.removeprefix(_HEADS))
         if commit is None:
-            references.delete(name)
+            references.delete(reference)
         elif now:
-            references[name].set_target(commit, "demandops")
+            references[reference].set_target(commit, "demandops")
         else:
-            references.create(name, commit)
+            references.create(reference, commit)
 
     def tree(self, tip: Oid, files: Mapping[str, str | None]) -> Oid:
         """Return the tree of ``tip`` with ``files`` changed."""
@@ -165,10 +160,10 @@ class ProposalBranches:
             return False  # the clone was made again, or `git gc` removed the commit
         now = commit_of(objects, tip).tree
         new = objects[wanted].peel(pygit2.Tree)
-        proposed = dict(trees.differences(objects, old, proposal, ""))
-        if proposed != dict(trees.differences(objects, now, new, "")):
+        proposed = dict(trees.differences(old, proposal))
+        if proposed != dict(trees.differences(now, new)):
             return False
-        moved = dict(trees.differences(objects, old, now, ""))
+        moved = dict(trees.differences(old, now))
         return not set(moved) & set(proposed)
 
 
@@ -221,33 +216,26 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
     repo = Repository(repository.objects.path)
-    space = f"refs/remotes/origin/{PREFIX}"
-    if not isinstance(repository, RemoteRepository):
-        space = f"{_HEADS}{PREFIX}"
+    remote = isinstance(repository, RemoteRepository)
+    space = f"refs/remotes/origin/{PREFIX}" if remote else f"{_HEADS}{PREFIX}"
     main = repository.tip()
     for name in sorted(name for name in repo.references if name.startswith(space)):
-        entries = [
-            entry
-            for entry in commit_log.walk(repo, repo.references[name].resolve().target, main)
-            if PROPOSAL in entry.trailers
-        ]
-        if entries:
-            yield _from_commits(repo, f"{PREFIX}{name.removeprefix(space)}", entries)
+        found = commit_log.commits(repo, repo.references[name].resolve().target, main)
+        proposed = [pair for pair in found if commit_log.PROPOSAL in pair[1].trailers]
+        if not proposed:
+            continue
+        entries = [entry for _, entry in proposed]
+        first = proposed[-1][0]
+        yield PendingProposal(
+            branch=f"{PREFIX}{name.removeprefix(space)}",
+            commit=entries[0].commit,
+            summary=entries[0].summary,
+            since=datetime.fromtimestamp(first.author.time, tz=timezone.utc),
+            requesters=_all_of(entries, "Requester"),
+            demands=_all_of(entries, "Demand-Id"),
+            operations=_all_of(entries, "Operation-Id"),
+        )
 
 
-def _from_commits(
-    repo: Repository, branch: str, entries: list[commit_log.LogEntry]
-) -> PendingProposal:
-    def all_of(key: str) -> tuple[str, ...]:
-        return tuple(sorted({value for entry in entries for value in entry.trailers.get(key, ())}))
-
-    first = commit_of(repo, entries[-1].commit)
-    return PendingProposal(
-        branch=branch,
-        commit=entries[0].commit,
-        summary=entries[0].summary,
-        since=datetime.fromtimestamp(first.author.time, tz=timezone.utc),
-        requesters=all_of("Requester"),
-        demands=all_of("Demand-Id"),
-        operations=all_of("Operation-Id"),
-    )
+def _all_of(entries: Iterable[commit_log.LogEntry], key: str) -> tuple[str, ...]:
+    return tuple(sorted({value for entry in entries for value in entry.trailers.get(key, ())}))

@@ -1,0 +1,123 @@
+"""The claim files of a commit: reading them, and which of them differ between two commits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from pygit2 import Oid, Repository, Tree
+
+from demandops import naming
+from demandops.demand.claim import Claim, ClaimKey
+from demandops.errors import Fault, InvalidInput
+from demandops.ledger import claim_file
+from demandops.ledger.ledger import Ledger
+from demandops.render.gitops.paths import CLUSTERS_ROOT
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history import commit_log
+from demandops.subject import Subject
+
+
+@dataclass(frozen=True, slots=True)
+class ClaimFiles:
+    """The claims of some files, and the faults of the files that are not valid."""
+
+    claims: tuple[Claim, ...]
+    faults: tuple[Fault, ...]
+
+    def ledger(self) -> Ledger:
+        """Return the ledger with these claims."""
+        ledger = Ledger()
+        for claim in self.claims:
+            ledger = ledger.replace(claim.key, claim)
+        return ledger
+
+
+def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
+    """Return the claims of these files, (path, text); skip files that hold no claim."""
+    claims, faults = list[Claim](), list[Fault]()
+    for path, text in files:
+        if claim_file.kind_of(path) is None:
+            continue
+        try:
+            claims.append(claim_file.read(text, path))
+        except InvalidInput as error:
+            faults += error.faults
+    return ClaimFiles(tuple(claims), tuple(faults))
+
+
+def claim_at(tree: Tree | None, path: str) -> Claim | None:
+    """Return the claim at a path, or None if there is no file.
+
+    Raises:
+        InvalidInput: the file is not valid.
+    """
+    text = trees.read_text(tree, path)
+    return claim_file.read(text, path) if text is not None else None
+
+
+def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
+    """Return the claim at a path, or None if there is no valid file."""
+    try:
+        return claim_at(tree, path)
+    except InvalidInput:
+        return None
+
+
+def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
+    """Return the key of the claim in effect whose file is at a path; reads the whole ledger."""
+    if claim_file.kind_of(path) is None:
+        return None
+    keys = (claim.key for claim in ledger)
+    return next((key for key in keys if claim_file.path_of(key) == path), None)
+
+
+def last_valid_claims(
+    repo: Repository, last_valid_commit: Oid, to: Oid, paths: Iterable[str]
+) -> dict[str, Claim | None]:
+    """Return path → the claim as the generator last wrote it, even after a person's edit.
+
+    If it wrote none since the newest commit where all files were valid, that commit's claim counts.
+    """
+    tree = trees.commit_of(repo, last_valid_commit).tree
+    claims = {path: claim_at(tree, path) for path in paths}
+    left = set(claims)
+    for commit, entry in commit_log.commits(repo, to, last_valid_commit) if left else ():
+        before = trees.parent_tree(commit)
+        if before is None or not entry.by_generator:
+            continue
+        for path in [path for path in left if trees.differ(before, commit.tree, (path,))]:
+            claims[path] = claim_at(commit.tree, path)
+            left.remove(path)
+    return claims
+
+
+def changed_subjects(before: Ledger, after: Ledger) -> list[Subject]:
+    """Return the subjects whose claims differ between two ledgers, sorted."""
+    old, new = before.claims, after.claims
+    return sorted((one for one in {*old, *new} if old.get(one) != new.get(one)), key=str)
+
+
+def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
+    """Yield the claim files that differ, in order."""
+    changed = trees.differences(before, after, (claim_file.LEDGER_ROOT,))
+    return (path for path, _ in changed if claim_file.kind_of(path) is not None)
+
+
+def changes_node(repo: Repository, revision: str | Oid, node: str) -> bool:
+    """Return whether a commit changed what runs on a node, or a claim that names it."""
+    commit = trees.commit_of(repo, revision)
+    before, after = trees.parent_tree(commit), commit.tree
+    if before is None:
+        return False
+    folder = naming.object_name("", node)
+    for path, _ in trees.differences(before, after, (CLUSTERS_ROOT,)):
+        parts = path.split("/")
+        if len(parts) == 5 and parts[3] == folder:
+            return True
+    claims = (
+        valid_claim_at(tree, path)
+        for path in changed_files(before, after)
+        for tree in (before, after)
+    )
+    return any(claim is not None and claim.held.needs(node) for claim in claims)
