@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ import pytest
 import yaml
 from demandops.service import Generator
 
-from tests.kit import repo, sync, templates
+from tests.kit import repo, sync
 from tests.kit.cli import Ran, Run, runner
 from tests.kit.generator import running
 from tests.kit.processes import Drivers
@@ -28,7 +29,11 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     config.addinivalue_line("markers", "synced: force writes to disk, as the program does")
     sync.force(False)
-    templates.compile_once()
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Start more workers than processors: many tests wait for git, other processes and clocks."""
+    return (os.cpu_count() or 1) * 3 // 2
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -90,7 +95,9 @@ def limited(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def bare_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bare state repo as ``demandops init`` makes it; copy it, never write to it."""
-    return repo.init(tmp_path_factory.mktemp("template") / "state.git")
+    made = repo.init(tmp_path_factory.mktemp("template") / "state.git")
+    repo.git(made, "repack", "-adq")  # few files to copy
+    return made
 
 
 @pytest.fixture

@@ -25,8 +25,7 @@ from demandops.plan.release_keys import all_keys
 from tests.kit.cli import Run
 from tests.kit.config import FAST, skeleton
 from tests.kit.goals import BODY, CLOUD, STATION_CLOUD, application, connection, goal
-from tests.kit.memory import NOW
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import NOW, MemoryRepo
 from tests.kit.repo import GitRepo
 
 HERE = Path(__file__).parent
@@ -58,8 +57,8 @@ def additions() -> dict[str, str]:
 
 
 @pytest.fixture
-def books() -> Books:
-    return Books(additions())
+def books() -> MemoryRepo:
+    return MemoryRepo(additions())
 
 
 def record(id: str = "edge/record", **more: Any) -> dict[str, Any]:
@@ -121,7 +120,7 @@ def test_no_python_of_the_generator_knows_it() -> None:
         assert "object-fusion" not in text, path
 
 
-def test_a_service_for_each_topic_runs_where_its_source_is(books: Books) -> None:
+def test_a_service_for_each_topic_runs_where_its_source_is(books: MemoryRepo) -> None:
     books.send(goal([record(clouds=[CLOUD, STATION_CLOUD])]))
     releases = books.objects("HelmRelease")
     assert releases.keys() >= {"drv-vehicle00-vehicle00", "drv-station00-station00"}
@@ -138,13 +137,13 @@ def test_a_service_for_each_topic_runs_where_its_source_is(books: Books) -> None
 
 
 def test_what_runs_at_its_source_needs_a_connection_for_what_it_makes_of_its_input(
-    books: Books,
+    books: MemoryRepo,
 ) -> None:
     assert books.send(goal([record()])).warnings == (UNCARRIED,)
 
 
 def test_a_demand_of_our_own_gets_the_connection_that_brings_what_is_made_at_the_source(
-    books: Books,
+    books: MemoryRepo,
 ) -> None:
     topic = {"topic": CLOUD[0], "source": "vehicle00"}
     application = {
@@ -170,7 +169,7 @@ def test_a_demand_of_our_own_gets_the_connection_that_brings_what_is_made_at_the
     assert books.books() | {"commit": ""} == {"services": {}, "connections": {}, "commit": ""}
 
 
-def test_two_applications_of_different_kinds_share_a_driver(books: Books) -> None:
+def test_two_applications_of_different_kinds_share_a_driver(books: MemoryRepo) -> None:
     books.send(goal([record(who=["vehicle00"])], id="1"))
     before = books.rendered()
     decision = books.send(goal([monitor(who=["operator"])], id="2"))
@@ -190,7 +189,7 @@ def test_two_applications_of_different_kinds_share_a_driver(books: Books) -> Non
     assert [release.name[:4] for release in decision.releases] == ["mon-"]
 
 
-def test_a_shared_driver_stops_with_the_last_who_needs_it(books: Books) -> None:
+def test_a_shared_driver_stops_with_the_last_who_needs_it(books: MemoryRepo) -> None:
     for demanded in (record(), monitor()):
         books.send(goal([demanded], id=demanded["header"]["id"]))
     down = goal([record()], id="edge/record", shutdown=True)
@@ -204,7 +203,7 @@ def test_a_shared_driver_stops_with_the_last_who_needs_it(books: Books) -> None:
 def test_a_driver_does_not_depend_on_which_of_its_users_came_first() -> None:
     ends = []
     for order in ((record(), monitor()), (monitor(), record())):
-        books = Books(additions())
+        books = MemoryRepo(additions())
         for demanded in order:
             books.send(goal([demanded], id=demanded["header"]["id"]))
         ends.append(books.rendered())
@@ -214,7 +213,9 @@ def test_a_driver_does_not_depend_on_which_of_its_users_came_first() -> None:
 @pytest.mark.parametrize(
     ("topics", "replicas"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3), (6, 3), (7, 3), (20, 3)]
 )
-def test_replicas_follow_the_topics_within_bounds(books: Books, topics: int, replicas: int) -> None:
+def test_replicas_follow_the_topics_within_bounds(
+    books: MemoryRepo, topics: int, replicas: int
+) -> None:
     clouds = [(f"/points_{number}", "vehicle00") for number in range(topics)]
     books.send(goal([record(clouds=clouds)]))
     (values,) = (
@@ -226,7 +227,7 @@ def test_replicas_follow_the_topics_within_bounds(books: Books, topics: int, rep
     assert len(values["topics"]) == topics
 
 
-def test_replicas_go_down_again_when_topics_are_released(books: Books) -> None:
+def test_replicas_go_down_again_when_topics_are_released(books: MemoryRepo) -> None:
     clouds = [(f"/points_{number}", "vehicle00") for number in range(5)]
     books.send(goal([record(clouds=clouds)]))
     decision = books.send(goal([record(clouds=clouds[1:])], shutdown=True))
@@ -234,13 +235,13 @@ def test_replicas_go_down_again_when_topics_are_released(books: Books) -> None:
     assert change.details[-2:] == ("- replicas 3", "+ replicas 1")
 
 
-def test_a_list_of_the_message_that_it_does_not_take_is_refused(books: Books) -> None:
+def test_a_list_of_the_message_that_it_does_not_take_is_refused(books: MemoryRepo) -> None:
     assert books.faults(goal([record(ego=[("/ego", "vehicle00")])])) == [
         f"{BODY}.ego_data_topics: recorder has no such input; known: point_cloud"
     ]
 
 
-def test_another_kind_for_a_claimed_application_is_refused(books: Books) -> None:
+def test_another_kind_for_a_claimed_application_is_refused(books: MemoryRepo) -> None:
     books.send(goal([record("edge/x")]))
     assert books.faults(goal([application("edge/x", who=["vehicle01"])])) == [
         "apps[0].type: 'object-detection-fusion' contradicts an existing claim: 'edge/x' is held "
@@ -248,14 +249,14 @@ def test_another_kind_for_a_claimed_application_is_refused(books: Books) -> None
     ]
 
 
-def test_an_unknown_type_is_told_with_all_that_are_known(books: Books) -> None:
+def test_an_unknown_type_is_told_with_all_that_are_known(books: MemoryRepo) -> None:
     assert books.faults(goal([application(type=9)])) == [
         "apps[0].type: 9 is not a known application type; known: 3 (monitor), "
         "1 (object-detection-fusion), 2 (recorder)"
     ]
 
 
-def test_all_three_kinds_run_side_by_side(books: Books) -> None:
+def test_all_three_kinds_run_side_by_side(books: MemoryRepo) -> None:
     books.send(goal([application(), record(), monitor()], [connection()]))
     kinds = sorted(entry["service"] for entry in books.books()["services"].values())
     assert kinds == ["driver", "monitor", "object-detection", "object-fusion", "recorder"]
@@ -281,14 +282,14 @@ class TestParameters:
         return apply(ledger, request, NOW + timedelta(minutes=minute))[0]
 
     @staticmethod
-    def planned(books: Books, ledger: Ledger, service: str = "recorder") -> dict[str, object]:
+    def planned(books: MemoryRepo, ledger: Ledger, service: str = "recorder") -> dict[str, object]:
         for key in all_keys(ledger, books.config):
             release = plan(ledger, books.config, key)
             if isinstance(release, ServiceRelease) and key.service == service:  # type: ignore[union-attr]
                 return dict(release.parameters)
         raise AssertionError(f"no {service} is planned")
 
-    def test_nobody_says_anything(self, books: Books) -> None:
+    def test_nobody_says_anything(self, books: MemoryRepo) -> None:
         assert self.planned(books, self.book(Ledger(), "a")) == {
             "labels": [],
             "rate": 1,
@@ -313,7 +314,7 @@ class TestParameters:
         ],
     )
     def test_two_values_become_one(
-        self, books: Books, name: str, given: list[object], merged: object
+        self, books: MemoryRepo, name: str, given: list[object], merged: object
     ) -> None:
         ledger = Ledger()
         for minute, value in enumerate(given):
@@ -321,7 +322,7 @@ class TestParameters:
         assert self.planned(books, ledger)[name] == merged
 
     @pytest.mark.parametrize("name", ["labels", "rate", "quality", "format"])
-    def test_the_order_of_demands_does_not_matter(self, books: Books, name: str) -> None:
+    def test_the_order_of_demands_does_not_matter(self, books: MemoryRepo, name: str) -> None:
         values = {
             "labels": [["a"], ["b"]],
             "rate": [1, 2],
@@ -336,17 +337,17 @@ class TestParameters:
             ends.append(self.planned(books, ledger)[name])
         assert ends[0] == ends[1]
 
-    def test_who_says_nothing_does_not_count_as_saying_the_default(self, books: Books) -> None:
+    def test_who_says_nothing_does_not_count_as_saying_the_default(self, books: MemoryRepo) -> None:
         ledger = self.book(self.book(Ledger(), "a"), "b", rate=0.5, format="bag")
         assert self.planned(books, ledger)["rate"] == 0.5
         assert self.planned(books, ledger)["format"] == "bag"
 
-    def test_what_was_released_no_longer_counts(self, books: Books) -> None:
+    def test_what_was_released_no_longer_counts(self, books: MemoryRepo) -> None:
         ledger = self.book(self.book(Ledger(), "a", rate=5), "b", rate=9)
         (claim,) = (claim for claim in ledger if claim.requesters == ("b",))
         assert self.planned(books, ledger.replace(claim.key, None))["rate"] == 5
 
-    def test_values_that_nobody_said_how_to_merge_must_agree(self, books: Books) -> None:
+    def test_values_that_nobody_said_how_to_merge_must_agree(self, books: MemoryRepo) -> None:
         ledger = self.book(
             self.book(Ledger(), "vehicle00", format="mcap"), "vehicle01", format="bag"
         )
@@ -360,7 +361,7 @@ class TestParameters:
         assert (start, set(shown.split(" and "))) == ("", values)
         assert remedy == "agree, or have the application definition say how to merge them"
 
-    def test_a_text_where_a_number_is_merged_is_refused(self, books: Books) -> None:
+    def test_a_text_where_a_number_is_merged_is_refused(self, books: MemoryRepo) -> None:
         ledger = self.book(self.book(Ledger(), "a", rate=5), "b", rate="fast")
         with pytest.raises(Refused) as refused:
             self.planned(books, ledger)
@@ -371,7 +372,7 @@ class TestParameters:
             )
         ]
 
-    def test_parameters_are_in_the_values(self, books: Books) -> None:
+    def test_parameters_are_in_the_values(self, books: MemoryRepo) -> None:
         ledger = self.book(Ledger(), "a", rate=7, title="{{ x }}\n: 'y'", labels=["yes", "1e3"])
         from demandops.decision import State, rendered_files
 
@@ -385,14 +386,14 @@ class TestParameters:
 
     @pytest.mark.parametrize(("recorder", "monitor"), [(10, 20), (20, 10)])
     def test_a_shared_driver_merges_over_all_kinds_of_its_applications(
-        self, books: Books, recorder: int, monitor: int
+        self, books: MemoryRepo, recorder: int, monitor: int
     ) -> None:
         ledger = self.book(Ledger(), "a", "recorder", rate=recorder)
         ledger = self.book(ledger, "b", "monitor", rate=monitor)
         assert self.planned(books, ledger, "driver")["rate"] == 20
 
     def test_a_shared_driver_does_not_fall_back_to_the_default_of_one_kind(
-        self, books: Books
+        self, books: MemoryRepo
     ) -> None:
         ledger = self.book(Ledger(), "a", "monitor", rate=20)
         ledger = self.book(ledger, "b", "recorder")

@@ -27,6 +27,7 @@ def _played(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """The experiment's first six steps: all four join, vehicle00 and vehicle01 leave."""
     folder = Path(shutil.copytree(bare_template, tmp_path_factory.mktemp("played") / "state.git"))
     assert run_command(["request", *map(str, EXPERIMENT[:6]), "--state-repo", str(folder)]) == 0
+    git(folder, "repack", "-adq")
     return folder
 
 

@@ -23,7 +23,6 @@ from tests.kit.goals import (
     BODY,
     CLOUD,
     EGO,
-    ROS_NAMES,
     STATION_CLOUD,
     application,
     connection,
@@ -217,12 +216,6 @@ class TestDefectsOfTheReference:
                     assert "-c" not in words
                     assert not [word for word in words if set(word) & set("$`;'\"{}()*")]
         assert not trace.exists()
-
-    def test_08_a_topic_with_a_command_in_it_is_refused(self, request_json: Send) -> None:
-        topic = "/points$(touch trace)"
-        assert refused(request_json(goal([application(clouds=[(topic, "vehicle00")])]))) == [
-            (f"{BODY}.pointcloud_topics[0].topic_name", f"'{topic}' {ROS_NAMES}")
-        ]
 
     def test_09_a_topic_arrives_under_its_other_name(self, request_json: Send, state: Any) -> None:
         topics, targets = ["/b/points", "/a/points"], ["/x", "/y"]
@@ -432,34 +425,6 @@ class TestRefusals:
     def test_the_schemas_of_files_and_goals_are_the_tried_ones(self) -> None:
         shown = {model for model, _ in SCHEMAS.values()} - {AccessFile}
         assert shown == {*CONFIG_MODELS.values(), *GOAL_MODELS}
-
-    def test_what_is_refused_does_not_stop_what_comes_after(
-        self, request_json: Send, state: Any
-    ) -> None:
-        ran = request_json(perception(id="1"), goal(id="2"), perception(id="3"))
-        assert ran.code == 1
-        rows = ran.json()
-        assert [(row["index"], row["request_id"], row["outcome"]) for row in rows] == [
-            (0, "1", "booked"),
-            (1, "2", "refused"),
-            (2, "3", "booked"),
-        ]
-        assert len(state.commits()) == 3
-
-    def test_another_node_for_a_claimed_application_names_what_stands(
-        self, request_json: Send, state: Any
-    ) -> None:
-        booked(request_json(perception()))
-        before = state.tip
-        asked = goal([application(node="cloud", who=["vehicle01"])])
-        assert refused(request_json(asked)) == [
-            (
-                "apps[0].header.node_id",
-                "'cloud' contradicts an existing claim: 'edge/object_detection_fusion' is held by "
-                "vehicle00 on 'edge'; ask for that node, or wait until it is released",
-            )
-        ]
-        assert state.tip == before
 
     def test_two_contradicting_requests_of_one_call_are_judged_in_order(
         self, request_json: Send, state: Any

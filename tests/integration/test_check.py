@@ -91,16 +91,6 @@ def test_a_chart_that_changed_with_a_new_version_is_fine_and_shows_what_follows(
     )
 
 
-def test_a_chart_and_the_registry_that_disagree_are_told(checkout: Path, check: Check) -> None:
-    edit(checkout / CHART / "Chart.yaml", "version: 0.1.0", "version: 0.2.0")
-    code, _, errors = check()
-    assert code == 1
-    assert errors == (
-        "error: registry/charts.yaml: charts.object-fusion.version: is 0.1.0, but "
-        f"{CHART}/Chart.yaml says 0.2.0; make them equal\n"
-    )
-
-
 def test_a_generated_file_edited_by_hand_is_told(checkout: Path, check: Check) -> None:
     edit(checkout / "bootstrap" / "c-its.yaml", "prune: true", "prune: false")
     code, _, errors = check()
@@ -130,6 +120,14 @@ def test_a_folder_that_is_no_git_checkout_is_checked_all_the_same(
     assert check()[0] == 1
     code, _, errors = check("--base", "HEAD")
     assert (code, errors) == (1, f"error: {checkout} is not a Git checkout; leave out --base\n")
+
+
+def test_a_folder_that_is_no_state_repo(demandops: Run, tmp_path: Path) -> None:
+    said = (
+        f"error: {tmp_path} is not a state repo, because it has no demandops.yaml; `demandops "
+        "init` makes one\n"
+    )
+    assert demandops("check", tmp_path) == (1, "", said)
 
 
 def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None:

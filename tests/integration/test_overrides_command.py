@@ -13,7 +13,7 @@ import yaml
 
 from tests.kit.cli import Ran, Run
 from tests.kit.goals import perception
-from tests.kit.repo import GitRepo as StateRepo
+from tests.kit.repo import GitRepo
 
 HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
 
@@ -23,7 +23,7 @@ def text(**fields: Any) -> str:
 
 
 @pytest.fixture
-def overridden(state: StateRepo, request_json: Callable[..., Ran]) -> StateRepo:
+def overridden(state: GitRepo, request_json: Callable[..., Ran]) -> GitRepo:
     """A state repo with perception for vehicle00, and overrides of each sort in force."""
     request_json(perception())
     many = {
@@ -48,7 +48,7 @@ def overridden(state: StateRepo, request_json: Callable[..., Ran]) -> StateRepo:
     return state
 
 
-def test_overrides_are_listed_with_what_each_does(demandops: Run, overridden: StateRepo) -> None:
+def test_overrides_are_listed_with_what_each_does(demandops: Run, overridden: GitRepo) -> None:
     listed = demandops("overrides", "--state-repo", overridden.path, "--output", "json")
     assert listed.code == 0
     rows = {row["name"]: row for row in listed.json()}
@@ -89,7 +89,7 @@ def test_overrides_are_listed_with_what_each_does(demandops: Run, overridden: St
     assert before.out == "no overrides; see docs/overrides.md\n"
 
 
-def test_bookkeeping_shows_what_is_suspended(demandops: Run, overridden: StateRepo) -> None:
+def test_bookkeeping_shows_what_is_suspended(demandops: Run, overridden: GitRepo) -> None:
     books = demandops("bookkeeping", "--state-repo", overridden.path, "--output", "json").json()
     (entry,) = books["suspended"]
     demand = entry.pop("demand")
@@ -107,7 +107,7 @@ def test_bookkeeping_shows_what_is_suspended(demandops: Run, overridden: StateRe
 
 
 def test_check_says_what_an_override_would_do_and_warns_of_idle_ones(
-    demandops: Run, state: StateRepo, request_json: Callable[..., Ran], tmp_path: Path
+    demandops: Run, state: GitRepo, request_json: Callable[..., Ran], tmp_path: Path
 ) -> None:
     request_json(perception())
     clone = tmp_path / "clone"
@@ -136,9 +136,7 @@ def test_check_says_what_an_override_would_do_and_warns_of_idle_ones(
     assert (fault["file"], fault["field"]) == ("overrides/many.yaml", "values.replicas")
 
 
-def test_a_dry_run_tells_of_a_denial_and_books_nothing(
-    demandops: Run, overridden: StateRepo
-) -> None:
+def test_a_dry_run_tells_of_a_denial_and_books_nothing(demandops: Run, overridden: GitRepo) -> None:
     tip = overridden.tip
     goal = yaml.safe_dump(perception(id="another"))
     ran = demandops("request", "-", "--state-repo", overridden.path, "--dry-run", stdin=goal)
@@ -153,7 +151,7 @@ def test_there_is_a_schema_for_overrides(demandops: Run) -> None:
     assert "name" not in schema["properties"]
 
 
-def test_why_tells_what_overrides_do(demandops: Run, overridden: StateRepo) -> None:
+def test_why_tells_what_overrides_do(demandops: Run, overridden: GitRepo) -> None:
     def why(name: str, *more: str) -> Any:
         where = ("--state-repo", overridden.path)
         return demandops("why", name, *where, *more)
@@ -199,7 +197,7 @@ def test_why_tells_what_overrides_do(demandops: Run, overridden: StateRepo) -> N
 
 
 def test_why_of_what_an_override_keeps(
-    demandops: Run, overridden: StateRepo, request_json: Callable[..., Ran]
+    demandops: Run, overridden: GitRepo, request_json: Callable[..., Ran]
 ) -> None:
     overridden.commit({"overrides/closed.yaml": None, "overrides/off.yaml": None})
     assert request_json(perception(), perception(shutdown=True)).code == 0

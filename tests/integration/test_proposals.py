@@ -12,14 +12,13 @@ import yaml
 
 from tests.kit.cli import Ran, Run
 from tests.kit.goals import perception
-from tests.kit.repo import GitRepo as StateRepo
-from tests.kit.repo import git
+from tests.kit.repo import GitRepo, git
 
 POLICY = "policy/access-domains.yaml"
 
 
 @pytest.fixture
-def strict(state: StateRepo) -> StateRepo:
+def strict(state: GitRepo) -> GitRepo:
     """A state repo whose access domain demands approval."""
     data = yaml.safe_load(state.files(POLICY)[POLICY])
     data["domains"][0]["approval"] = "required"
@@ -32,7 +31,7 @@ Send = Callable[..., Ran]
 
 @pytest.fixture
 def send(demandops: Run) -> Send:
-    def call(state: StateRepo, *more: str, goal: Any = None) -> Ran:
+    def call(state: GitRepo, *more: str, goal: Any = None) -> Ran:
         text = yaml.safe_dump(goal or perception())
         return demandops("request", "-", "--state-repo", state.path, *more, stdin=text)
 
@@ -40,7 +39,7 @@ def send(demandops: Run) -> Send:
 
 
 def test_a_demand_that_needs_approval_is_proposed_and_listed(
-    demandops: Run, send: Send, strict: StateRepo
+    demandops: Run, send: Send, strict: GitRepo
 ) -> None:
     before = strict.tip
     ran = send(strict)
@@ -62,7 +61,7 @@ def test_a_demand_that_needs_approval_is_proposed_and_listed(
     assert by_url.json() == [row]
 
 
-def test_the_json_tells_where_it_waits(send: Send, strict: StateRepo) -> None:
+def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:
     [row] = send(strict, "--output", "json").json()
     branch = git(strict, "for-each-ref", "--format=%(refname:short)", "refs/heads/demand")
     assert row == {
@@ -78,7 +77,7 @@ def test_the_json_tells_where_it_waits(send: Send, strict: StateRepo) -> None:
 
 
 def test_sent_again_it_waits_on_the_same_branch_and_once_merged_changes_nothing(
-    demandops: Run, send: Send, strict: StateRepo
+    demandops: Run, send: Send, strict: GitRepo
 ) -> None:
     first, second = send(strict), send(strict)
     assert first.out == second.out
@@ -89,7 +88,7 @@ def test_sent_again_it_waits_on_the_same_branch_and_once_merged_changes_nothing(
     assert (row["outcome"], row["commit"]) == ("unchanged", strict.tip)
 
 
-def test_wait_waits_for_the_decision(send: Send, strict: StateRepo) -> None:
+def test_wait_waits_for_the_decision(send: Send, strict: GitRepo) -> None:
     def merge() -> None:
         for _ in range(1000):
             found = git(strict, "for-each-ref", "--format=%(refname)", "refs/heads/demand")
@@ -109,7 +108,7 @@ def test_wait_waits_for_the_decision(send: Send, strict: StateRepo) -> None:
     assert ran.out == f"standard input: request 0 'request' booked in {strict.tip}\n"
 
 
-def test_one_that_is_turned_down_while_it_waits_is_refused(send: Send, strict: StateRepo) -> None:
+def test_one_that_is_turned_down_while_it_waits_is_refused(send: Send, strict: GitRepo) -> None:
     def turn_down() -> None:
         for _ in range(1000):
             found = git(strict, "for-each-ref", "--format=%(refname:short)", "refs/heads/demand")
@@ -127,7 +126,7 @@ def test_one_that_is_turned_down_while_it_waits_is_refused(send: Send, strict: S
 
 
 def test_a_dry_run_says_that_approval_is_needed(
-    demandops: Run, send: Send, strict: StateRepo
+    demandops: Run, send: Send, strict: GitRepo
 ) -> None:
     ran = send(strict, "--dry-run")
     assert ran.out.splitlines()[:2] == [
@@ -140,7 +139,7 @@ def test_a_dry_run_says_that_approval_is_needed(
 
 
 def test_a_release_of_what_waits_is_done_by_a_later_call(
-    demandops: Run, send: Send, strict: StateRepo
+    demandops: Run, send: Send, strict: GitRepo
 ) -> None:
     send(strict)
     ran = send(strict, goal=perception(shutdown=True))
@@ -148,9 +147,7 @@ def test_a_release_of_what_waits_is_done_by_a_later_call(
     assert git(strict, "for-each-ref", "refs/heads/demand") == ""
 
 
-def test_verify_and_log_take_a_merged_proposal(
-    demandops: Run, send: Send, strict: StateRepo
-) -> None:
+def test_verify_and_log_take_a_merged_proposal(demandops: Run, send: Send, strict: GitRepo) -> None:
     branch = send(strict).out.split()[-1]
     git(strict, "update-ref", "refs/heads/main", f"refs/heads/{branch}")
     ran = demandops("verify", "--state-repo", strict.path)
@@ -160,8 +157,6 @@ def test_verify_and_log_take_a_merged_proposal(
     assert entry["commit"] == strict.tip
 
 
-def test_nothing_waits_in_a_new_state_repo(
-    demandops: Run, state: StateRepo, tmp_path: Path
-) -> None:
+def test_nothing_waits_in_a_new_state_repo(demandops: Run, state: GitRepo, tmp_path: Path) -> None:
     ran = demandops("proposals", "--state-repo", state.path, "--output", "json")
     assert (ran.code, ran.json()) == (0, [])

@@ -1,7 +1,7 @@
 """`demandops upgrade`: to another controller, and to a newer program that renders otherwise.
 
 The newer program is this one with its number raised and its label changed, in a folder of its own
-and run as a process of its own.
+and run in a process of its own.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import pty
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from demandops.staterepo.git import remote_repository
 
 from tests.kit.cli import Ran, Run
 from tests.kit.goals import perception
-from tests.kit.repo import GitRepo as StateRepo
+from tests.kit.repo import GitRepo
 
 ROOT = Path(__file__).parents[2]
 PARTS = ("generator", "ros_bridge", "templates", "appdefs", "state-repo-skeleton")
@@ -42,8 +42,23 @@ NEWER = (
 )
 
 
+# Runs each line's command line, with the text that it reads, in one process.
+SERVE = """
+import io, json, os, sys
+from contextlib import redirect_stderr, redirect_stdout
+from demandops.cli.main import run
+commands, answers = sys.stdin, sys.stdout
+for line in commands:
+    args, text, os.environ["DEMANDOPS_DATA_HOME"] = json.loads(line)
+    sys.stdin = io.TextIOWrapper(io.BytesIO(text.encode()), "utf-8")
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        code = run(args)
+    print(json.dumps([code, out.getvalue(), err.getvalue()]), file=answers, flush=True)
+"""
+
+
 @pytest.fixture(scope="session")
-def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subprocess.Popen[str]]:
     """A program of render version 2, whose HelmReleases wait longer."""
     folder = tmp_path_factory.mktemp("newer")
     for part in PARTS:
@@ -55,33 +70,37 @@ def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
         text = (folder / path).read_text()
         assert text.count(old) == 1
         (folder / path).write_text(text.replace(old, new))
-    return folder
+    roots = (folder / "generator", folder / "ros_bridge")
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVE],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, roots))},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        yield process
 
 
 @pytest.fixture
-def newer(newer_program: Path, state: StateRepo, data_home: Path) -> Run:
+def newer(newer_program: subprocess.Popen[str], state: GitRepo, data_home: Path) -> Run:
     """Run a command of the newer program on the state repo."""
 
     def call(*args: str, stdin: str = "") -> Ran:
-        command = [sys.executable, "-m", "demandops.cli.main", *args]
         options = ["--state-repo", str(state.path)] if args[0] != "init" else []
-        roots = (newer_program / "generator", newer_program / "ros_bridge")
-        done = subprocess.run(
-            [*command, *options],
-            cwd=newer_program,
-            input=stdin,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, roots))},
-            capture_output=True,
-            text=True,
-            check=False,
+        assert newer_program.stdin and newer_program.stdout
+        print(
+            json.dumps([[*args, *options], stdin, str(data_home)]),
+            file=newer_program.stdin,
+            flush=True,
         )
-        return Ran(done.returncode, done.stdout, done.stderr)
+        return Ran(*json.loads(newer_program.stdout.readline()))
 
     return call
 
 
 @pytest.fixture
-def upgraded(demandops: Run, state: StateRepo) -> Callable[..., Ran]:
+def upgraded(demandops: Run, state: GitRepo) -> Callable[..., Ran]:
     def call(*args: str) -> Ran:
         return demandops("upgrade", "--state-repo", state.path, *args)
 
@@ -89,7 +108,7 @@ def upgraded(demandops: Run, state: StateRepo) -> Callable[..., Ran]:
 
 
 @pytest.fixture
-def book(demandops: Run, state: StateRepo) -> Callable[..., Ran]:
+def book(demandops: Run, state: GitRepo) -> Callable[..., Ran]:
     def call(**options: Any) -> Ran:
         goal = yaml.safe_dump(perception(**options))
         return demandops("request", "-", "--state-repo", state.path, stdin=goal)
@@ -97,7 +116,7 @@ def book(demandops: Run, state: StateRepo) -> Callable[..., Ran]:
     return call
 
 
-def verified(demandops: Run, state: StateRepo) -> list[str]:
+def verified(demandops: Run, state: GitRepo) -> list[str]:
     rows = demandops("verify", "--state-repo", state.path, "--output", "json").json()
     assert all(row["holds"] for row in rows)
     return [row["skipped"] for row in rows]
@@ -107,7 +126,7 @@ def verified(demandops: Run, state: StateRepo) -> list[str]:
 
 
 def test_all_goes_over_in_one_commit_and_back_and_verifies(
-    demandops: Run, state: StateRepo, upgraded: Callable[..., Ran], book: Callable[..., Ran]
+    demandops: Run, state: GitRepo, upgraded: Callable[..., Ran], book: Callable[..., Ran]
 ) -> None:
     assert book().code == 0
     flux, tip = state.files(), state.tip
@@ -131,7 +150,7 @@ def test_all_goes_over_in_one_commit_and_back_and_verifies(
     assert verified(demandops, state) == [None]
 
 
-def test_the_commit_says_what_it_did(state: StateRepo, upgraded: Callable[..., Ran]) -> None:
+def test_the_commit_says_what_it_did(state: GitRepo, upgraded: Callable[..., Ran]) -> None:
     assert upgraded("--gitops", "argocd").code == 0
     assert state.commits()[0] == (
         "Render everything again, for Argo CD\n"
@@ -153,7 +172,7 @@ def test_the_commit_says_what_it_did(state: StateRepo, upgraded: Callable[..., R
 
 
 def test_what_a_person_wrote_in_the_file_stays(
-    state: StateRepo, upgraded: Callable[..., Ran]
+    state: GitRepo, upgraded: Callable[..., Ran]
 ) -> None:
     text = (
         "# Ours.\napiVersion: demandops/v1\nkind: StateRepository\n"
@@ -168,7 +187,7 @@ def test_what_a_person_wrote_in_the_file_stays(
 
 
 def test_a_dry_run_tells_all_and_writes_nothing(
-    state: StateRepo, upgraded: Callable[..., Ran], book: Callable[..., Ran]
+    state: GitRepo, upgraded: Callable[..., Ran], book: Callable[..., Ran]
 ) -> None:
     assert book().code == 0
     before = state.tip
@@ -212,7 +231,7 @@ def test_a_dry_run_tells_all_and_writes_nothing(
 
 @pytest.mark.parametrize(("answer", "code"), [("n", 1), ("y", 0)])
 def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(
-    state: StateRepo, data_home: Path, answer: str, code: int
+    state: GitRepo, data_home: Path, answer: str, code: int
 ) -> None:
     before = state.tip
     command = [sys.executable, "-m", "demandops.cli.main", "upgrade", "--gitops", "argocd"]
@@ -236,7 +255,7 @@ def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(
 
 
 def test_back_to_flux_argo_cds_finalizers_go_first(
-    state: StateRepo, upgraded: Callable[..., Ran]
+    state: GitRepo, upgraded: Callable[..., Ran]
 ) -> None:
     assert upgraded("--gitops", "argocd").code == 0
     (step,) = upgraded("--gitops", "flux", "--dry-run", "--output", "json").json()["before"]
@@ -254,7 +273,7 @@ def test_back_to_flux_argo_cds_finalizers_go_first(
 
 @pytest.mark.parametrize("more", [[], ["--gitops", "flux"], ["--url", URL]], ids=" ".join)
 def test_where_nothing_would_change_nothing_is_committed(
-    state: StateRepo, upgraded: Callable[..., Ran], more: list[str]
+    state: GitRepo, upgraded: Callable[..., Ran], more: list[str]
 ) -> None:
     before = state.tip
     ran = upgraded(*more)
@@ -277,7 +296,7 @@ def test_where_nothing_would_change_nothing_is_committed(
     ],
 )
 def test_a_url_that_cannot_be_taken_is_told(
-    state: StateRepo, upgraded: Callable[..., Ran], args: list[str], said: str
+    state: GitRepo, upgraded: Callable[..., Ran], args: list[str], said: str
 ) -> None:
     before = state.tip
     ran = upgraded(*args)
@@ -286,7 +305,7 @@ def test_a_url_that_cannot_be_taken_is_told(
 
 
 def test_a_file_that_cannot_be_edited_by_the_program_is_told(
-    state: StateRepo, upgraded: Callable[..., Ran]
+    state: GitRepo, upgraded: Callable[..., Ran]
 ) -> None:
     root = {
         "apiVersion": "demandops/v1",
@@ -305,7 +324,7 @@ def test_a_file_that_cannot_be_edited_by_the_program_is_told(
 
 
 def test_a_state_repo_that_is_not_valid_is_not_upgraded(
-    state: StateRepo, upgraded: Callable[..., Ran]
+    state: GitRepo, upgraded: Callable[..., Ran]
 ) -> None:
     nodes = state.files()["inventory/nodes.yaml"]
     before = state.commit(
@@ -317,7 +336,7 @@ def test_a_state_repo_that_is_not_valid_is_not_upgraded(
 
 
 def test_a_url_is_pushed_to_and_tried_again_when_somebody_was_first(
-    demandops: Run, state: StateRepo, book: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
+    demandops: Run, state: GitRepo, book: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert book().code == 0
     push, others = remote_repository.RemoteRepository.publish, []
@@ -338,7 +357,7 @@ def test_a_url_is_pushed_to_and_tried_again_when_somebody_was_first(
 
 
 def test_a_state_repo_that_never_stands_still_is_told(
-    state: StateRepo, monkeypatch: pytest.MonkeyPatch, upgraded: Callable[..., Ran]
+    state: GitRepo, monkeypatch: pytest.MonkeyPatch, upgraded: Callable[..., Ran]
 ) -> None:
     monkeypatch.setattr(upgrade, "_PAUSE_S", 0)
     monkeypatch.setattr(upgrade.CommitBatch, "publish", lambda self: False)
@@ -352,7 +371,7 @@ def test_a_state_repo_that_never_stands_still_is_told(
 
 
 def test_a_running_generator_goes_on_for_the_other_controller(
-    state: StateRepo, data_home: Path, upgraded: Callable[..., Ran]
+    state: GitRepo, data_home: Path, upgraded: Callable[..., Ran]
 ) -> None:
     generator = Generator(str(state.path))
     try:
@@ -370,7 +389,7 @@ def test_a_running_generator_goes_on_for_the_other_controller(
 
 
 def test_a_newer_program_serves_only_after_an_upgrade_and_the_older_only_before(
-    demandops: Run, state: StateRepo, newer: Run, book: Callable[..., Ran]
+    demandops: Run, state: GitRepo, newer: Run, book: Callable[..., Ran]
 ) -> None:
     assert book().code == 0
     before, goal = state.tip, yaml.safe_dump(perception(id="second"))
@@ -405,7 +424,7 @@ def test_a_newer_program_serves_only_after_an_upgrade_and_the_older_only_before(
 
 
 def test_a_running_generator_stops_taking_demands_when_a_newer_one_takes_over(
-    state: StateRepo, data_home: Path, newer: Run
+    state: GitRepo, data_home: Path, newer: Run
 ) -> None:
     generator = Generator(str(state.path))
     try:
@@ -420,7 +439,7 @@ def test_a_running_generator_stops_taking_demands_when_a_newer_one_takes_over(
 
 
 def test_an_upgrade_that_is_reverted_gives_the_repo_back_to_the_older_program(
-    demandops: Run, state: StateRepo, newer: Run, book: Callable[..., Ran]
+    demandops: Run, state: GitRepo, newer: Run, book: Callable[..., Ran]
 ) -> None:
     assert book().code == 0
     old = state.files()

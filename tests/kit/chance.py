@@ -29,7 +29,11 @@ def examples(count: int) -> Callable[[Any], Any]:
         database=None,
         phases=[Phase.explicit, Phase.generate, Phase.shrink],
         deadline=None,
-        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+        suppress_health_check=[
+            HealthCheck.too_slow,
+            HealthCheck.data_too_large,
+            HealthCheck.function_scoped_fixture,
+        ],
     )
 
 

@@ -132,11 +132,6 @@ def _is_around(field: str, place: str) -> bool:
     return (long.startswith(short) and (long[len(short) :] or ".")[0] in ".[") or not short
 
 
-def places_of_faults(faults: Iterable[Fault]) -> list[str]:
-    """Return the field of each fault, with its code unless that is the usual one."""
-    return [one.field + (f" [{one.code}]" if one.code != "invalid" else "") for one in faults]
-
-
 def problem(
     mutation: Mutation, faults: Sequence[Fault], form: Form, *, free: Container[str], file: str = ""
 ) -> str:

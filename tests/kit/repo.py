@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import os
 import subprocess
+import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,41 +93,57 @@ class GitRepo:
         """Return what a GitOps controller reads."""
         return {p: text for p, text in self.files("clusters/").items() if p.endswith(".yaml")}
 
-    def commit(self, changed: dict[str, str | None], text: str = "By hand\n") -> str:
-        """Commit as a person would, and return the commit."""
-        repo, index = _index(self.path, "main")
+    def commit(
+        self,
+        changed: Mapping[str, str | None],
+        text: str = "By hand\n",
+        who: tuple[str, str, int] = ("A person", "person@example.org", 1_770_000_000),
+    ) -> str:
+        """Commit as a forge's web page does, with no clone, and return the commit."""
+        parent = self.tip
+        repo, index = _index(self.path, parent)
         for path, new in changed.items():
             if new is None:
                 index.remove(path)
             else:
                 blob = repo.create_blob(new.encode())
                 index.add(pygit2.IndexEntry(path, blob, pygit2.enums.FileMode.BLOB))
-        who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
+        by = pygit2.Signature(*who, 0)
         tree = index.write_tree(repo)
-        return str(repo.create_commit("refs/heads/main", who, who, text, tree, [self.tip]))
+        return str(repo.create_commit("refs/heads/main", by, by, text, tree, [parent]))
 
 
 class Person:
-    """A person who changes the state repo in a clone and pushes it."""
+    """A person who changes the state repo at its forge, or in a clone and pushes it."""
 
     def __init__(self, remote: Path, folder: Path) -> None:
         self.bare, self.folder = remote, folder
-        git(folder.parent, "clone", "--quiet", str(remote), str(folder))
 
     def _git(self, *args: str) -> str:
         return git(self.folder, *args)
 
     def fetch(self) -> None:
+        """Have the newest branches in the clone, and main's files in its folder."""
+        if not self.folder.exists():
+            git(self.folder.parent, "clone", "--quiet", str(self.bare), str(self.folder))
+            return
         self._git("fetch", "--quiet", "--prune", "origin")
         self._git("reset", "--quiet", "--hard", "origin/main")
 
     def read(self, path: str) -> str:
         """Return a file of the newest main."""
-        self.fetch()
-        return (self.folder / path).read_text()
+        return GitRepo(self.bare).files()[path]
 
     def change(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
-        """Commit ``files`` (``None``: remove) on the newest main and push it; return the commit."""
+        """Commit ``files`` (``None``: remove) on the newest main; return the commit."""
+        who = ("Petra Platform", "petra@example.org", int(time.time()))
+        for _ in range(100):
+            with suppress(pygit2.GitError):  # a generator was first
+                return GitRepo(self.bare).commit(files, f"{message}\n", who)
+        raise AssertionError("main never stood still")
+
+    def push(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
+        """Do the same in the clone and push it; fails when a generator was first."""
         self.fetch()
         for path, text in files.items():
             target = self.folder / path
@@ -171,7 +189,7 @@ class Person:
         self._git("checkout", "--quiet", "-")
 
     def delete(self, branch: str) -> None:
-        self._git("push", "--quiet", "origin", f":{branch}")
+        pygit2.Repository(str(self.bare)).branches.delete(branch)
 
     def _push(self) -> None:
         self._git("push", "--quiet", "origin", "HEAD:main")
@@ -223,8 +241,7 @@ def operations(repo: Path) -> list[str]:
 
 def branches(repo: Path) -> list[str]:
     """Return the branches of demands that await approval."""
-    refs = git(repo, "for-each-ref", "--format=%(refname:short)", "refs/heads/demand")
-    return refs.splitlines()
+    return sorted(b for b in pygit2.Repository(str(repo)).branches.local if b.startswith("demand/"))
 
 
 def books(repo: Path, revision: str = "main") -> dict[str, Any]:
@@ -234,9 +251,8 @@ def books(repo: Path, revision: str = "main") -> dict[str, Any]:
 
 def claims(repo: Path, needle: str = "") -> list[str]:
     """The paths of claim files whose text holds ``needle``."""
-    paths = git(repo, "ls-tree", "-r", "--name-only", "main", "ledger/").splitlines()
-    paths = [path for path in paths if path.endswith(".yaml")]
-    return [path for path in paths if needle in git(repo, "show", f"main:{path}")]
+    files = GitRepo(repo).files("ledger/")
+    return [path for path in files if path.endswith(".yaml") and needle in files[path]]
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
@@ -248,7 +264,9 @@ def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]
 
 
 def root(repo: Path) -> str:
-    return git(repo, "rev-list", "--max-parents=0", "main")
+    """Return the first commit."""
+    *_, first = pygit2.Repository(str(repo)).walk(tip(repo))
+    return str(first.id)
 
 
 def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
@@ -266,6 +284,6 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
     assert (fsck.returncode, fsck.stdout, fsck.stderr) == (0, "", "")
     made = commits(repo)
     assert [commit.id for commit in made if len(commit.parents) != 1] == []
-    ids = operations(repo)
+    ids = [found for commit in made if (found := commit.one("Operation-Id"))]
     assert sorted(ids) == sorted(set(ids))
     assert differing(repo, made[-verify_last - 1].id if verify_last else None) == {}

@@ -18,11 +18,12 @@ from tests.kit.repo import git, tip
 from tests.kit.ros import Client, Serve, Served
 
 
-def slow_remote(bare: Path, seconds: float) -> str:
-    """Delay every push to a repository, and return its URL."""
+def held_remote(bare: Path) -> str:
+    """Hold every push to a repository until its file ``go`` is there, and return its URL."""
     hook = bare / "hooks" / "pre-receive"
     hook.parent.mkdir(exist_ok=True)
-    hook.write_text(f"#!/bin/sh\nsleep {seconds}\n")
+    wait = "for _ in $(seq 600); do [ -e go ] && exit; sleep 0.05; done"
+    hook.write_text(f"#!/bin/sh\n{wait}\n")
     hook.chmod(0o755)
     return f"file://{bare}"
 
@@ -88,7 +89,7 @@ def test_two_hundred_goals_at_once_are_all_answered_and_none_is_lost(
 def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(
     serve: Serve, client: Client, bare: Path
 ) -> None:
-    served = serve(slow_remote(bare, 2))
+    served = serve(held_remote(bare))
     client.ready()
     committed = client.send(connection(1))
     client.wait(lambda: any(text.startswith("committed") for text in committed.feedback))
@@ -96,6 +97,7 @@ def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(
     client.wait(lambda: waiting.accepted is not None)
     assert client.cancel(waiting)
     assert not client.cancel(committed)
+    (bare / "go").touch()
     client.wait(lambda: waiting.answered and committed.answered)
     assert (waiting.status, committed.status) == ("cancelled", "succeeded")
     assert list(served.bookkeeping()["connections"]) == ["c1"]
@@ -106,12 +108,13 @@ def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(
 def test_a_stopped_node_first_finishes_the_open_goals(
     serve: Serve, client: Client, bare: Path, number: signal.Signals
 ) -> None:
-    served = serve(slow_remote(bare, 1))
+    served = serve(held_remote(bare))
     client.ready()
     goals = [client.send(connection(i)) for i in range(5)]
     client.wait(lambda: all(goal.accepted is not None for goal in goals))
     client.wait(lambda: any("committed" in text for goal in goals for text in goal.feedback))
     served.process.send_signal(number)
+    (bare / "go").touch()
     client.wait(lambda: all(goal.answered for goal in goals))
     assert {goal.status for goal in goals} == {"succeeded"}, served.log.read_text()
     assert served.process.wait(30) == 0
@@ -121,7 +124,7 @@ def test_a_stopped_node_first_finishes_the_open_goals(
 def test_a_restart_resumes_a_demand_that_was_not_answered(
     serve: Serve, client: Client, bare: Path
 ) -> None:
-    served = serve(slow_remote(bare, 30))
+    served = serve(held_remote(bare))
     client.ready()
     goal = client.send(connection(1))
     client.wait(lambda: any("committed" in text for text in goal.feedback))

@@ -10,9 +10,18 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Mapping
+from types import CodeType
 from typing import Any
 
-from jinja2 import BaseLoader, Environment, FileSystemLoader, StrictUndefined, TemplateError
+from jinja2 import (
+    BaseLoader,
+    BytecodeCache,
+    Environment,
+    FileSystemLoader,
+    StrictUndefined,
+    TemplateError,
+)
+from jinja2.bccache import Bucket
 from jinja2.environment import Template
 from jinja2.exceptions import TemplateNotFound, TemplateSyntaxError
 from jinja2.runtime import Undefined
@@ -47,6 +56,26 @@ class _FilesLoader(BaseLoader):
         if template not in self._files:
             raise TemplateNotFound(template)
         return self._files[template], template, lambda: True
+
+
+class _CompiledTemplates(BytecodeCache):
+    """Keeps compiled templates, so that each text is compiled once in a process."""
+
+    _LIMIT = 256
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[str, str], CodeType] = {}
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Fill in the template's code, if its path and text are known."""
+        bucket.code = self._kept.get((bucket.key, bucket.checksum))
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Keep the template's code, and no more than the limit: a text may have many versions."""
+        if len(self._kept) >= self._LIMIT:
+            self._kept.clear()
+        if bucket.code:
+            self._kept[bucket.key, bucket.checksum] = bucket.code
 
 
 def _finalize(value: object) -> object:
@@ -106,16 +135,20 @@ _OPTIONS: dict[str, Any] = {
     "keep_trailing_newline": True,
     "auto_reload": False,
 }
+_OWN_COMPILED, _CONFIG_COMPILED = _CompiledTemplates(), _CompiledTemplates()
 
 
 class Engine:
-    """Renders the program's templates and those of one configuration; compiles each once."""
+    """Renders the program's templates and those of one configuration."""
 
     def __init__(self, files: Mapping[str, str]) -> None:
+        own, config = FileSystemLoader(data_folder("templates")), _FilesLoader(files)
         self._own = _configure(
-            Environment(loader=FileSystemLoader(data_folder("templates")), **_OPTIONS)  # noqa: S701 - YAML, not HTML
+            Environment(loader=own, bytecode_cache=_OWN_COMPILED, **_OPTIONS)  # noqa: S701 - YAML, not HTML
         )
-        self._config = _configure(Sandbox(loader=_FilesLoader(files), **_OPTIONS))
+        self._config = _configure(
+            Sandbox(loader=config, bytecode_cache=_CONFIG_COMPILED, **_OPTIONS)
+        )
 
     def text(self, template: str, **context: object) -> str:
         """Render a template of the program (``flux/release.yaml.j2``)."""

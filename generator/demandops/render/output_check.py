@@ -10,11 +10,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import jsonschema_rs
-import kubernetes_validate
 
 from demandops import strict_yaml
 from demandops.config.base_model import field_path
@@ -162,7 +162,9 @@ def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
     """Compile the schema of a built-in kind."""
     *group, version = api.split("/")
     prefix = f"{group[0].split('.')[0]}-" if group else ""
-    folder = Path(kubernetes_validate.__file__).parent / "kubernetes-json-schema"
+    package = find_spec("kubernetes_validate")  # its import is slow, and only its files are used
+    assert package and package.origin  # noqa: S101 - it is one of our dependencies
+    folder = Path(package.origin).parent / "kubernetes-json-schema"
     folder = folder / f"v{KUBERNETES_VERSION}-local-strict"
     name = f"{kind.lower()}-{prefix}{version}.json"
     schema = json.loads((folder / name).read_text())

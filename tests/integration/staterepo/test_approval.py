@@ -21,8 +21,7 @@ from demandops.service.approvals import approvals
 from tests.kit import rig
 from tests.kit.generator import Proposed
 from tests.kit.git_over_http import serving
-from tests.kit.repo import Person as Petra
-from tests.kit.repo import branches
+from tests.kit.repo import Person, branches
 from tests.kit.rig import Gate, git, goal, leave
 
 
@@ -34,14 +33,14 @@ def _eager(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def petra(bare: Path, tmp_path: Path) -> Petra:
-    made = Petra(bare, tmp_path / "petra")
+def petra(bare: Path, tmp_path: Path) -> Person:
+    made = Person(bare, tmp_path / "petra")
     made.policy(approval="required")
     return made
 
 
 def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_it(
-    address: str, bare: Path, petra: Petra
+    address: str, bare: Path, petra: Person
 ) -> None:
     before = rig.tip(bare)
     with rig.running(address) as generator:
@@ -64,7 +63,7 @@ def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_
     assert rig.tip(bare) == commit.id, "the merge fits, so nothing follows"
 
 
-Way = Callable[[Petra, str], None]
+Way = Callable[[Person, str], None]
 
 
 @pytest.mark.parametrize(
@@ -77,12 +76,12 @@ Way = Callable[[Petra, str], None]
             lambda p, b: p.squash(b, f"Squashed\n\n{git(p.bare, 'log', '-1', '--format=%B', b)}"),
             id="squash-with-trailers",
         ),
-        pytest.param(Petra.rebase, id="rebase"),
+        pytest.param(Person.rebase, id="rebase"),
     ],
 )
 @pytest.mark.parametrize("moved", [False, True], ids=["same-main", "main-moved-on"])
 def test_however_it_is_merged_the_demand_is_booked_and_the_files_fit(
-    bare: Path, petra: Petra, way: Way, moved: bool
+    bare: Path, petra: Person, way: Way, moved: bool
 ) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
@@ -111,7 +110,7 @@ def assert_rendered(bare: Path) -> None:
     assert stands == {path: text for path, text in wanted.items() if path.endswith(".yaml")}
 
 
-def test_a_deleted_branch_turns_the_demand_down(url: str, bare: Path, petra: Petra) -> None:
+def test_a_deleted_branch_turns_the_demand_down(url: str, bare: Path, petra: Person) -> None:
     before = rig.tip(bare)
     with rig.running(url) as generator:
         proposed = Proposed(generator, goal(1))
@@ -125,7 +124,7 @@ def test_a_deleted_branch_turns_the_demand_down(url: str, bare: Path, petra: Pet
     assert branches(bare) == []
 
 
-def test_a_demand_that_waits_can_be_taken_back(url: str, bare: Path, petra: Petra) -> None:
+def test_a_demand_that_waits_can_be_taken_back(url: str, bare: Path, petra: Person) -> None:
     with rig.running(url) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
@@ -137,7 +136,7 @@ def test_a_demand_that_waits_can_be_taken_back(url: str, bare: Path, petra: Petr
 
 
 def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
-    bare: Path, petra: Petra
+    bare: Path, petra: Person
 ) -> None:
     gate = Gate()
     with rig.running(bare) as generator:
@@ -160,7 +159,7 @@ def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
         assert not waiting.future.done()
 
 
-def test_a_proposal_outlives_the_generator(address: str, bare: Path, petra: Petra) -> None:
+def test_a_proposal_outlives_the_generator(address: str, bare: Path, petra: Person) -> None:
     with rig.running(address) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         branch = proposed.branch
@@ -177,7 +176,7 @@ def test_a_proposal_outlives_the_generator(address: str, bare: Path, petra: Petr
 
 
 def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
-    address: str, bare: Path, petra: Petra
+    address: str, bare: Path, petra: Person
 ) -> None:
     with rig.running(address) as generator:
         taken, refused = (Proposed(generator, goal(n), f"op-{n}") for n in (1, 2))
@@ -193,7 +192,7 @@ def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
 
 @pytest.mark.parametrize("how", ["generator-runs", "merged-while-away", "rebased-while-away"])
 def test_two_proposals_from_one_tip_come_to_what_two_demands_come_to(
-    bare: Path, petra: Petra, how: str
+    bare: Path, petra: Person, how: str
 ) -> None:
     """Both change the same fusion, so the second does not fit once the first is merged."""
     one, two = goal(0, vehicle=0), goal(5, vehicle=1)
@@ -221,7 +220,7 @@ def test_two_proposals_from_one_tip_come_to_what_two_demands_come_to(
     assert_rendered(bare)
 
 
-def test_a_proposal_that_still_fits_is_left_where_it_is(bare: Path, petra: Petra) -> None:
+def test_a_proposal_that_still_fits_is_left_where_it_is(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         first = Proposed(generator, goal(1, vehicle=1))
         stood = git(bare, "rev-parse", first.branch)
@@ -233,7 +232,7 @@ def test_a_proposal_that_still_fits_is_left_where_it_is(bare: Path, petra: Petra
         assert git(bare, "rev-parse", first.branch) == stood
 
 
-def test_a_branch_that_a_person_works_on_is_left_to_them(bare: Path, petra: Petra) -> None:
+def test_a_branch_that_a_person_works_on_is_left_to_them(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         one = Proposed(generator, goal(0, vehicle=0))
         branch = one.branch
@@ -254,7 +253,7 @@ def test_a_branch_that_a_person_works_on_is_left_to_them(bare: Path, petra: Petr
     assert_rendered(bare)
 
 
-def test_the_same_request_sent_twice_waits_on_one_branch(bare: Path, petra: Petra) -> None:
+def test_the_same_request_sent_twice_waits_on_one_branch(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         first = Proposed(generator, goal(1), "op-1")
         branch = first.branch
@@ -266,7 +265,7 @@ def test_the_same_request_sent_twice_waits_on_one_branch(bare: Path, petra: Petr
         assert (first.outcome(), second.outcome()) == ("booked", "booked")
 
 
-def test_a_release_of_what_waits_takes_the_branch_away(bare: Path, petra: Petra) -> None:
+def test_a_release_of_what_waits_takes_the_branch_away(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1))
         assert [proposed.branch] == branches(bare)
@@ -278,7 +277,7 @@ def test_a_release_of_what_waits_takes_the_branch_away(bare: Path, petra: Petra)
             rig.book(generator, leave(1))
 
 
-def test_a_release_right_behind_the_demand_leaves_no_branch(bare: Path, petra: Petra) -> None:
+def test_a_release_right_behind_the_demand_leaves_no_branch(bare: Path, petra: Person) -> None:
     gate = rig.Gate()
     with rig.running(bare) as generator:
         generator.submit(leave(3), listener=rig.Stages())
@@ -320,7 +319,7 @@ def put(demand: str, vehicle: int, lease: int | None = None, who: str = "user") 
     return made | ({"lease": lease} if lease else {})
 
 
-def test_a_put_of_the_same_demand_replaces_the_proposal(bare: Path, petra: Petra) -> None:
+def test_a_put_of_the_same_demand_replaces_the_proposal(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         first = Proposed(generator, put("d", 1), "op-1")
         branch = first.branch
@@ -337,7 +336,7 @@ def test_a_put_of_the_same_demand_replaces_the_proposal(bare: Path, petra: Petra
     assert "vehicle01" not in git(bare, "show", f"main:{claim}")
 
 
-def test_giving_up_and_renewing_need_no_approval(bare: Path, petra: Petra) -> None:
+def test_giving_up_and_renewing_need_no_approval(bare: Path, petra: Person) -> None:
     petra.policy(approval="none")
     with rig.running(bare) as generator:
         rig.book(generator, goal(1), put("d", 1, 600))
@@ -351,7 +350,7 @@ def test_giving_up_and_renewing_need_no_approval(bare: Path, petra: Petra) -> No
         assert branches(bare) == []
 
 
-def test_a_lease_counts_from_the_merge(bare: Path, petra: Petra) -> None:
+def test_a_lease_counts_from_the_merge(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, put("d", 1, 600), "op-1")
         branch = proposed.branch
@@ -373,7 +372,7 @@ def test_a_lease_counts_from_the_merge(bare: Path, petra: Petra) -> None:
 
 
 def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(
-    bare: Path, petra: Petra
+    bare: Path, petra: Person
 ) -> None:
     with rig.running(bare) as generator:
         first = goal(0)
@@ -388,7 +387,7 @@ def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(
         rig.wait_until(lambda: gone not in branches(bare), "the branch is taken away")
 
 
-def test_a_policy_that_asks_no_more_lets_what_waits_through(bare: Path, petra: Petra) -> None:
+def test_a_policy_that_asks_no_more_lets_what_waits_through(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
@@ -400,7 +399,7 @@ def test_a_policy_that_asks_no_more_lets_what_waits_through(bare: Path, petra: P
     rig.assert_sound(bare)
 
 
-def test_demands_that_need_none_go_on_meanwhile(bare: Path, petra: Petra) -> None:
+def test_demands_that_need_none_go_on_meanwhile(bare: Path, petra: Person) -> None:
     petra.policy(
         approval="none",
         rules=[
@@ -435,12 +434,11 @@ def hooked(bare: Path) -> Iterator[Path]:
 
 
 def test_gitlab_is_asked_for_a_merge_request_by_push_options(
-    url: str, bare: Path, petra: Petra, hooked: Path
+    url: str, bare: Path, petra: Person, hooked: Path
 ) -> None:
     root = git(bare, "show", "main:demandops.yaml")
     text = f"{root}\nproposals: {{forge: gitlab, labels: [demand, its]}}\n"
     petra.change({"demandops.yaml": text})
-    hooked.unlink()
     with rig.running(url) as generator:
         proposed = Proposed(generator, goal(1))
         branch = proposed.branch
@@ -463,7 +461,7 @@ def test_gitlab_is_asked_for_a_merge_request_by_push_options(
 
 
 def test_a_server_that_takes_no_push_options_gets_the_branch_without(
-    url: str, bare: Path, petra: Petra
+    url: str, bare: Path, petra: Person
 ) -> None:
     root = git(bare, "show", "main:demandops.yaml")
     petra.change({"demandops.yaml": f"{root}\nproposals: {{forge: gitlab}}\n"})
@@ -472,7 +470,7 @@ def test_a_server_that_takes_no_push_options_gets_the_branch_without(
 
 
 def test_a_server_that_refuses_the_branch_is_told_to_the_requester(
-    url: str, bare: Path, petra: Petra
+    url: str, bare: Path, petra: Person
 ) -> None:
     hook = bare / "hooks" / "pre-receive"
     hook.parent.mkdir(exist_ok=True)
@@ -493,7 +491,7 @@ def test_a_server_that_refuses_the_branch_is_told_to_the_requester(
     indirect=["address"],
 )
 def test_killed_while_proposing_there_is_one_branch_after_the_restart(
-    drivers: rig.Drivers, address: str, bare: Path, petra: Petra, point: str
+    drivers: rig.Drivers, address: str, bare: Path, petra: Person, point: str
 ) -> None:
     drivers.start(address, [[rig.demand("one", goal(1))]], die_at=point).listen()
     with rig.running(address) as generator:
@@ -508,7 +506,7 @@ def test_killed_while_proposing_there_is_one_branch_after_the_restart(
 
 
 def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the_restart(
-    drivers: rig.Drivers, address: str, bare: Path, petra: Petra
+    drivers: rig.Drivers, address: str, bare: Path, petra: Person
 ) -> None:
     lanes = [[rig.demand("leave", leave(1))]]
     opening = rig.demand("join", goal(1))
@@ -520,7 +518,7 @@ def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the
 
 
 def test_two_generators_that_take_one_demand_agree_once_it_is_merged(
-    url: str, bare: Path, petra: Petra
+    url: str, bare: Path, petra: Person
 ) -> None:
     with rig.running(url) as one, rig.running(url) as two:
         first, second = Proposed(one, goal(1)), Proposed(two, goal(1))
@@ -532,7 +530,7 @@ def test_two_generators_that_take_one_demand_agree_once_it_is_merged(
 
 
 def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
-    bare: Path, petra: Petra
+    bare: Path, petra: Person
 ) -> None:
     with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
         proposed = Proposed(generator, goal(1), "op-1")
@@ -546,7 +544,7 @@ def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
         assert branches(bare) == []
 
 
-def test_a_push_whose_answer_got_lost_makes_no_second_branch(bare: Path, petra: Petra) -> None:
+def test_a_push_whose_answer_got_lost_makes_no_second_branch(bare: Path, petra: Person) -> None:
     with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
         server.faults.cut_answers = 1
         proposed = Proposed(generator, goal(1), "op-1")
@@ -559,7 +557,7 @@ def _is_decided_or_waits(ticket: Ticket) -> bool:
     return ticket.future.done() or bool(ticket.proposal and ticket.proposal.pushed)
 
 
-def test_odd_ids_give_branches_that_git_takes(bare: Path, petra: Petra) -> None:
+def test_odd_ids_give_branches_that_git_takes(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         for number, id in enumerate(["", "..", "a..b/.lock", "Ä ö", "x" * 900, "-o", "@{0}"]):
             made = goal(number) | {"id": id}
@@ -571,7 +569,7 @@ def test_odd_ids_give_branches_that_git_takes(bare: Path, petra: Petra) -> None:
     assert all(len(name) < 70 and name.isascii() for name in names)
 
 
-def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petra: Petra) -> None:
+def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petra: Person) -> None:
     """The reference's demands add up, so both are on the branch, one commit each."""
     more = goal(1, vehicle=2) | {"connections": []}
     with rig.running(bare) as generator:
@@ -590,7 +588,7 @@ def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petr
     assert rig.books(bare) == rig.books_after([goal(1)])
 
 
-def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Petra) -> None:
+def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Person) -> None:
     """The latched bookkeeping and the clusters' wake-up hang on it; nothing else is published."""
     heard = threading.Event()
     with rig.running(bare) as generator:
@@ -603,7 +601,7 @@ def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Petra) -> None:
 
 
 def test_a_proposal_passes_the_check_of_pull_requests(
-    bare: Path, petra: Petra, capsys: pytest.CaptureFixture[str]
+    bare: Path, petra: Person, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from demandops.cli.main import run
 
@@ -615,7 +613,7 @@ def test_a_proposal_passes_the_check_of_pull_requests(
 
 
 def test_one_cancelled_right_before_a_crash_is_taken_away_at_the_restart(
-    bare: Path, petra: Petra
+    bare: Path, petra: Person
 ) -> None:
     """The withdrawal is on the disk before anything else; its branch is not to be merged."""
     with serving(bare.parent) as server:

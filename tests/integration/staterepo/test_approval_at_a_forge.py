@@ -19,8 +19,7 @@ from demandops.service.approvals import approvals, forge_worker
 from tests.kit import rig
 from tests.kit.generator import Proposed
 from tests.kit.http import Answer, Call, serving
-from tests.kit.repo import Person as Petra
-from tests.kit.repo import branches
+from tests.kit.repo import Person, branches
 from tests.kit.rig import git, goal
 
 TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
@@ -68,14 +67,14 @@ def hub() -> Iterator[Hub]:
 
 
 @pytest.fixture
-def petra(hub: Hub, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Petra:
+def petra(hub: Hub, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Person:
     monkeypatch.setattr(approvals, "CHECK_EMBEDDED_S", 0.05)
     monkeypatch.setattr(approvals, "CHECK_REMOTE_S", 0.1)
     monkeypatch.setattr(forge_worker, "POLL_S", 0.05)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     (tmp_path / "token").write_text(TOKEN)
     monkeypatch.setenv("DEMANDOPS_FORGE_TOKEN_FILE", str(tmp_path / "token"))
-    made = Petra(bare, tmp_path / "petra")
+    made = Person(bare, tmp_path / "petra")
     made.policy(approval="required")
     root = git(bare, "show", "main:demandops.yaml")
     where = f"forge: github, url: 'https://github.com/its/state', api: '{hub.url}'"
@@ -84,7 +83,7 @@ def petra(hub: Hub, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_pull_request_is_opened_and_its_link_told(
-    hub: Hub, address: str, bare: Path, petra: Petra
+    hub: Hub, address: str, bare: Path, petra: Person
 ) -> None:
     with rig.running(address) as generator:
         proposed = Proposed(generator, goal(1))
@@ -100,7 +99,7 @@ def test_a_pull_request_is_opened_and_its_link_told(
     assert [one["state"] for one in hub.pulls] == ["open"], "merging is the person's"
 
 
-def test_a_closed_pull_request_turns_the_demand_down(hub: Hub, bare: Path, petra: Petra) -> None:
+def test_a_closed_pull_request_turns_the_demand_down(hub: Hub, bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1))
         assert [proposed.branch] == branches(bare)
@@ -112,7 +111,7 @@ def test_a_closed_pull_request_turns_the_demand_down(hub: Hub, bare: Path, petra
 
 
 def test_one_closed_while_no_generator_ran_is_not_opened_again(
-    hub: Hub, bare: Path, petra: Petra
+    hub: Hub, bare: Path, petra: Person
 ) -> None:
     with rig.running(bare) as generator:
         assert [Proposed(generator, goal(1)).branch] == branches(bare)
@@ -122,7 +121,7 @@ def test_one_closed_while_no_generator_ran_is_not_opened_again(
     assert len(hub.pulls) == 1
 
 
-def test_a_restart_opens_no_second_one(hub: Hub, bare: Path, petra: Petra) -> None:
+def test_a_restart_opens_no_second_one(hub: Hub, bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         branch = Proposed(generator, goal(1)).branch
     with rig.running(bare) as generator:
@@ -130,7 +129,7 @@ def test_a_restart_opens_no_second_one(hub: Hub, bare: Path, petra: Petra) -> No
     assert [pull["head"] for pull in hub.pulls].count(branch) == 1
 
 
-def test_what_is_taken_back_is_closed(hub: Hub, bare: Path, petra: Petra) -> None:
+def test_what_is_taken_back_is_closed(hub: Hub, bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
@@ -141,7 +140,7 @@ def test_what_is_taken_back_is_closed(hub: Hub, bare: Path, petra: Petra) -> Non
 
 
 def test_a_forge_that_is_away_holds_nothing_up_and_is_asked_again(
-    hub: Hub, bare: Path, petra: Petra, caplog: pytest.LogCaptureFixture
+    hub: Hub, bare: Path, petra: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
     hub.away = True
     with caplog.at_level(logging.INFO), rig.running(bare) as generator:

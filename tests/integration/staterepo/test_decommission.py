@@ -54,6 +54,7 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
         nodes = rig.git(bare, "show", f"main:{NODES}") + "\n"
         start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
         made = person.change({NODES: nodes[:start] + nodes[end:]}, "vehicle01 is sold")
+        person.fetch()
         assert demandops("check", tmp_path / "person")[0] == 0
         rig.wait_until(
             lambda: "vehicle01" not in generator.snapshot.state.config.nodes, "it is taken in"

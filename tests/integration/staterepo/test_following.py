@@ -255,7 +255,6 @@ def test_several_peoples_commits_are_all_named_and_a_readme_is_not(
         rig.book(generator, goal(1))
         first = person.change(_move_broker(bare), "Elsewhere")
         person.change({"README.md": "Ours\n"}, "Say whose it is")
-        rig.git(person.folder, "config", "user.name", "-")
         second = person.edit(BROKERS, "elsewhere", "somewhere")
         rig.book(generator, goal(2))
     (commit,) = [c for c in rig.commits(bare) if c.one("Operation") == "follow"]

@@ -21,9 +21,9 @@ from tests.kit.rig import Drivers, Goal
 pytestmark = pytest.mark.synced
 
 GENERATORS = 4
-DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "32"))
+DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "16"))
 SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
-LANES = 8
+LANES = 4
 """Requesters that wait for an answer before they send again, at each generator."""
 CUTS = 0.01
 """The share of requests whose connection is cut, once before and once after they are done."""
@@ -64,7 +64,7 @@ class _Person:
                 files["registry/images.yaml"] = _images(number)
             for attempt in range(1, 200):
                 try:
-                    self.pushed.append(self.person.change(files, f"Note {number}"))
+                    self.pushed.append(self.person.push(files, f"Note {number}"))
                     self.tries.append(attempt)
                     break
                 except AssertionError:

@@ -143,7 +143,7 @@ def test_another_gitops_controller_has_everything_rendered_anew_in_one_commit(
     rig.assert_sound(bare)
 
 
-@RUNNING
+@EITHER
 def test_a_deleted_claim_is_released_with_what_ran_for_it_alone(
     address: str, bare: Path, person: Person, running: bool
 ) -> None:
@@ -184,16 +184,6 @@ def test_an_invalid_inventory_leaves_its_last_valid_version_in_force_and_is_logg
     rig.assert_sound(bare)
 
 
-def test_an_inventory_still_invalid_at_a_restart_leaves_its_last_valid_version_in_force(
-    url: str, bare: Path, person: Person
-) -> None:
-    """The newest commit of the generator holds the person's broken file by then."""
-    _around(url, True, [goal(1)], lambda: _break_nodes(person), [goal(2)])
-    with rig.running(url) as generator:
-        rig.book(generator, goal(3))
-    assert _kinds(bare) == ["join", "person", "follow", "join", "join"]
-
-
 def test_a_claim_still_broken_at_a_restart_leaves_its_last_valid_version_in_force(
     url: str, bare: Path, person: Person
 ) -> None:
@@ -202,21 +192,6 @@ def test_a_claim_still_broken_at_a_restart_leaves_its_last_valid_version_in_forc
         rig.book(generator, goal(3), leave(1))
     assert _kinds(bare) == ["join", "person", "follow", "join", "join", "shutdown", "follow"]
     assert rig.books(bare) == rig.books_after([goal(2), goal(3)])
-
-
-@EITHER
-def test_a_broken_claim_file_leaves_the_claim_as_it_was_and_is_logged(
-    address: str, bare: Path, person: Person, running: bool, caplog: pytest.LogCaptureFixture
-) -> None:
-    _around(address, running, [goal(1)], lambda: _break_claim(bare)(person), [goal(2)])
-    assert _kinds(bare) == ["join", "person", "follow", "join"]
-    fusions = rig.git(bare, "ls-tree", "-r", "--name-only", "main", "clusters/")
-    assert "of-edge-fusion-1" in fusions, "the claim stands, so its fusion runs"
-    assert any(
-        record.levelname == "ERROR" and record.getMessage().startswith("ledger/applications/")
-        for record in caplog.records
-    )
-    assert [c.id for c in rig.commits(bare) if len(c.parents) != 1] == []
 
 
 def test_a_claim_whose_file_a_person_broke_can_still_be_released(
@@ -247,16 +222,6 @@ def test_a_node_that_is_taken_away_while_it_is_in_use_does_not_stop_other_demand
         if "connections" in path
     }
     rig.assert_sound(bare)
-
-
-def test_a_node_taken_away_while_it_is_in_use_stops_no_demand_after_a_restart(
-    bare: Path, person: Person
-) -> None:
-    take = lambda: _take_vehicle01_away(bare, person)  # noqa: E731
-    _around(str(bare), True, [goal(1)], take, [goal(6)])
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(11))
-    assert [kind for kind in _kinds(bare) if kind != "follow"] == ["join", "person", "join", "join"]
 
 
 def test_a_node_taken_away_is_gone_for_new_demands_once_it_is_released(

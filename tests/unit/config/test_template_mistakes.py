@@ -10,7 +10,7 @@ from demandops.ledger.ledger import Ledger
 
 from tests.kit.config import configuration, skeleton
 from tests.kit.goals import perception
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import MemoryRepo
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"
@@ -21,7 +21,7 @@ LAST = skeleton()[TEMPLATE].count("\n") + 1
 
 def faults(template: str) -> list[str]:
     """Return the faults that a demand gets which needs the template."""
-    books = Books({TEMPLATE: template})
+    books = MemoryRepo({TEMPLATE: template})
     before = dict(books.files)
     with pytest.raises(InvalidInput) as invalid:
         books.send(perception())
@@ -208,7 +208,9 @@ class TestValues:
 
     @pytest.mark.parametrize("end", ["\\n", "\\n\\n", "\\n\\n\\n", "", " \\n"])
     def test_a_text_of_several_lines_stays_as_it_is(self, end: str) -> None:
-        books = Books({TEMPLATE: skeleton()[TEMPLATE] + f'podAnnotations: {{a: "x\\ny{end}"}}\n'})
+        books = MemoryRepo(
+            {TEMPLATE: skeleton()[TEMPLATE] + f'podAnnotations: {{a: "x\\ny{end}"}}\n'}
+        )
         books.send(perception())
         release = books.objects("HelmRelease")["od-edge-vehicle00"]
         text = f"x\\ny{end}".replace("\\n", "\n")

@@ -23,7 +23,7 @@ from tests.kit.connections import (
     state,
 )
 from tests.kit.goals import connection, goal
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import MemoryRepo
 
 
 def carried(before: State, asked: dict[str, Any]) -> ConnectionType:
@@ -92,7 +92,7 @@ class TestAutomaticChoice:
         assert after.ledger == Ledger()
 
     def test_the_wire_cannot_ask_for_it(self) -> None:
-        (found,) = Books().faults(goal([], [connection(type=-1)]))
+        (found,) = MemoryRepo().faults(goal([], [connection(type=-1)]))
         assert found.startswith("connections[0].type: input should be greater than or equal to 0")
 
 
@@ -220,8 +220,8 @@ class TestRos:
 class TestThroughTheWire:
     """The reference's message names the three types by number, and says nothing of options."""
 
-    def books(self, **nodes: dict[str, Any]) -> Books:
-        books = Books()
+    def books(self, **nodes: dict[str, Any]) -> MemoryRepo:
+        books = MemoryRepo()
         books.state = state(**nodes)
         return books
 

@@ -10,7 +10,7 @@ import yaml
 
 from tests.kit.config import brokers
 from tests.kit.goals import connection, goal
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import MemoryRepo
 
 TOPIC_KEYS = {
     "ros2mqtt": {"mqtt_topic", "primitive", "json", "ros_type", "inject_timestamp", "advanced"},
@@ -19,7 +19,7 @@ TOPIC_KEYS = {
 LISTS = {"ros2mqtt": "ros_topics", "mqtt2ros": "mqtt_topics"}
 
 
-def ends(books: Books) -> dict[str, dict[str, Any]]:
+def ends(books: MemoryRepo) -> dict[str, dict[str, Any]]:
     """Return the parameters of each client by its client id."""
     found = {}
     for name, config in books.objects("ConfigMap").items():
@@ -30,7 +30,7 @@ def ends(books: Books) -> dict[str, dict[str, Any]]:
     return found
 
 
-def carried(books: Books) -> dict[str, dict[tuple[str, str], str]]:
+def carried(books: MemoryRepo) -> dict[str, dict[tuple[str, str], str]]:
     """Follow each message as two clients would: connection → (ROS in, MQTT) → ROS out."""
     deployments = books.objects("Deployment")
     ways: dict[str, dict[str, dict[str, str]]] = {}
@@ -50,12 +50,12 @@ def carried(books: Books) -> dict[str, dict[tuple[str, str], str]]:
     }
 
 
-def pairs(books: Books, id: str) -> dict[str, str]:
+def pairs(books: MemoryRepo, id: str) -> dict[str, str]:
     return {source: target for (source, _), target in carried(books)[id].items()}
 
 
 def test_the_parameters_of_both_ends_are_exactly_these() -> None:
-    books = Books(brokers("edge"))
+    books = MemoryRepo(brokers("edge"))
     books.send(
         goal([], [connection("c", topics=["/b/points", "/a"], targets=["/x", "/y"], broker="")])
     )
@@ -87,13 +87,13 @@ def test_the_parameters_of_both_ends_are_exactly_these() -> None:
 
 
 def test_two_source_topics_may_arrive_as_one() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(goal([], [connection("c", topics=["/a", "/b"], targets=["/c", "/c"])]))
     assert pairs(books, "c") == {"/a": "/c", "/b": "/c"}
 
 
 def test_topics_are_united_over_the_claims_and_parted_again() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(goal([], [connection("c", topics=["/b", "/a"], targets=["/y", "/x"])], id="1"))
     alone = books.rendered()
     books.send(goal([], [connection("c", topics=["/a", "/c"], targets=["/x", "/z"])], id="2"))
@@ -108,7 +108,7 @@ def test_topics_are_united_over_the_claims_and_parted_again() -> None:
 
 
 def test_two_connections_with_one_topic_name_share_no_mqtt_topic() -> None:
-    books = Books()
+    books = MemoryRepo()
     for id in ("c", "c/d", "c_d", "C"):
         books.send(goal([], [connection(id, topics=["/d", "/c/d"])], id=id))
     mqtt = [topic for ways in carried(books).values() for _, topic in ways]
@@ -116,7 +116,7 @@ def test_two_connections_with_one_topic_name_share_no_mqtt_topic() -> None:
 
 
 def test_no_mqtt_topic_holds_a_wildcard_or_a_dollar() -> None:
-    books = Books()
+    books = MemoryRepo()
     for id in ("+", "#", "$SYS/x", "a/+/b", "a\u00a0b", "/", "//"):
         books.send(goal([], [connection(id)], id=id))
     for ways in carried(books).values():
@@ -125,7 +125,7 @@ def test_no_mqtt_topic_holds_a_wildcard_or_a_dollar() -> None:
 
 
 def test_every_end_has_a_client_id_of_its_own_and_that_of_its_deployment() -> None:
-    books = Books()
+    books = MemoryRepo()
     for id in ("c", "c-source", "c/source", "C"):
         books.send(goal([], [connection(id)], id=id))
     found = ends(books)
@@ -135,7 +135,7 @@ def test_every_end_has_a_client_id_of_its_own_and_that_of_its_deployment() -> No
 
 
 def test_new_topics_restart_both_ends_and_nothing_else_does() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(goal([], [connection("c", topics=["/a"])], id="1"))
     templates = {n: d["spec"]["template"] for n, d in books.objects("Deployment").items()}
     books.send(goal([], [connection("c", topics=["/a"], who=["vehicle01"])], id="2"))
@@ -147,7 +147,7 @@ def test_new_topics_restart_both_ends_and_nothing_else_does() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 50])
 def test_every_topic_is_listed_once(count: int) -> None:
-    books = Books()
+    books = MemoryRepo()
     topics = [f"/t{number}" for number in range(count)]
     books.send(goal([], [connection("c", topics=[*topics, *topics])]))
     assert sorted(pairs(books, "c")) == sorted(topics)

@@ -11,22 +11,13 @@ from demandops.decision import Decision, decide
 from demandops.demand import deployment_request_goal
 from demandops.errors import Fault, InvalidInput, Refused
 from demandops.staterepo.history import commit_message
-from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
+from tests.kit.chance import examples
 from tests.kit.config import FAST
 from tests.kit.goals import APP, CLOUD, application, connection, goal
-from tests.kit.memory import NOW
-from tests.kit.memory import MemoryRepo as Books
-
-FEW = settings(
-    max_examples=100,
-    derandomize=True,
-    deadline=None,
-    database=None,
-    phases=(Phase.explicit, Phase.generate, Phase.shrink),
-    suppress_health_check=[HealthCheck.too_slow],
-)
+from tests.kit.memory import NOW, MemoryRepo
 
 TEXT = st.text(max_size=12) | st.sampled_from(
     ["", "edge", "vehicle00", APP, CLOUD[0], "/a", "..", "~", "\\", "\ud800", "a" * 1100, "{{ x }}"]
@@ -52,7 +43,7 @@ ANYTHING = st.recursive(SCALAR, _nested, max_leaves=25)
 
 
 def outcome(goal: object) -> Decision | tuple[Fault, ...]:
-    books = Books()
+    books = MemoryRepo()
     before = repr(goal)
     try:
         return decide(books.state, goal, NOW, books.files.get)
@@ -72,7 +63,7 @@ def assert_told(faults: tuple[Fault, ...]) -> None:
         assert not found.field.startswith("applications"), "the wire says apps"
 
 
-@FEW
+@examples(70)
 @given(ANYTHING)
 def test_whatever_comes_is_refused_with_a_reason(data: Any) -> None:
     found = outcome(data)
@@ -80,7 +71,7 @@ def test_whatever_comes_is_refused_with_a_reason(data: Any) -> None:
     assert_told(found)
 
 
-@FEW
+@examples(70)
 @example({"\ud800": 1})
 @example({"apps": [{"\ud800": 1}]})
 @given(ANYTHING)
@@ -122,7 +113,7 @@ def goals(text: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
     return st.builds(make, apps, connections, id=text, shutdown=st.booleans())
 
 
-@FEW
+@examples(70)
 @given(goals(TEXT))
 def test_a_goal_of_the_right_form_is_decided_or_refused(data: Any) -> None:
     found = outcome(data)
@@ -133,7 +124,7 @@ def test_a_goal_of_the_right_form_is_decided_or_refused(data: Any) -> None:
 ID = st.text(min_size=1, max_size=30)
 
 
-@FEW
+@examples(70)
 @given(ID, ID, ID)
 @example("\\", "\\", "\\")
 @example(".", "<>", " ")
@@ -143,7 +134,7 @@ def test_any_id_is_refused_or_booked_rendered_committed_and_released(
     id: str, who: str, request: str
 ) -> None:
     asked = goal([application(id, who=[who])], [connection(id, who=[who])], id=request)
-    books = Books()
+    books = MemoryRepo()
     try:
         decision = books.send(asked)
     except InvalidInput as refused:

@@ -11,7 +11,7 @@ import yaml
 
 from tests.kit.config import FAST, brokers
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal, perception
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import MemoryRepo
 
 LABEL = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
 ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -70,12 +70,12 @@ SYNTAX = {
 }
 
 
-def services(books: Books) -> dict[str, Any]:
+def services(books: MemoryRepo) -> dict[str, Any]:
     found: dict[str, Any] = books.books()["services"]
     return found
 
 
-def assert_sound(books: Books) -> None:
+def assert_sound(books: MemoryRepo) -> None:
     """Every rendered object has a name that Kubernetes takes, at the path of its name."""
     for path, text in books.rendered().items():
         for document in yaml.load_all(text, Loader=FAST):
@@ -86,7 +86,7 @@ def assert_sound(books: Books) -> None:
 
 
 def test_ids_that_collide_after_slugging_stay_apart() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(
         goal(
             [application(id, who=[id]) for id in NEAR],
@@ -106,7 +106,7 @@ def test_ids_that_collide_after_slugging_stay_apart() -> None:
 
 
 def test_derived_topics_and_clients_of_near_ids_stay_apart() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(
         goal(
             [application(id) for id in NEAR],
@@ -136,7 +136,7 @@ def test_derived_topics_and_clients_of_near_ids_stay_apart() -> None:
 
 
 def test_one_of_two_near_ids_goes_and_the_other_stays() -> None:
-    books = Books()
+    books = MemoryRepo()
     for id in ("a/b", "a_b"):
         books.send(goal([application(id)], [connection(id)], id=id))
     before = books.rendered()
@@ -157,7 +157,7 @@ def test_nodes_whose_ids_collide_after_slugging_stay_apart() -> None:
     rest = (
         "  - {id: edge, type: edge, cluster: c-its}\n  - {id: cloud, type: cloud, cluster: c-its}\n"
     )
-    books = Books({"inventory/nodes.yaml": head + entries + rest})
+    books = MemoryRepo({"inventory/nodes.yaml": head + entries + rest})
     books.send(
         goal(
             [application(clouds=[("/points", node) for node in nodes])],
@@ -178,7 +178,7 @@ def test_nodes_whose_ids_collide_after_slugging_stay_apart() -> None:
 @pytest.mark.parametrize("length", [54, 300, 1024])
 def test_long_ids_work_and_stay_apart(length: int) -> None:
     ids = ["x" * length, "x" * (length - 1) + "y"]
-    books = Books()
+    books = MemoryRepo()
     books.send(
         goal(
             [application(id, who=ids) for id in ids],
@@ -202,8 +202,8 @@ def test_long_ids_work_and_stay_apart(length: int) -> None:
 
 @pytest.mark.parametrize("text", SYNTAX.values(), ids=SYNTAX)
 def test_an_id_full_of_syntax_is_inert(text: str) -> None:
-    books = Books()
-    plain = Books()
+    books = MemoryRepo()
+    plain = MemoryRepo()
     plain.send(goal([application("id", who=["who"])], [connection("id", who=["who"])], id="r"))
     books.send(goal([application(text, who=[text])], [connection(text, who=[text])], id=text))
     assert_sound(books)
@@ -235,7 +235,7 @@ def _shape(value: Any) -> Any:
 
 
 def test_no_two_ids_full_of_syntax_share_a_name() -> None:
-    books = Books()
+    books = MemoryRepo()
     texts = list(SYNTAX.values())
     books.send(goal([application(t) for t in texts], [connection(t) for t in texts]))
     fusions = [e for e in services(books).values() if e["service"] == "object-fusion"]
@@ -244,7 +244,7 @@ def test_no_two_ids_full_of_syntax_share_a_name() -> None:
 
 
 def test_the_same_demand_twice_changes_nothing() -> None:
-    books = Books()
+    books = MemoryRepo()
     assert books.send(perception()).outcome == "booked"
     before = dict(books.files)
     again = books.send(perception())
@@ -253,7 +253,7 @@ def test_the_same_demand_twice_changes_nothing() -> None:
 
 
 def test_the_same_demand_in_another_order_is_the_same_demand() -> None:
-    books = Books()
+    books = MemoryRepo()
     who = ["vehicle00", "station00"]
     clouds = [CLOUD, STATION_CLOUD]
     books.send(goal([application(who=who, clouds=clouds)]))
@@ -265,7 +265,7 @@ def test_the_same_demand_in_another_order_is_the_same_demand() -> None:
 
 
 def test_a_second_point_cloud_of_one_source_runs_beside_the_first() -> None:
-    books = Books()
+    books = MemoryRepo()
     rear = ("/vehicles/vehicle00/drivers/rear/pointcloud", "vehicle00")
     books.send(goal([application(clouds=[CLOUD])], id="1"))
     first = books.rendered()
@@ -293,7 +293,7 @@ def test_names_do_not_depend_on_who_came_first() -> None:
     demands = [goal([application(clouds=[cloud])], id=cloud[0]) for cloud in clouds]
     ends = []
     for order in (demands, demands[::-1]):
-        books = Books()
+        books = MemoryRepo()
         for demand in order:
             books.send(demand)
         ends.append(books.rendered())
@@ -301,7 +301,7 @@ def test_names_do_not_depend_on_who_came_first() -> None:
 
 
 def test_two_clouds_of_one_topic_name_from_two_sources_stay_apart() -> None:
-    books = Books()
+    books = MemoryRepo()
     clouds = [("/points", "vehicle01"), ("/points", "vehicle02")]
     books.send(goal([application(clouds=clouds)]))
     found = [e for e in services(books).values() if e["service"] == "object-detection"]
@@ -312,7 +312,7 @@ class TestOpenBroker:
     """The requested one, one on the target node, one on the source node, the only one."""
 
     @staticmethod
-    def hosts(books: Books) -> set[str]:
+    def hosts(books: MemoryRepo) -> set[str]:
         return {
             yaml.safe_load(config["data"]["params.yaml"])["/**/*"]["ros__parameters"]["broker"][
                 "host"
@@ -335,17 +335,17 @@ class TestOpenBroker:
     def test_the_broker_is_chosen_by_rule(
         self, there: tuple[str, ...], requested: str, ends: tuple[str, str], chosen: str
     ) -> None:
-        books = Books(brokers(*there))
+        books = MemoryRepo(brokers(*there))
         books.send(goal([], [connection(broker=requested, ends=ends)]))
         assert self.hosts(books) == {f"broker-{chosen}"}
 
     def test_a_request_that_names_the_only_brokers_neighbour_is_refused(self) -> None:
         """With one broker the reference ignores which one is requested."""
-        books = Books(brokers("cloud"))
+        books = MemoryRepo(brokers("cloud"))
         assert len(books.faults(goal([], [connection(broker="edge")]))) == 1
 
     def test_a_broker_left_open_and_one_named_for_one_connection_agree(self) -> None:
-        books = Books()
+        books = MemoryRepo()
         books.send(goal([], [connection(broker="")], id="1"))
         assert books.send(goal([], [connection(broker="cloud")], id="2")).outcome == "booked"
         assert self.hosts(books) == {"service-mqtt-broker-cloud"}
@@ -354,7 +354,7 @@ class TestOpenBroker:
 
 
 def test_a_connection_whose_topics_are_all_released_is_gone() -> None:
-    books = Books()
+    books = MemoryRepo()
     topics = ["/a", "/b", "/c"]
     books.send(goal([], [connection(topics=topics)]))
     for index, topic in enumerate(topics):
@@ -368,21 +368,21 @@ def test_a_connection_whose_topics_are_all_released_is_gone() -> None:
 
 
 def test_a_connection_is_released_whole_where_no_topic_is_listed() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(goal([], [connection(topics=["/a", "/b"])]))
     books.send(goal([], [connection(topics=[])], shutdown=True))
     assert books.rendered() == {}
 
 
 def test_an_application_is_released_whole_where_no_topic_is_listed() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(goal([application(ego=[EGO])]))
     books.send(goal([application(clouds=[])], shutdown=True))
     assert books.rendered() == {}
 
 
 def test_a_running_connection_takes_further_topics_on() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(goal([], [connection(topics=["/a"])], id="1"))
     books.send(goal([], [connection(topics=["/b"], who=["vehicle01"])], id="2"))
     assert books.books()["connections"]["vehicle00/edge"] == {
@@ -394,7 +394,7 @@ def test_a_running_connection_takes_further_topics_on() -> None:
 
 
 def test_a_shutdown_of_what_does_not_run_creates_nothing() -> None:
-    books = Books()
+    books = MemoryRepo()
     before = dict(books.files)
     books.faults(perception(shutdown=True))
     assert books.files == before
@@ -402,7 +402,7 @@ def test_a_shutdown_of_what_does_not_run_creates_nothing() -> None:
 
 def test_a_join_repeated_counts_once_and_one_leave_releases_it() -> None:
     for repetitions in (1, 2, 3):
-        books = Books()
+        books = MemoryRepo()
         for _ in range(repetitions):
             books.send(perception())
         books.send(perception(shutdown=True))
@@ -410,7 +410,7 @@ def test_a_join_repeated_counts_once_and_one_leave_releases_it() -> None:
 
 
 def test_a_topic_without_its_leading_slash_is_the_same_topic() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(goal([application(clouds=[CLOUD])], [connection(topics=[CLOUD[0]])]))
     bare = CLOUD[0].removeprefix("/")
     again = goal([application(clouds=[(bare, "vehicle00")])], [connection(topics=[bare])])
@@ -418,7 +418,7 @@ def test_a_topic_without_its_leading_slash_is_the_same_topic() -> None:
 
 
 def test_absent_fields_take_the_defaults_of_ros() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(perception())
     asked = {
         "id": "request",
@@ -438,7 +438,7 @@ def test_absent_fields_take_the_defaults_of_ros() -> None:
 
 def test_every_pair_of_odd_requesters_makes_its_own_demand() -> None:
     texts = ["a", "a,b", "b", "a b", '["a"]', "a\\", "\\a", '"']
-    books = Books()
+    books = MemoryRepo()
     for pair in combinations(texts, 2):
         books.send(goal([application(who=pair)]))
     demands = {claim.demand for claim in books.state.ledger}
@@ -475,7 +475,7 @@ def test_in_every_field_text_is_inert_or_refused_by_its_name(
     for part in field[:-1]:
         inner = inner[part]
     inner[field[-1]] = text
-    books = Books()
+    books = MemoryRepo()
     names = [part for part in field if isinstance(part, str)]
     if names[-1] in FREE and "\n" not in text:
         assert books.send(asked).outcome == "booked"

@@ -10,7 +10,7 @@ from demandops.demand.lease import UNSTARTED
 
 from tests.kit.config import edited, skeleton
 from tests.kit.goals import APP, application, connection, goal, perception
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import MemoryRepo
 
 POLICY = "policy/access-domains.yaml"
 DOMAIN = "access domain 'perception'"
@@ -57,13 +57,13 @@ VEHICLES = {"name": "vehicles", "requesters": ["vehicle*"], "approval": "none"}
     ],
 )
 def test_who_asks_for_approval(config: dict[str, str], asks: tuple[str, ...]) -> None:
-    decision = Books(config).send(perception())
+    decision = MemoryRepo(config).send(perception())
     assert decision.approval == asks
     assert decision.outcome == "booked", "what would come of it is decided all the same"
 
 
 def test_each_requester_needs_a_rule_that_lets_it_through() -> None:
-    books = Books(rules(VEHICLES, ASKS))
+    books = MemoryRepo(rules(VEHICLES, ASKS))
     assert books.send(goal([application(who=["vehicle00", "truck"])])).approval == (
         f"rule 'asks' of {DOMAIN}",
     )
@@ -72,7 +72,7 @@ def test_each_requester_needs_a_rule_that_lets_it_through() -> None:
 def test_a_rule_for_another_application_or_node_lets_nothing_through() -> None:
     elsewhere = {"name": "elsewhere", "nodes": ["cloud"], "approval": "none"}
     other = {"name": "other", "applications": ["recorder"], "approval": "none"}
-    books = Books(rules(ASKS, elsewhere, other))
+    books = MemoryRepo(rules(ASKS, elsewhere, other))
     assert books.send(goal([application()])).approval == (f"rule 'asks' of {DOMAIN}",)
     # a connection is not held to applications, so the rule for another one covers it
     assert books.send(goal([], [connection()], id="other")).approval == ()
@@ -80,19 +80,19 @@ def test_a_rule_for_another_application_or_node_lets_nothing_through() -> None:
 
 def test_an_appdef_asks_for_its_applications_and_not_for_connections() -> None:
     text = "kind: ApplicationDefinition"
-    books = Books(edited(APPDEF, text, f"{text}\napproval: required"))
+    books = MemoryRepo(edited(APPDEF, text, f"{text}\napproval: required"))
     assert books.send(goal([], [connection()])).approval == ()
 
 
 def test_what_stands_already_needs_no_approval() -> None:
-    books = Books(policy(approval="required"))
+    books = MemoryRepo(policy(approval="required"))
     assert books.send(perception()).approval == (DOMAIN,)
     assert books.send(perception()).approval == ()
     assert books.send(perception(shutdown=True)).approval == ()
 
 
 def test_more_of_what_stands_needs_approval() -> None:
-    books = Books(policy(approval="required"))
+    books = MemoryRepo(policy(approval="required"))
     books.send(perception())
     more = goal([application(ego=[("/vehicles/vehicle00/ego_data", "vehicle00")])])
     assert books.send(more).approval == (DOMAIN,)
@@ -107,7 +107,7 @@ def put(**changed: Any) -> dict[str, Any]:
 
 
 def test_dropping_renewing_and_releasing_need_none() -> None:
-    books = Books(policy(approval="required", leases={"slack": "0s"}))
+    books = MemoryRepo(policy(approval="required", leases={"slack": "0s"}))
     app = put()["applications"][0]
     two = [app, app | {"id": "edge/second"}]
     assert books.send(put(applications=two, lease=60)).approval == (DOMAIN,)
@@ -125,7 +125,7 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
 
     from tests.kit.memory import NOW
 
-    books = Books(policy(approval="required"))
+    books = MemoryRepo(policy(approval="required"))
     decision = decide(books.state, put(lease=60), NOW, books.files.get)
     waiting = decide(books.state, with_leases_from_approval(decision.request), NOW, books.files.get)
     [claim] = [
@@ -156,5 +156,5 @@ def test_another_word_is_a_fault(config: dict[str, str], field: str) -> None:
     from demandops.errors import InvalidInput
 
     with pytest.raises(InvalidInput) as error:
-        Books(config)
+        MemoryRepo(config)
     assert [found.field for found in error.value.faults] == [field]

@@ -110,7 +110,7 @@ def all_claims(draw: st.DrawFn) -> Claim:
 claims = all_claims()
 
 
-@examples(80)
+@examples(50)
 @given(claims)
 def test_every_claim_survives_its_file(claim: Claim) -> None:
     path, text = claim_file.path_of(claim.key), claim_file.text_of(claim)
@@ -143,7 +143,7 @@ def test_two_claims_never_share_a_file(keys: dict[tuple[SubjectKind, str, str], 
     assert len(paths) == len(keys)
 
 
-@examples(100)
+@examples(60)
 @given(moments, st.integers(-12, 14))
 def test_a_time_is_the_same_moment_in_any_zone(moment: datetime, hours: int) -> None:
     here = moment.astimezone(timezone(timedelta(hours=hours)))

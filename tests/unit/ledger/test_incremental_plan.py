@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import TIMES, chances, examples, told
-from tests.kit.memory import MemoryRepo as Repo
+from tests.kit.memory import MemoryRepo
 from tests.model.goals import Maker
 
 
@@ -41,10 +41,10 @@ class Following:
         return len(found)
 
 
-@examples(60)
+@examples(40)
 @given(chances, st.integers(1, 14))
 def test_what_is_brought_forward_is_what_is_made_afresh(random: Random, length: int) -> None:
-    repo = Repo()
+    repo = MemoryRepo()
     following = Following(repo.state.config)
     for request in told(Maker(random).sequence(length)):
         taken = repo.take(request)
@@ -55,7 +55,7 @@ def test_what_is_brought_forward_is_what_is_made_afresh(random: Random, length: 
 
 @pytest.mark.parametrize("seed", range(2 * TIMES))
 def test_several_changes_at_once(seed: int) -> None:
-    repo, random = Repo(), Random(seed)
+    repo, random = MemoryRepo(), Random(seed)
     following = Following(repo.state.config)
     changes: list[ClaimChange] = []
     for request in Maker(random).sequence(80):
@@ -69,7 +69,7 @@ def test_several_changes_at_once(seed: int) -> None:
 
 
 def test_what_reads_nothing_that_changed_is_left_alone() -> None:
-    repo = Repo()
+    repo = MemoryRepo()
     maker = Maker(Random(1), calm=True)
     following = Following(repo.state.config)
     for request in maker.sequence(20):

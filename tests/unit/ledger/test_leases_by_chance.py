@@ -207,7 +207,7 @@ def assert_recorded(world: running.World, promises: Promises) -> None:
             assert claim.lease.until <= end <= claim.lease.expires_at
 
 
-@examples(90)
+@examples(60)
 @given(chances, st.integers(1, 16))
 def test_what_was_promised_is_kept(random: Random, length: int) -> None:
     world, promises, maker = running.World(EMPTY, FILES), Promises(SLACK_S), Maker(random)
@@ -304,7 +304,7 @@ connections = st.builds(
 all_claims = st.builds(Claim, held=applications | connections, **common)
 
 
-@examples(150)
+@examples(100)
 @given(all_claims)
 def test_a_claim_is_read_as_it_was_written(claim: Claim) -> None:
     path = claim_file.path_of(claim.key)
@@ -318,7 +318,7 @@ def test_a_claim_is_read_as_it_was_written(claim: Claim) -> None:
         )
 
 
-@examples(50)
+@examples(35)
 @given(st.lists(all_claims, max_size=8), chances)
 def test_the_index_is_that_of_a_ledger_built_in_any_order(
     claims: list[Claim], random: Random

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples, told
-from tests.kit.memory import MemoryRepo as Repo
+from tests.kit.memory import MemoryRepo
 from tests.model.goals import goal
 
 DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
@@ -90,7 +90,7 @@ def kubernetes_name(subject: Subject) -> str:
     return naming.object_name(*subject)
 
 
-@examples(60)
+@examples(40)
 @given(st.lists(subjects, min_size=1, max_size=12))
 def test_different_subjects_have_different_names_that_kubernetes_takes(
     drawn: list[Subject],
@@ -115,7 +115,7 @@ def topic_instance(subject: Subject) -> str:
     return naming.topic_part(*subject)
 
 
-@examples(80)
+@examples(50)
 @given(st.lists(st.one_of(st.tuples(ids), st.tuples(ids, topics)), min_size=1, max_size=12))
 def test_different_subjects_have_different_derived_topics_that_ros_takes(
     drawn: list[Subject],
@@ -205,7 +205,7 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
 
 
 def test_the_watcher_of_one_application_is_not_named_like_the_fusion_of_another() -> None:
-    repo = Repo()
+    repo = MemoryRepo()
     item = {
         "requester_ids": ["somebody"],
         "ego_data_topics": [{"source_node_id": "vehicle00", "topic_name": "/ego"}],
@@ -235,9 +235,9 @@ def usual_cloud(nodes: list[str], node: str) -> str:
     return f"/usual/cloud{nodes.index(node)}"
 
 
-def with_nodes(nodes: list[str]) -> Repo:
+def with_nodes(nodes: list[str]) -> MemoryRepo:
     """Return a new repo whose inventory lists further nodes, with any ids."""
-    repo = Repo()
+    repo = MemoryRepo()
     config = repo.state.config
     (domain,) = config.domains.values()
     more = {

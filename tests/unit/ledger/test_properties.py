@@ -19,8 +19,7 @@ from hypothesis import assume, given, note
 from hypothesis import strategies as st
 
 from tests.kit.chance import TIMES, chances, examples, told
-from tests.kit.memory import NOW, outcome
-from tests.kit.memory import MemoryRepo as Repo
+from tests.kit.memory import NOW, MemoryRepo, outcome
 from tests.model.books import Books, Demand, Goal
 from tests.model.goals import (
     SKELETON,
@@ -42,7 +41,7 @@ def demand_in(claim: Claim) -> tuple[str, str, Demand]:
     return kind, claim.subject.id, (claim.request, claim.requesters)
 
 
-def ledger_in(repo: Repo) -> Ledger:
+def ledger_in(repo: MemoryRepo) -> Ledger:
     """Return the ledger as one who only has the files reads it."""
     ledger = Ledger()
     for path, text in repo.below("ledger").items():
@@ -54,12 +53,12 @@ def ledger_in(repo: Repo) -> Ledger:
 # As the model has it
 
 
-@examples(70)
+@examples(45)
 @given(chances, st.integers(1, 14))
 def test_bookkeeping_and_outcomes_are_the_models_after_every_request(
     random: Random, length: int
 ) -> None:
-    repo, books = Repo(), Books(SKELETON)
+    repo, books = MemoryRepo(), Books(SKELETON)
     for request in told(Maker(random).sequence(length)):
         expected = books.take(request)
         taken = repo.take(request)
@@ -68,9 +67,9 @@ def test_bookkeeping_and_outcomes_are_the_models_after_every_request(
         assert repo.view() == books.view()
 
 
-@pytest.mark.parametrize("seed", range(4 * TIMES))
+@pytest.mark.parametrize("seed", range(2 * TIMES))
 def test_bookkeeping_stays_the_models_over_a_long_time(seed: int) -> None:
-    repo, books = Repo(), Books(SKELETON)
+    repo, books = MemoryRepo(), Books(SKELETON)
     for place, request in enumerate(Maker(Random(seed)).sequence(150)):
         expected = books.take(request)
         taken = repo.take(request)
@@ -78,10 +77,10 @@ def test_bookkeeping_stays_the_models_over_a_long_time(seed: int) -> None:
         assert repo.view() == books.view(), (place, request)
 
 
-@examples(70)
+@examples(45)
 @given(chances, st.integers(1, 14))
 def test_a_shutdown_names_what_was_not_held_and_nothing_else(random: Random, length: int) -> None:
-    repo, books = Repo(), Books(SKELETON)
+    repo, books = MemoryRepo(), Books(SKELETON)
     for request in told(Maker(random).sequence(length)):
         expected = books.take(request)
         taken = repo.take(request)
@@ -106,7 +105,7 @@ def _whole(text: str) -> bool:
 def test_a_subject_listed_twice_in_one_shutdown_costs_one_claim_only() -> None:
     who = ["vehicle00", "station00"]
     item = connection("station00/edge", who, ["/status"])
-    repo = Repo()
+    repo = MemoryRepo()
     repo.take_all([goal("first", connections=[item]), goal("second", connections=[item])])
     whole = {**item, "source_topics": [], "target_topics": []}
 
@@ -117,7 +116,7 @@ def test_a_subject_listed_twice_in_one_shutdown_costs_one_claim_only() -> None:
 
 
 def test_a_topic_that_a_shutdown_lists_twice_is_not_said_to_be_not_held() -> None:
-    repo = Repo()
+    repo = MemoryRepo()
     topics = [ego("vehicle00"), ego("vehicle01")]
     repo.take(goal("one", [application("cloud/fusion", ["vehicle00"], topics)]))
     twice = [
@@ -133,7 +132,7 @@ def test_a_topic_that_a_shutdown_lists_twice_is_not_said_to_be_not_held() -> Non
 
 
 def test_a_shutdown_may_leave_out_the_ends_of_a_connection() -> None:
-    repo = Repo()
+    repo = MemoryRepo()
     joined = connection("station00/edge", ["station00"], ["/status"])
     repo.take(goal("one", connections=[joined]))
     bare = {**joined, "source_node_id": "", "target_node_id": ""}
@@ -146,7 +145,7 @@ def test_a_shutdown_may_leave_out_the_ends_of_a_connection() -> None:
 # Nothing stays behind
 
 
-@examples(30)
+@examples(20)
 @given(chances, st.integers(0, 6), st.integers(0, 6))
 def test_a_released_demand_leaves_no_trace(random: Random, before: int, after: int) -> None:
     maker = Maker(random)
@@ -158,7 +157,7 @@ def test_a_released_demand_leaves_no_trace(random: Random, before: int, after: i
         for _ in range(after)
     ]
     told([*first, guest, *others])
-    with_guest, without = Repo(), Repo()
+    with_guest, without = MemoryRepo(), MemoryRepo()
     outcomes = [outcome(without.take(request)) for request in first]
 
     assert [outcome(with_guest.take(request)) for request in first] == outcomes
@@ -176,22 +175,22 @@ def test_a_released_demand_leaves_no_trace(random: Random, before: int, after: i
 @examples(20)
 @given(chances, st.integers(1, 8))
 def test_when_all_have_left_the_repo_is_as_it_was_laid_down(random: Random, count: int) -> None:
-    maker, repo = Maker(random, calm=True), Repo()
+    maker, repo = Maker(random, calm=True), MemoryRepo()
     requests = told([maker.join(f"request {number}") for number in range(count)])
     repo.take_all(requests)
 
     assert set(repo.take_all([shutdown_of(request) for request in requests])) == {"released"}
-    assert repo.state == Repo().state
-    assert repo.files == Repo().files
+    assert repo.state == MemoryRepo().state
+    assert repo.files == MemoryRepo().files
 
 
 # Again
 
 
-@examples(40)
+@examples(28)
 @given(chances, st.integers(1, 8))
 def test_booking_again_changes_nothing(random: Random, length: int) -> None:
-    maker, repo = Maker(random), Repo()
+    maker, repo = Maker(random), MemoryRepo()
     for request in told(maker.sequence(length)):
         taken = repo.take(request)
         if outcome(taken) not in ("booked", "unchanged"):
@@ -207,12 +206,12 @@ def test_booking_again_changes_nothing(random: Random, length: int) -> None:
             assert not again.releases
 
 
-@examples(40)
+@examples(28)
 @given(chances, st.integers(0, 6))
 def test_a_demand_still_counts_once_when_others_came_in_between(
     random: Random, others: int
 ) -> None:
-    maker, repo = Maker(random, calm=True), Repo()
+    maker, repo = Maker(random, calm=True), MemoryRepo()
     request = maker.join("mine")
     repo.take_all(told([request, *(maker.join() for _ in range(others))]))
 
@@ -222,17 +221,17 @@ def test_a_demand_still_counts_once_when_others_came_in_between(
 # Together or not at all
 
 
-@examples(50)
+@examples(35)
 @given(chances, st.integers(0, 6))
 def test_what_a_request_asks_for_is_booked_together_or_not_at_all(
     random: Random, before: int
 ) -> None:
-    maker, repo = Maker(random), Repo()
+    maker, repo = Maker(random), MemoryRepo()
     repo.take_all(told(maker.sequence(before)))
     request = told([maker.join()])[0]
     parts = [goal(request["id"], [app]) for app in request["apps"]]
     parts += [goal(request["id"], connections=[item]) for item in request["connections"]]
-    one_by_one = Repo()
+    one_by_one = MemoryRepo()
     one_by_one.state, one_by_one.files = repo.state, dict(repo.files)
     outcomes = [outcome(one_by_one.take(part)) for part in parts]
     standing, files = repo.state, dict(repo.files)
@@ -248,10 +247,10 @@ def test_what_a_request_asks_for_is_booked_together_or_not_at_all(
         assert repo.files == one_by_one.files
 
 
-@examples(40)
+@examples(28)
 @given(chances, st.integers(1, 12))
 def test_a_request_writes_the_claims_it_changes_and_no_others(random: Random, length: int) -> None:
-    repo, books = Repo(), Books(SKELETON)
+    repo, books = MemoryRepo(), Books(SKELETON)
     for request in told(Maker(random).sequence(length)):
         expected = books.take(request)
         taken = repo.take(request)
@@ -265,7 +264,7 @@ def test_a_request_writes_the_claims_it_changes_and_no_others(random: Random, le
 
 
 def test_a_contradiction_in_a_connection_keeps_the_application_from_being_booked() -> None:
-    repo = Repo()
+    repo = MemoryRepo()
     mine = connection("vehicle00/edge", ["vehicle00"])
     repo.take(goal("one", connections=[mine]))
     standing = repo.state
@@ -281,7 +280,7 @@ def test_a_contradiction_in_a_connection_keeps_the_application_from_being_booked
 # Order
 
 
-@examples(20)
+@examples(14)
 @given(chances, st.integers(2, 6))
 def test_the_order_of_independent_demands_does_not_matter(random: Random, count: int) -> None:
     maker = Maker(random, calm=True)
@@ -295,7 +294,7 @@ def test_the_order_of_independent_demands_does_not_matter(random: Random, count:
         ready = [r for r in waiting if not r["shutdown"] or r["id"] in here]
         other_order.append(ready[0])
         waiting.remove(ready[0])
-    one, other = Repo(), Repo()
+    one, other = MemoryRepo(), MemoryRepo()
 
     assert "refused" not in {outcome(one.take(request)) for request in one_order}
     for request in other_order:  # nor does it matter in which order a request lists things
@@ -307,12 +306,12 @@ def test_the_order_of_independent_demands_does_not_matter(random: Random, count:
 # Step by step
 
 
-@examples(40)
+@examples(28)
 @given(chances, st.integers(1, 12))
 def test_rendering_step_by_step_gives_what_rendering_at_once_gives(
     random: Random, length: int
 ) -> None:
-    repo = Repo()
+    repo = MemoryRepo()
     for request in told(Maker(random).sequence(length)):
         repo.take(request)
         at_once = rendered_files(repo.state)
@@ -322,10 +321,10 @@ def test_rendering_step_by_step_gives_what_rendering_at_once_gives(
     assert rendered_files(fresh) == at_once
 
 
-@examples(40)
+@examples(28)
 @given(chances, st.integers(1, 8))
 def test_a_further_requester_changes_no_release(random: Random, length: int) -> None:
-    maker, repo = Maker(random), Repo()
+    maker, repo = Maker(random), MemoryRepo()
     requests = told(maker.sequence(length))
     taken = [repo.take(request) for request in requests]
     standing = [
@@ -351,7 +350,7 @@ def test_a_further_requester_changes_no_release(random: Random, length: int) -> 
 
 
 def test_the_model_and_the_program_agree_on_the_papers_table() -> None:
-    repo, books = Repo(), Books(SKELETON)
+    repo, books = MemoryRepo(), Books(SKELETON)
     joins = []
     for vehicle in ("vehicle00", "vehicle01", "vehicle03", "vehicle02"):
         who = [vehicle, "station00"]

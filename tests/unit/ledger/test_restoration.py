@@ -17,8 +17,7 @@ from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.restoration import Restoration
 
-from tests.kit.memory import NOW
-from tests.kit.memory import MemoryRepo as Repo
+from tests.kit.memory import NOW, MemoryRepo
 from tests.model.goals import Maker
 
 LATER = NOW + timedelta(hours=3)
@@ -35,8 +34,8 @@ def back_to(claims: Iterable[Claim], *, drop_newer: bool = False) -> Restoration
     )
 
 
-def filled(seed: int) -> Repo:
-    repo = Repo()
+def filled(seed: int) -> MemoryRepo:
+    repo = MemoryRepo()
     for request in Maker(Random(seed), calm=True).sequence(12):
         repo.take(request)
     assert len(repo.state.ledger) > 2
@@ -47,7 +46,7 @@ def claims(ledger: Ledger) -> dict[Any, Claim]:
     return {claim.key: claim for claim in ledger}
 
 
-def rolled_back(repo: Repo, request: Restoration, now: datetime = LATER) -> Decision:
+def rolled_back(repo: MemoryRepo, request: Restoration, now: datetime = LATER) -> Decision:
     return decide(repo.state, request, now, repo.files.get)
 
 

@@ -26,14 +26,14 @@ def text() -> str:
     sections = {
         "configuration": (
             (name, of_config.refused(edited(path, old, new)))
-            for name, (path, old, new, _) in of_config.EDITS.items()
+            for name, (path, old, new) in of_config.EDITS.items()
         ),
         "overrides": (
             (name, of_overrides.refused(tested=of_overrides.text(**changed)))
-            for name, (changed, _) in of_overrides.MISTAKES.items()
+            for name, changed in of_overrides.MISTAKES.items()
         ),
-        "goals": ((name, _refusal(goal)) for name, (goal, _) in of_goals.REFUSED.items()),
-        "the form of goals": ((name, _refusal(goal)) for name, (goal, _) in of_form.WRONG.items()),
+        "goals": ((name, _refusal(goal)) for name, goal in of_goals.REFUSED.items()),
+        "the form of goals": ((name, _refusal(goal)) for name, goal in of_form.WRONG.items()),
     }
     lines = ["Written by `make golden`. Words of pydantic and libyaml are replaced by …", ""]
     for title, cases in sections.items():

@@ -18,12 +18,12 @@ from demandops.demand.demand_request import Expire
 from demandops.errors import InvalidInput, Refused
 from demandops.plan.views.bookkeeping import bookkeeping
 from demandops.subject import Subject, SubjectKind
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.chance import examples
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal
-from tests.kit.memory import NOW
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import NOW, MemoryRepo
 
 HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
 
@@ -76,9 +76,9 @@ def demands(draw: st.DrawFn) -> tuple[str, Any]:
 
 
 @given(st.lists(demands(), max_size=14))
-@settings(max_examples=25, deadline=None)
+@examples(25)
 def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> None:
-    books = Books(CROWD)
+    books = MemoryRepo(CROWD)
     for made in sent:
         before = dict(books.files)
         try:
@@ -104,12 +104,12 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
         assert "v2/edge" not in entries.connections
 
 
-def _one(**fields: Any) -> Books:
-    return Books(files(tested=fields))
+def _one(**fields: Any) -> MemoryRepo:
+    return MemoryRepo(files(tested=fields))
 
 
 def test_the_higher_priority_wins_and_patches_of_both_apply() -> None:
-    books = Books(
+    books = MemoryRepo(
         files(
             low={
                 "select": [{"nodes": ["edge"]}],
@@ -137,11 +137,11 @@ def test_what_is_higher_than_a_hold_changes_what_it_holds() -> None:
 
     hold = {"select": [{"services": ["object-detection"]}], "hold": True}
     for priority, changed in ((1, True), (-1, False)):
-        books = Books({})
+        books = MemoryRepo({})
         books.send(goal([application()]))
         before = dict(books.files)
         more = {"select": [{"nodes": ["edge"]}], "replicas": 4, "priority": priority}
-        held = Books(files(held=hold, more=more))
+        held = MemoryRepo(files(held=hold, more=more))
         held.state = held.state.__class__(held.config, held.state.engine, books.state.ledger)
         after = rendered_files(held.state, before)
         path = "clusters/c-its/perception/edge/od-edge-vehicle00.yaml"
@@ -193,7 +193,7 @@ def test_a_label_denied_is_told_at_the_end_that_has_it() -> None:
 def test_a_demand_that_an_override_breaks_is_told_which() -> None:
     """A patch may fit the invented demand and not the one that comes."""
     fields = {"select": [{"services": ["object-detection"]}], "values": {"replicas": {"x": 1}}}
-    books = Books(files(tested=fields))
+    books = MemoryRepo(files(tested=fields))
     with pytest.raises(InvalidInput) as refusal:
         books.send(goal([application()]))
     (found,) = refusal.value.faults
@@ -230,12 +230,12 @@ CHARTS = "clusters/c-its/perception/_charts"
 
 def test_a_held_release_keeps_its_chart_when_the_registry_moves_on() -> None:
     old, new = REGISTRY % ("1.0.0", "2.0.0"), REGISTRY % ("1.1.0", "2.1.0")
-    books = Books({"registry/charts.yaml": old})
+    books = MemoryRepo({"registry/charts.yaml": old})
     books.send(goal([application()]))
     before = dict(books.files)
     hold = files(held={"select": [{"services": ["object-detection"]}], "hold": True})
     for overrides, kept in ((hold, True), ({}, False)):
-        moved = Books({"registry/charts.yaml": new, **overrides})
+        moved = MemoryRepo({"registry/charts.yaml": new, **overrides})
         state = type(moved.state)(moved.config, moved.state.engine, books.state.ledger)
         after = rendered_files(state, before)
         assert (f"{CHARTS}/object-detection-1.0.0.yaml" in after) is kept
@@ -271,7 +271,7 @@ def test_what_a_lease_ends_is_kept_too_and_a_put_that_drops_it_as_well() -> None
     assert made.overrides == ("overrides/tested.yaml",)
 
 
-def _holders(books: Books) -> dict[str, list[str]]:
+def _holders(books: MemoryRepo) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for claim in books.state.ledger:
         if claim.subject.kind is SubjectKind.APPLICATION:

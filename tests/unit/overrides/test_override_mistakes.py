@@ -1,4 +1,4 @@
-"""What people write wrong in an override, and the place that the faults name."""
+"""What people write wrong in an override; ``tests/unit/messages`` holds what is said of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from demandops.config.load import load
 from demandops.errors import Fault, InvalidInput
 
 from tests.kit.config import configuration
-from tests.kit.mutations import places_of_faults as places
 
 VALID: dict[str, Any] = {
     "apiVersion": "demandops/v1",
@@ -37,108 +36,31 @@ def refused(**overrides: str) -> tuple[Fault, ...]:
     return invalid.value.faults
 
 
-MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
-    "a reason of two lines": (
-        {"reason": "one\ntwo"},
-        ["reason"],
-    ),
-    "an empty reason": (
-        {"reason": " "},
-        ["reason"],
-    ),
-    "an empty list": (
-        {"select": []},
-        ["select"],
-    ),
-    "an empty selector": (
-        {"select": [{}]},
-        ["select[0]"],
-    ),
-    "no pattern": (
-        {"select": [{"nodes": []}]},
-        ["select[0].nodes"],
-    ),
-    "a pattern forgotten": (
-        {"select": [{"nodes": None, "services": ["*"]}]},
-        ["select[0]"],
-    ),
-    "an end forgotten": (
-        {"expires": EMPTY},
-        [""],
-    ),
-    "a misspelt effect": (
-        {"replica": 2},
-        ["replica"],
-    ),
-    "a connection of an application": (
-        {"select": [{"connections": ["*"], "services": ["*"]}]},
-        ["select[0]"],
-    ),
-    "no effect": (
-        {"replicas": None},
-        [""],
-    ),
-    "deny and more": (
-        {"deny": True, "version": "0.1.0"},
-        [""],
-    ),
-    "hold and more": (
-        {"hold": True, "values": {"a": 1}},
-        [""],
-    ),
-    "a connection moved": (
-        {"select": [{"connections": ["*"]}], "replicas": None, "node": "cloud"},
-        [""],
-    ),
-    "a service kept": (
-        {"replicas": None, "keep": True},
-        [""],
-    ),
-    "no time": (
-        {"expires": "tomorrow"},
-        ["expires"],
-    ),
-    "a time without zone": (
-        {"expires": "2026-01-31T12:00:00"},
-        ["expires"],
-    ),
-    "a day that is none": (
-        {"expires": "2026-02-31T12:00:00Z"},
-        ["expires"],
-    ),
-    "a number that JSON lacks": (
-        {"values": {"a": [{"b": float("inf")}]}},
-        ["values"],
-    ),
-    "a pin that says nothing": (
-        {"images": {"object-detection": {}}},
-        ["images.object-detection"],
-    ),
-    "an unknown image": (
-        {"images": {"object-detektion": {"tag": "1"}}},
-        ["images.object-detektion"],
-    ),
-    "an unknown node": (
-        {"node": "edgy"},
-        ["node"],
-    ),
-    "an unknown version": (
-        {"version": "9.9.9"},
-        ["version"],
-    ),
-    "several at once": (
-        {"owner": None, "priority": "high", "hold": False},
-        ["owner", "priority", "hold"],
-    ),
+MISTAKES: dict[str, dict[str, Any]] = {
+    "a reason of two lines": {"reason": "one\ntwo"},
+    "an empty reason": {"reason": " "},
+    "an empty list": {"select": []},
+    "an empty selector": {"select": [{}]},
+    "no pattern": {"select": [{"nodes": []}]},
+    "a pattern forgotten": {"select": [{"nodes": None, "services": ["*"]}]},
+    "an end forgotten": {"expires": EMPTY},
+    "a misspelt effect": {"replica": 2},
+    "a connection of an application": {"select": [{"connections": ["*"], "services": ["*"]}]},
+    "no effect": {"replicas": None},
+    "deny and more": {"deny": True, "version": "0.1.0"},
+    "hold and more": {"hold": True, "values": {"a": 1}},
+    "a connection moved": {"select": [{"connections": ["*"]}], "replicas": None, "node": "cloud"},
+    "a service kept": {"replicas": None, "keep": True},
+    "no time": {"expires": "tomorrow"},
+    "a time without zone": {"expires": "2026-01-31T12:00:00"},
+    "a day that is none": {"expires": "2026-02-31T12:00:00Z"},
+    "a number that JSON lacks": {"values": {"a": [{"b": float("inf")}]}},
+    "a pin that says nothing": {"images": {"object-detection": {}}},
+    "an unknown image": {"images": {"object-detektion": {"tag": "1"}}},
+    "an unknown node": {"node": "edgy"},
+    "an unknown version": {"version": "9.9.9"},
+    "several at once": {"owner": None, "priority": "high", "hold": False},
 }
-
-
-@pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_a_fault_with_file_and_place(name: str) -> None:
-    changed, expected = MISTAKES[name]
-    found = refused(tested=text(**changed))
-    assert {one.file for one in found} == {"overrides/tested.yaml"}
-    assert places(found) == expected
 
 
 @pytest.mark.parametrize("path", ["overrides/a.yml", "overrides/A.yaml", "overrides/b/c.yaml"])

@@ -23,9 +23,10 @@ from demandops.plan.checks import trial_demands
 from demandops.plan.overrides.release_overrides import apply_effects, effects_on
 from demandops.plan.overrides.selectors import Traits, fits
 from demandops.plan.release import ServiceRelease
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
+from tests.kit.chance import examples
 from tests.kit.config import configuration
 
 TEXTS = ["".join(chars) for size in range(6) for chars in product("ab", repeat=size)]
@@ -86,7 +87,7 @@ selector = fields.filter(bool).map(Selector.model_validate)
 
 
 @given(st.lists(selector, min_size=1, max_size=2), st.lists(selector, min_size=1, max_size=2))
-@settings(max_examples=300)
+@examples(150)
 def test_selectors_that_cannot_meet_never_do(one: list[Selector], other: list[Selector]) -> None:
     if can_meet(one, other, config()):
         return
@@ -128,7 +129,7 @@ patch = st.fixed_dictionaries({}, optional={"k": json, "l": json})
 
 
 @given(patch, patch, patch)
-@settings(max_examples=300)
+@examples(150)
 def test_patches_that_commute_give_the_same_in_either_order(
     target: dict[str, Any], one: dict[str, Any], other: dict[str, Any]
 ) -> None:
@@ -183,7 +184,7 @@ def _release() -> ServiceRelease:
 
 
 @given(effects, effects)
-@settings(max_examples=300)
+@examples(150)
 def test_what_is_not_contested_is_the_same_in_either_order(
     one: dict[str, Any], other: dict[str, Any]
 ) -> None:

@@ -14,12 +14,12 @@ from demandops.render.output_check import check_files
 from tests.kit.config import FAST, edited
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal, perception
 from tests.kit.golden import CASES, rendered
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import MemoryRepo
 
 BUILT_IN = {"v1", "apps/v1", "rbac.authorization.k8s.io/v1"}
 
 
-def documents(books: Books) -> Iterator[tuple[str, dict[str, Any]]]:
+def documents(books: MemoryRepo) -> Iterator[tuple[str, dict[str, Any]]]:
     for path, text in books.files.items():
         if path.startswith("clusters/") and path.endswith(".yaml"):
             for document in yaml.load_all(text, Loader=FAST):
@@ -42,7 +42,7 @@ def test_what_is_rendered_fits_the_schemas_of_kubernetes(case: str) -> None:
 
 
 def test_requesters_appear_nowhere_below_clusters() -> None:
-    books = Books()
+    books = MemoryRepo()
     names = ["Requester-Zero", "requester/one", "request \u00fcber {{ two }}"]
     books.send(
         goal([application(who=names[:2])], [connection(who=names[:2])], id="a-request-of-somebody")
@@ -57,7 +57,7 @@ def test_requesters_appear_nowhere_below_clusters() -> None:
 
 
 def test_a_further_requester_changes_no_file_below_clusters() -> None:
-    books = Books()
+    books = MemoryRepo()
     books.send(perception())
     further = books.send(
         goal([application(who=["vehicle01"])], [connection(who=["vehicle01"])], id="further")
@@ -78,7 +78,7 @@ def test_a_further_requester_changes_no_file_below_clusters() -> None:
 
 
 def test_a_demand_touches_only_what_it_changes() -> None:
-    books = Books()
+    books = MemoryRepo()
     for number in range(10):
         books.send(goal([], [connection(f"c{number}")], id=f"r{number}"))
     books.send(goal([application(clouds=[STATION_CLOUD])], id="first"))
@@ -91,7 +91,7 @@ def test_a_demand_touches_only_what_it_changes() -> None:
 
 def test_the_inputs_of_a_fusion_change_nothing_but_the_inputs() -> None:
     """They reach a ConfigMap through the chart; everything else of the values restarts pods."""
-    books = Books()
+    books = MemoryRepo()
     books.send(goal([application(clouds=[STATION_CLOUD])], id="1"))
     before = fusion(books)
     books.send(goal([application(clouds=[CLOUD], ego=[EGO])], id="2"))
@@ -107,7 +107,7 @@ def test_the_inputs_of_a_fusion_change_nothing_but_the_inputs() -> None:
     assert before == after
 
 
-def fusion(books: Books) -> dict[str, Any]:
+def fusion(books: MemoryRepo) -> dict[str, Any]:
     (found,) = (
         item for name, item in books.objects("HelmRelease").items() if name.startswith("of-")
     )
@@ -119,7 +119,7 @@ def test_each_access_domain_has_its_own_folder_namespace_and_account() -> None:
     for name in ("fleet", "city"):
         text += f"  - {{name: {name}, namespace: ns-{name}, serviceAccount: sa-{name}, nodes: ["
         text += '"vehicle*"]}\n' if name == "fleet" else "edge, cloud, station00]}\n"
-    books = Books({"policy/access-domains.yaml": text})
+    books = MemoryRepo({"policy/access-domains.yaml": text})
     books.send(perception())
     for path, document in documents(books):
         domain = path.split("/")[2]
@@ -179,7 +179,7 @@ def test_a_new_selector_of_a_node_reaches_what_runs_there() -> None:
     change = edited(
         "inventory/nodes.yaml", "- id: edge\n", "- id: edge\n    selector: {rack: r1}\n"
     )
-    books = Books(change)
+    books = MemoryRepo(change)
     books.send(perception())
     for release in books.objects("HelmRelease").values():
         assert release["spec"]["values"]["nodeSelector"] == {"rack": "r1"}

@@ -11,7 +11,7 @@ from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.route import RouteOptions
 
 from tests.kit.config import skeleton
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import MemoryRepo
 
 PAGE = (Path(__file__).parents[3] / "docs" / "connections.md").read_text()
 
@@ -35,7 +35,7 @@ def test_the_example_gives_what_the_page_says() -> None:
     more = files.pop("registry/images.yaml, one more")
     request = yaml.safe_load(files.pop("demand.yaml"))
     images = {"registry/images.yaml": skeleton()["registry/images.yaml"] + more}
-    books = Books({**files, **images})
+    books = MemoryRepo({**files, **images})
     decision = books.send(request)
 
     clients = books.objects("ConfigMap")

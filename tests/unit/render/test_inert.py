@@ -17,7 +17,7 @@ from demandops.identifiers import control_character
 
 from tests.kit.config import FAST, skeleton
 from tests.kit.goals import application, connection, goal
-from tests.kit.memory import MemoryRepo as Books
+from tests.kit.memory import MemoryRepo
 
 NODES = "inventory/nodes.yaml"
 
@@ -91,20 +91,20 @@ def quoted(text: str) -> str:
     return '"' + "".join(f"\\U{ord(char):08X}" for char in text) + '"'
 
 
-def inventory(lines: Iterable[str]) -> Books:
+def inventory(lines: Iterable[str]) -> MemoryRepo:
     """Return a state repo with further nodes, each given by what stands below its kind."""
     entries = "".join(f"  - type: vehicle\n    cluster: c-its\n{line}" for line in lines)
-    return Books({NODES: skeleton()[NODES] + entries})
+    return MemoryRepo({NODES: skeleton()[NODES] + entries})
 
 
 @pytest.fixture(scope="module")
-def odd_nodes() -> Books:
+def odd_nodes() -> MemoryRepo:
     """Return a state repo in which each trap is a node's id."""
     return inventory(f"    id: {quoted(text)}\n    selector: {{a: b}}\n" for text in TRAPS)
 
 
 @pytest.mark.parametrize("text", TRAPS)
-def test_an_id_is_read_back_as_it_was(odd_nodes: Books, text: str) -> None:
+def test_an_id_is_read_back_as_it_was(odd_nodes: MemoryRepo, text: str) -> None:
     books = odd_nodes.copy()
     books.send(
         goal(
@@ -132,7 +132,7 @@ def test_an_id_is_read_back_as_it_was(odd_nodes: Books, text: str) -> None:
     }
 
 
-def there(books: Books, node: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def there(books: MemoryRepo, node: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the values of a release and the pod of a connection's end that run on a node."""
     books.send(goal([application(node=node)], [connection(ends=(node, "edge"))]))
     for content in books.rendered().values():
@@ -153,7 +153,7 @@ ANY_TEXT = [
 
 
 @pytest.fixture(scope="module")
-def tainted_nodes() -> Books:
+def tainted_nodes() -> MemoryRepo:
     """Return a state repo in which each text is a toleration of the node ``n<its index>``."""
     return inventory(
         f"    id: n{index}\n    tolerations: [{{key: {quoted(text)}, value: {quoted(text)}}}]\n"
@@ -162,7 +162,7 @@ def tainted_nodes() -> Books:
 
 
 @pytest.mark.parametrize("index", range(len(ANY_TEXT)), ids=[repr(text) for text in ANY_TEXT])
-def test_a_toleration_is_read_back_as_it_was(tainted_nodes: Books, index: int) -> None:
+def test_a_toleration_is_read_back_as_it_was(tainted_nodes: MemoryRepo, index: int) -> None:
     """People write them, in any text that YAML can hold."""
     values, pod = there(tainted_nodes.copy(), f"n{index}")
     wanted = [{"key": ANY_TEXT[index], "value": ANY_TEXT[index]}]
@@ -173,7 +173,7 @@ LABELS = ["yes", "y", "1e3", "0x1F", "010", "1_000", "2026-01-31", "null", "true
 
 
 @pytest.fixture(scope="module")
-def labelled_nodes() -> Books:
+def labelled_nodes() -> MemoryRepo:
     """Return a state repo in which each label selects the node ``n<its index>``."""
     return inventory(
         f'    id: n{index}\n    selector: {{"{label or "a"}": "{label}"}}\n'
@@ -182,7 +182,7 @@ def labelled_nodes() -> Books:
 
 
 @pytest.mark.parametrize("index", range(len(LABELS)), ids=[repr(label) for label in LABELS])
-def test_a_selector_is_text_for_every_parser(labelled_nodes: Books, index: int) -> None:
+def test_a_selector_is_text_for_every_parser(labelled_nodes: MemoryRepo, index: int) -> None:
     books = labelled_nodes.copy()
     values, pod = there(books, f"n{index}")
     wanted = {LABELS[index] or "a": LABELS[index]}
@@ -201,7 +201,7 @@ def test_names_that_kubernetes_takes_and_yaml_misreads(name: str) -> None:
     clusters = f'apiVersion: demandops/v1\nkind: Clusters\nclusters: [{{name: "{name}"}}]\n'
     nodes = skeleton()[NODES].replace("cluster: c-its", f'cluster: "{name}"')
     nodes = nodes.replace("- id: edge\n", f'- id: edge\n    imagePullSecrets: ["{name}"]\n')
-    books = Books(
+    books = MemoryRepo(
         {"policy/access-domains.yaml": domains, "inventory/clusters.yaml": clusters, NODES: nodes}
     )
     books.send(goal([application()], [connection()]))
@@ -240,4 +240,4 @@ def test_numbers_and_truths_stay_numbers_and_truths() -> None:
 
 @pytest.mark.parametrize("text", [text for text in UNSEEN if ord(text[0]) < 0xFEFF])
 def test_what_no_reader_would_see_is_refused_in_an_id(text: str) -> None:
-    assert Books().faults(goal([], [connection(f"a{text.strip('ab ')}b")]))
+    assert MemoryRepo().faults(goal([], [connection(f"a{text.strip('ab ')}b")]))

@@ -9,9 +9,10 @@ import pytest
 from demandops.identifiers import id_problem
 from demandops.staterepo.history import commit_log, commit_message
 from demandops.staterepo.history.commit_log import operations_since, trailers_of
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.chance import examples
 from tests.kit.repo import git
 
 
@@ -52,11 +53,7 @@ IDS = st.text(
 
 
 @given(names=st.lists(IDS, min_size=1, max_size=3, unique=True), request=IDS, application=IDS)
-@settings(
-    max_examples=40,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
+@examples(30)
 def test_every_id_is_read_back_by_git_and_by_us_as_it_was(
     desk: Any, repo: pygit2.Repository, names: list[str], request: str, application: str
 ) -> None:

@@ -9,8 +9,10 @@ from contextlib import contextmanager
 import pygit2
 import pytest
 from demandops.staterepo.git import tree as trees
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+
+from tests.kit.chance import examples
 
 Files = dict[str, str]
 
@@ -89,11 +91,8 @@ def lay(repo: pygit2.Repository, files: Files) -> pygit2.Tree:
     return tree
 
 
-RELAXED = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-
-
 @given(data=st.data())
-@RELAXED
+@examples(50)
 def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.DataObject) -> None:
     files = data.draw(file_trees(), "files")
     change = data.draw(changes(files), "change")
@@ -105,7 +104,7 @@ def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.Da
 
 
 @given(data=st.data())
-@RELAXED
+@examples(50)
 def test_writing_onto_nothing_gives_the_files_alone(data: st.DataObject) -> None:
     change = data.draw(changes({}), "change")
     with scratch() as repo:
@@ -113,7 +112,7 @@ def test_writing_onto_nothing_gives_the_files_alone(data: st.DataObject) -> None
 
 
 @given(before=file_trees(), after=file_trees())
-@RELAXED
+@examples(50)
 def test_differences_tell_just_what_differs_and_rebuild_the_one_from_the_other(
     before: Files, after: Files
 ) -> None:
