@@ -286,4 +286,5 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
     assert [commit.id for commit in made if len(commit.parents) != 1] == []
     ids = [found for commit in made if (found := commit.one("Operation-Id"))]
     assert sorted(ids) == sorted(set(ids))
-    assert differing(repo, made[-verify_last - 1].id if verify_last else None) == {}
+    before = made[-verify_last - 1].id if 0 < verify_last < len(made) else None
+    assert differing(repo, before) == {}
