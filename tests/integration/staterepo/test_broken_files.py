@@ -203,7 +203,7 @@ def test_a_start_at_any_commit_finds_what_the_running_generator_has(
             made = person.change(files)
             alone = state_in_effect.state_at(repo, made)
             generator.fetch_now()
-            rig.wait_until(lambda: includes(generator, made), f"{made} is followed")
+            rig.wait_until(lambda commit=made: includes(generator, commit), f"{made} is followed")
             running = generator.snapshot
             again = state_in_effect.state_at(repo, running.commit)
             for found in (alone, again):
