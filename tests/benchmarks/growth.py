@@ -25,8 +25,8 @@ from tests.benchmarks import fleet
 
 VEHICLES = (10, 100, 200, 1_000)
 TOPICS = (10, 1_000, 8_000)
-ROUNDS = 20
-WARM_UP = 2
+ROUNDS = 40
+WARM_UP = 20
 
 Row = dict[str, float]
 
