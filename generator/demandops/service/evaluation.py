@@ -8,15 +8,14 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from datetime import datetime, timezone
-from typing import TypeAlias
 
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand import decommission_goal
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
-from demandops.service.approvals.approvals import RELEASED, Approvals, Deferred
-from demandops.service.approvals.proposal import is_release
-from demandops.service.demand_queue import TAKEN_BACK, DemandQueue
+from demandops.service.approvals.approvals import Approvals, Deferred
+from demandops.service.approvals.proposal import is_release, name_of
+from demandops.service.demands import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import Receipt, Ticket
 from demandops.service.timing.rate_limit import RateLimit
@@ -24,11 +23,9 @@ from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_batch
+from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
-
-Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Deferred]
 
 
 class Evaluator:
@@ -37,37 +34,30 @@ class Evaluator:
     def __init__(
         self,
         repository: StateRepository,
-        queue: DemandQueue,
+        demands: Demands,
         approvals: Approvals,
         with_targets: bool,
     ) -> None:
-        self._repository, self._queue, self._approvals = repository, queue, approvals
+        self._repository, self._demands, self._approvals = repository, demands, approvals
         self._with_targets = with_targets
         self._rate_limit = RateLimit()
 
     def evaluate(
         self,
-        commits: commit_batch.CommitBatch,
+        commits: CommitBatch,
         ticket: Ticket,
         published: dict[str, commit_log.RecordedOutcome],
-        earlier: list[Result],
     ) -> Receipt | DemandOpsError | Deferred:
         """Decide a demand, commit it on the commit batch and return its result.
 
         Args:
             published: what :meth:`published_before` returned for the batch.
-            earlier: the results of the earlier demands of the batch. A demand that releases one of
-                them before it is proposed replaces its result with ``Withdrawn``.
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
         if ticket.operation in published:
             return _receipt_of_published(ticket, published[ticket.operation])
         try:
-            released = self._approvals.released_in_batch(ticket, commits.head.state, earlier)
-            earlier[:] = [
-                (t, Withdrawn(RELEASED) if t.operation in released else r) for t, r in earlier
-            ]
             goal = ticket.goal
             if rollback_goal.is_rollback(goal):
                 goal = rollback_goal.to_restoration(goal, self._repository, commits.start)
@@ -83,16 +73,17 @@ class Evaluator:
             )
             if decision.approval:
                 return Deferred(decision)
-            if not self._queue.mark_committed(ticket):
+            if not self._demands.commit(ticket):
                 return Withdrawn(TAKEN_BACK)
             self._approvals.withdraw_replaced(decision.request)
             before = commits.head.state.ledger
             targets = targets_of_decision(before, decision) if self._with_targets else ()
             return replace(_commit(commits, ticket, decision), targets=targets)
         except InvalidInput as error:
-            if self._approvals.has_released_a_proposal(ticket):  # which held no claims yet
+            if ticket.has_released:  # a proposal, which held no claims yet
                 commits.note_settled(ticket.operation, "Unchanged")
-                return _receipt_of_released(ticket, str(commits.head.commit))
+                commit = str(commits.head.commit)
+                return Receipt(ticket.operation, name_of(ticket.goal), "released", commit)
             commits.note_settled(ticket.operation, "Refused")
             return error
         except SigningFailed as error:
@@ -115,7 +106,7 @@ class Evaluator:
         return published
 
 
-def _commit(commits: commit_batch.CommitBatch, ticket: Ticket, decision: Decision) -> Receipt:
+def _commit(commits: CommitBatch, ticket: Ticket, decision: Decision) -> Receipt:
     if decision.files:
         commit = commits.commit(decision, ticket.operation, ticket.received, _now())
         ticket.notify("committed", f"committed {commit}")
@@ -140,21 +131,14 @@ def _receipt_of_published(
     if arrival.outcome == "refused":
         message = "was refused, but the reason was lost with the connection; send it again"
         return Refused([fault("", message, code="refused")])
-    goal = ticket.goal if isinstance(ticket.goal, dict) else {}
+    goal = ticket.goal
     releases = is_release(goal) or decommission_goal.is_decommission(goal)
     outcome: Outcome = "released" if releases else "booked"
     if rollback_goal.is_rollback(goal):
         outcome = "restored"
     if arrival.outcome == "unchanged":
         outcome = "unchanged"
-    name = goal.get("id") or goal.get("request") or goal.get("demand") or goal.get("name") or ""
-    return Receipt(ticket.operation, str(name), outcome, arrival.commit)
-
-
-def _receipt_of_released(ticket: Ticket, commit: str) -> Receipt:
-    goal = ticket.goal
-    name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
-    return Receipt(ticket.operation, str(name), "released", commit)
+    return Receipt(ticket.operation, name_of(goal), outcome, arrival.commit)
 
 
 def _now() -> datetime:

@@ -10,9 +10,8 @@ from pathlib import Path
 
 from demandops import settings
 from demandops.config.config import Config
-from demandops.errors import DemandOpsError, ShuttingDown, StateRepoError
 from demandops.service.approvals.approvals import Approvals
-from demandops.service.demand_queue import DemandQueue
+from demandops.service.demands import Demands
 from demandops.service.remote_status import StateRepoStatus
 from demandops.service.ticket import Listener, Ticket, new_ticket
 from demandops.service.worker import Worker
@@ -73,25 +72,25 @@ class Generator:
         self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
-        self._queue = DemandQueue(self._slot.journal, queue_limit)
+        self._demands = Demands(self._slot.journal, queue_limit)
         self._listeners: list[Callable[[Config], None]] = []
-        self._approvals = Approvals(
-            repository, self._queue, with_targets, settings.forge_token_file()
-        )
+        token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,
             snapshot,
-            self._queue,
+            self._demands,
+            Approvals(repository, snapshot.state, self._demands, with_targets, token_file),
             self._call_listeners,
             with_targets,
-            self._approvals,
             fetch_interval,
         )
         self._finished: Future[bool] | None = None
         self._stop_lock = threading.Lock()
-        for operation in self._queue.operations:
+        for operation in self.operations:
             log.info("resuming demand %s from the journal", operation)
-        self._thread = threading.Thread(target=self._run, name="demandops-writer", daemon=True)
+        self._thread = threading.Thread(
+            target=self._worker.run, name="demandops-writer", daemon=True
+        )
         self._thread.start()
 
     @property
@@ -104,15 +103,20 @@ class Generator:
         """The status of the state repo; any thread may read it."""
         snapshot = self.snapshot
         return StateRepoStatus(
-            self._worker.fetcher.remote.status,
+            self._worker.remote.status,
             snapshot.problems,
-            self._queue.unpublished,
+            self._demands.unpublished,
             str(snapshot.commit),
         )
 
+    @property
+    def operations(self) -> tuple[str, ...]:
+        """The operation ids of the demands that have no answer yet; any thread may read them."""
+        return self._demands.operations
+
     def fetch_now(self) -> None:
         """Fetch from the state repo now, because a push was reported; from any thread."""
-        self._worker.fetcher.fetch_now()
+        self._worker.fetch_now()
 
     def submit(
         self,
@@ -137,7 +141,7 @@ class Generator:
         ticket = new_ticket(goal, operation, listener)
         if not ticket.future.done():
             ticket.base = str(self.snapshot.commit)
-            self._queue.add(ticket)
+            self._demands.arrive(ticket)
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:
@@ -158,7 +162,7 @@ class Generator:
 
     def withdraw(self, operation: str) -> bool:
         """Withdraw a demand; return False if it is committed or unknown."""
-        return self._queue.withdraw(operation)
+        return self._demands.withdraw(operation)
 
     def on_publish(self, listener: Callable[[Config], None]) -> None:
         """Call ``listener`` in the worker thread after every publication.
@@ -185,7 +189,7 @@ class Generator:
             if self._finished is not None:
                 return self._finished
             self._finished = finished = Future[bool]()
-        self._queue.close()
+        self._demands.close()
         threading.Thread(
             target=self._end, args=(timeout, finished), name="demandops-stop", daemon=True
         ).start()
@@ -196,35 +200,10 @@ class Generator:
         if self._thread.is_alive():
             self._worker.stop_retrying()
         self._thread.join()
-        unpublished = self._queue.unpublished
+        unpublished = self._demands.unpublished
         self._slot.close()
         finished.set_result(not unpublished)
 
     def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
         """Stop, wait for the worker to end, and return whether everything was published."""
         return self.stop(timeout).result()
-
-    def _run(self) -> None:
-        """Process demands until the queue is closed and empty; in the worker thread."""
-        while self._queue.wait(self._worker.seconds_until_due()):
-            batch: list[Ticket] = []
-            try:
-                self._worker.take(batch)
-                if not batch:
-                    self._worker.fetch_if_due()
-                else:
-                    self._worker.publish(batch)
-                    self._worker.retry_changes()
-                    self._worker.tidy()
-                self._worker.check_proposals()
-            except ShuttingDown as error:
-                self._queue.fail(batch, error, keep=True)
-            except DemandOpsError as error:
-                if not batch:  # nobody gets it as an answer
-                    log.error("%s", error)
-                self._queue.fail(batch, error)
-            except Exception as error:
-                log.exception("internal error")
-                answer = StateRepoError(f"internal error of the generator: {error!r}; see its log")
-                self._queue.fail(batch, answer)
-        self._approvals.suspend()

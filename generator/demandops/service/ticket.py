@@ -24,20 +24,8 @@ Stage = Literal["away", "admitted", "booked", "committed", "proposed", "pushed"]
 """``away``: the state repo cannot be reached or written; the text says why."""
 Listener = Callable[[Stage, str], None]
 
-State = Literal["waiting", "committed", "proposed", "withdrawn", "done"]
-_NEXT: dict[State, tuple[State, ...]] = {
-    "waiting": ("committed", "proposed", "withdrawn", "done"),
-    "committed": ("committed", "proposed", "done"),
-    "proposed": ("proposed", "waiting", "withdrawn", "done"),
-    "withdrawn": ("done",),
-    "done": (),
-}
-"""Which states may follow a state of a demand; only the queue changes it, under its lock.
-
-``waiting``: it may be evaluated. ``committed``: it has a commit that may be published already, so
-it is evaluated until it has an answer. ``proposed``: it awaits approval. ``withdrawn``: the
-requester took it back, or another demand replaced it. ``done``: it is answered.
-"""
+State = Literal["arrived", "waiting", "committed", "proposed", "withdrawn", "done"]
+"""See :mod:`demandops.service.demands`, which alone changes it."""
 
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
@@ -84,7 +72,8 @@ class Ticket:
     """A demand under way. ``future`` returns its receipt or raises its error.
 
     ``base`` is the tip that was known when it arrived. ``maybe_published``: the remote may have
-    accepted a push of it although no answer arrived.
+    accepted a push of it although no answer arrived. ``has_released``: it released a demand that
+    awaited approval; then it may hold no claims.
     """
 
     operation: str
@@ -94,22 +83,13 @@ class Ticket:
     future: Future[Receipt] = field(default_factory=Future)
     base: str = ""
     maybe_published: bool = False
+    has_released: bool = False
     state: State = "waiting"
     notified: set[str] = field(default_factory=set)
     proposal: ProposalRecord | None = None
 
     def __post_init__(self) -> None:
         self.future.set_running_or_notify_cancel()  # a demand is withdrawn, not canceled
-
-    def can_become(self, state: State) -> bool:
-        """Return whether a state may follow the current one."""
-        return state in _NEXT[self.state]
-
-    def become(self, state: State) -> bool:
-        """Change the state; return False, and leave it, if that one may not follow."""
-        if self.can_become(state):
-            self.state = state
-        return self.state == state
 
     def notify(self, stage: Stage, text: str) -> None:
         """Report each stage once, even if the demand is evaluated again.

@@ -1,91 +1,149 @@
-"""The worker: evaluates, commits and publishes batches of demands, again if the remote has moved.
+"""The worker: follows the state repo, and publishes the demands as commits.
 
-Belongs to one thread, the only one that writes to the state repo.
+Belongs to one thread, the only one that writes to the state repo. Demands go first: a fetch stops
+when one arrives, because its push shows what is new too.
 """
 
 from __future__ import annotations
 
 import logging
+import random
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import datetime, timezone
 
 from demandops.config.config import Config
-from demandops.errors import ShuttingDown
-from demandops.service.approvals.approvals import Approvals, Deferred
-from demandops.service.demand_queue import DemandQueue
-from demandops.service.evaluation import Evaluator, Result
-from demandops.service.fetcher import Fetcher
+from demandops.errors import DemandOpsError, Fault, ShuttingDown, StateRepoError
+from demandops.service.approvals.approvals import Approvals, Deferred, Result
+from demandops.service.demands import Demands
+from demandops.service.evaluation import Evaluator
+from demandops.service.remote_status import RemoteMonitor
 from demandops.service.ticket import Receipt, Ticket
 from demandops.service.timing.backoff import LIMIT_EMBEDDED, LIMIT_REMOTE, Backoff
 from demandops.service.timing.lease_expiry import LONGEST_WAIT_S, LeaseExpiry
 from demandops.service.timing.override_expiry import OverrideExpiry
-from demandops.staterepo.git.repository import PushDenied, RemoteAway, StateRepository
+from demandops.service.timing.polling import PollTimer
+from demandops.staterepo.git.repository import (
+    FetchInterrupted,
+    PushDenied,
+    RemoteAway,
+    StateRepository,
+)
 from demandops.staterepo.load.snapshot import ReadAhead, Snapshot
-from demandops.staterepo.write import commit_batch
+from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
 _TIDY_EVERY = 300
+_TRIES = 5
+_LONGEST_PAUSE_S = 0.05
 
 
 class Worker:
-    """Turns batches of demands into published commits.
+    """Follows the state repo and turns batches of demands into published commits.
 
-    ``snapshot`` is the newest published state; any thread may read it.
+    Any thread may read ``snapshot``, the newest published state, and ``remote``.
     """
 
     def __init__(
         self,
         repository: StateRepository,
         snapshot: Snapshot,
-        queue: DemandQueue,
+        demands: Demands,
+        approvals: Approvals,
         on_published: Callable[[Config], None],
         with_targets: bool,
-        approvals: Approvals,
-        fetch_interval: float = 0.0,
+        fetch_interval: float,
     ) -> None:
         self.snapshot = snapshot
-        self._approvals = approvals
-        self._repository = repository
-        self._queue = queue
+        self.remote = RemoteMonitor(repository.address)
+        self._repository, self._demands, self._approvals = repository, demands, approvals
         self._on_published = on_published
-        self._evaluator = Evaluator(repository, queue, approvals, with_targets)
-        self._must_fetch = False
-        self._tip_is_fresh = False
-        self._commits_since_tidy = 0
-        self._lease_expiry = LeaseExpiry()
-        self._override_expiry = OverrideExpiry()
+        self._evaluator = Evaluator(repository, demands, approvals, with_targets)
+        self._timer = PollTimer(fetch_interval, embedded=repository.always_current)
+        self._lease_expiry, self._override_expiry = LeaseExpiry(), OverrideExpiry()
         self._ahead = ReadAhead()
+        self._batch_limit = LIMIT_EMBEDDED if repository.always_current else LIMIT_REMOTE
+        self._must_fetch = self._tip_is_fresh = False
+        self._commits_since_tidy = 0
+        self._logged: frozenset[Fault] = frozenset()
         self._stopped_retrying = threading.Event()
-        embedded = repository.always_current
-        self.fetcher = Fetcher(
-            repository, queue, fetch_interval, self._new_commit_batch, self._set_snapshot
-        )
-        self._batch_limit = LIMIT_EMBEDDED if embedded else LIMIT_REMOTE
+
+    # ---- from any thread ----
+
+    def fetch_now(self) -> None:
+        """Make a fetch due now."""
+        self._timer.request()
+        self._demands.wake()
 
     def stop_retrying(self) -> None:
-        """Stop waiting for a remote that cannot be reached; from any thread."""
+        """Stop waiting for a remote that cannot be reached; pending attempts are the last."""
         self._stopped_retrying.set()
-        self.fetcher.stop_retrying()
         self._repository.abort()
-        self._queue.wake()
+        self._demands.wake()
 
-    def take(self, batch: list[Ticket]) -> None:
-        """Move queued demands into ``batch``, then the releases of ended leases.
+    # ---- the loop ----
 
-        No lease ends while demands are queued, because one of them may renew it.
+    def run(self) -> None:
+        """Work until no demand is accepted and none waits."""
+        if self._demands.proposed:  # they may be decided already; stopping at once must not skip it
+            self._work()
+        while self._demands.wait(self._seconds_until_due()):
+            self._work()
+        self._approvals.suspend()
+
+    def _work(self) -> None:
+        """Publish the demands that wait, or follow the state repo; then check the proposals."""
+        batch: list[Ticket] = []
+        try:
+            self._take(batch)
+            if batch:
+                self._publish(batch)
+                if self.snapshot.problems:  # a release may have made a change possible
+                    self._try_to_carry_out_changes()
+                self._tidy()
+            else:
+                self._follow()
+            self._check_proposals()
+        except ShuttingDown as error:
+            self._demands.fail(batch, error, keep=True)
+        except DemandOpsError as error:
+            if not batch:  # nobody gets it as an answer
+                log.error("%s", error)
+            self._demands.fail(batch, error)
+        except Exception as error:
+            log.exception("internal error")
+            answer = StateRepoError(f"internal error of the generator: {error!r}; see its log")
+            self._demands.fail(batch, answer)
+
+    def _seconds_until_due(self) -> float:
+        """Return the seconds until a lease, override, proposal or fetch is due."""
+        state = self.snapshot.state
+        seconds = self._approvals.seconds_until_due(LONGEST_WAIT_S)
+        seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
+        seconds = self._override_expiry.seconds_until_due(state.config, _now(), seconds)
+        fetch = self._timer.seconds_until_due()
+        return seconds if fetch is None else min(seconds, fetch)
+
+    def _take(self, batch: list[Ticket]) -> None:
+        """Move waiting demands into ``batch``, then the releases of ended leases.
+
+        No lease ends while demands wait, because one of them may renew it.
         """
-        self._take_queued(batch)
-        if not self._queue.has_waiting:
+        self._demands.take(batch, self._batch_limit)
+        if not self._demands.has_waiting:
             batch += self._lease_expiry.tickets(self.snapshot.state.ledger)
 
-    def _take_queued(self, batch: list[Ticket]) -> None:
-        self._queue.take(batch, self._batch_limit)
-        self._approvals.resume(batch, self.snapshot.state)
+    def _tidy(self) -> None:
+        """Pack the repository every few hundred commits; each adds about twenty loose objects."""
+        if self._commits_since_tidy >= _TIDY_EVERY:
+            self._commits_since_tidy = 0
+            self._repository.tidy()
 
-    def publish(self, batch: list[Ticket]) -> None:
+    # ---- publishing demands ----
+
+    def _publish(self, batch: list[Ticket]) -> None:
         """Publish a batch, with the demands that arrive during retries, and empty it.
 
         Raises:
@@ -99,7 +157,7 @@ class Worker:
                 wait = self._attempt(batch, backoff)
             except RemoteAway as error:
                 _mark_maybe_published(batch, self.snapshot)
-                self.fetcher.record_unreachable(error)
+                self._record_unreachable(error)
                 self._tip_is_fresh = self._repository.always_current
                 wait = backoff.unreachable()
             if wait is None:
@@ -111,7 +169,7 @@ class Worker:
                     "the remote cannot be reached; the demand stays in the journal and is resumed "
                     "at the next start"
                 )
-            self._take_queued(batch)
+            self._demands.take(batch, self._batch_limit)
 
     def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:
         """Evaluate and publish a part of a batch.
@@ -123,10 +181,10 @@ class Worker:
             RemoteAway: if the remote cannot be reached.
         """
         # fetch first: a demand that was committed can no longer be withdrawn
-        if self._must_fetch or self.fetcher.remote.is_unreachable:
+        if self._must_fetch or self.remote.is_unreachable:
             self._repository.refresh()
             self._must_fetch, self._tip_is_fresh = False, True
-        self._queue.answer_withdrawn(batch)
+        self._demands.answer_withdrawn(batch)
         part = batch[: backoff.max_demands]
         self._approvals.remove_released(part, self.snapshot.state)
         commits = self._new_commit_batch()
@@ -134,14 +192,13 @@ class Worker:
         published = self._evaluator.published_before(commits.start, part)
         results: list[Result] = []
         for ticket in part:
-            result = self._evaluator.evaluate(commits, ticket, published, results)
-            results.append((ticket, result))
+            self._approvals.withdraw_released(results, ticket, commits.head.state)
+            results.append((ticket, self._evaluator.evaluate(commits, ticket, published)))
         evaluated = time.monotonic()
-        if commits.head.commit == commits.start.commit and not self._tip_is_fresh:
+        if commits.is_empty and not self._tip_is_fresh:
             # nothing to push, so only a fetch shows whether the remote has moved
-            tip = self._repository.refresh()
             self._tip_is_fresh = True
-            if tip != commits.start.commit:
+            if self._repository.refresh() != commits.start.commit:
                 return None
         if self._publish_commits(commits, results):
             self._answer(results)
@@ -153,70 +210,7 @@ class Worker:
         self._must_fetch = True
         return backoff.overtaken(len(part), evaluated - began, time.monotonic() - evaluated)
 
-    def _answer(self, results: list[Result]) -> None:
-        """Answer the demands that have a final result; propose those that need approval."""
-        final = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
-        self._queue.answer(final)
-        for ticket, result in results:
-            if isinstance(result, Deferred):
-                self._approvals.add(ticket, result.decision)
-
-    def check_proposals(self) -> None:
-        """Check the demands that await approval against the newest main, if it is time to."""
-        if not self._approvals.is_due(str(self.snapshot.commit)):
-            return
-        try:
-            heads = self._approvals.fetch_heads()
-            if heads.main != str(self.snapshot.commit):
-                self._repository.refresh()
-                self.fetcher.carry_out_changes()
-            # a deleted branch may have been merged: only a main at least as new shows that
-            if self._repository.includes(str(self.snapshot.commit), heads.main):
-                self._approvals.check(self.snapshot, heads)
-        except (RemoteAway, PushDenied) as error:
-            log.warning("%s; the demands that await approval keep waiting", error)
-
-    def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
-        """Wait; meanwhile journal new demands and report to them why they wait."""
-        end = time.monotonic() + seconds
-        to_notify = list(batch)
-        while not self._stopped_retrying.is_set():
-            if self.fetcher.remote.is_unreachable:
-                for ticket in to_notify:
-                    ticket.notify("away", f"waiting: {self.fetcher.remote.status.unreachable}")
-            self._queue.answer_withdrawn(batch)
-            left = end - time.monotonic()
-            if left <= 0:
-                return
-            to_notify = self._queue.journal_arrivals(left)
-
-    def seconds_until_due(self) -> float:
-        """Return the seconds until a lease, override, proposal or fetch is due."""
-        state = self.snapshot.state
-        seconds = self._approvals.seconds_until_due(LONGEST_WAIT_S)
-        seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
-        seconds = self._override_expiry.seconds_until_due(state.config, _now(), seconds)
-        fetch = self.fetcher.seconds_until_due()
-        return seconds if fetch is None else min(seconds, fetch)
-
-    def retry_changes(self) -> None:
-        """Carry out quarantined changes again, because a release may have made them possible."""
-        if self.snapshot.problems:
-            self.fetcher.carry_out_changes()
-
-    def fetch_if_due(self) -> None:
-        """Carry out what others pushed and end overrides, while no demand comes."""
-        due = self._override_expiry.is_due(self.snapshot.state.config, _now())
-        if not self.fetcher.fetch_if_due(self.snapshot, due):
-            self._override_expiry.postpone(_now())
-
-    def tidy(self) -> None:
-        """Pack the repository every few hundred commits; each adds about twenty loose objects."""
-        if self._commits_since_tidy >= _TIDY_EVERY:
-            self._commits_since_tidy = 0
-            self._repository.tidy()
-
-    def _publish_commits(self, commits: commit_batch.CommitBatch, results: list[Result]) -> bool:
+    def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
         """Publish a commit batch; return False if another writer was first.
 
         If the remote rejects the push for another reason, that is the answer of all its demands.
@@ -225,34 +219,134 @@ class Worker:
             published = commits.publish()
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
-            self.fetcher.remote.record_push_denied(str(error))
+            self.remote.record_push_denied(str(error))
             return True
         if not published:
             return False
-        self.fetcher.record_reached(pushed=commits.head.commit != commits.start.commit)
-        self._set_snapshot(commits)
+        self._record_reached(pushed=not commits.is_empty)
+        self._set_snapshot(commits.head)
         self._commits_since_tidy += len(results)
         return True
 
-    def _set_snapshot(self, commits: commit_batch.CommitBatch) -> None:
-        before, self.snapshot = self.snapshot, commits.head
-        if commits.head.commit != before.commit:  # a merge may need no commit of the generator
-            self._on_published(commits.head.state.config)
+    def _answer(self, results: list[Result]) -> None:
+        """Answer the demands that have a final result; propose those that need approval."""
+        final = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
+        self._demands.answer(final)
+        for ticket, result in results:
+            if isinstance(result, Deferred):
+                self._approvals.add(ticket, result.decision)
 
-    def _new_commit_batch(self) -> commit_batch.CommitBatch:
+    def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
+        """Wait; meanwhile journal new demands and report to them why they wait."""
+        end = time.monotonic() + seconds
+        to_notify = list(batch)
+        while not self._stopped_retrying.is_set():
+            if self.remote.is_unreachable:
+                for ticket in to_notify:
+                    ticket.notify("away", f"waiting: {self.remote.status.unreachable}")
+            self._demands.answer_withdrawn(batch)
+            left = end - time.monotonic()
+            if left <= 0:
+                return
+            to_notify = self._demands.journal_arrivals(left)
+
+    # ---- following the state repo ----
+
+    def _follow(self) -> None:
+        """Fetch if it is time to, carry out what others pushed, and end overrides.
+
+        A repository on this disk is read each time, because that is cheap.
+        """
+        override_is_due = self._override_expiry.is_due(self.snapshot.state.config, _now())
+        try:
+            if self._timer.start_if_due():
+                self._repository.refresh_unless_urgent(lambda: self._demands.must_not_wait)
+            elif not (self._repository.always_current or override_is_due):
+                return
+            new = override_is_due or self._repository.tip() != self.snapshot.commit
+            self._record_reached(pushed=new and self._carry_out_changes())
+        except FetchInterrupted:
+            self._timer.interrupted()
+        except StateRepoError as error:
+            self._record_unreachable(error)
+            self._override_expiry.postpone(_now())
+
+    def _check_proposals(self) -> None:
+        """Check the demands that await approval against the newest main, if it is time to."""
+        if not self._approvals.is_due(str(self.snapshot.commit)):
+            return
+        try:
+            heads = self._approvals.fetch_heads()
+            if heads.main != str(self.snapshot.commit):
+                self._repository.refresh()
+                self._try_to_carry_out_changes()
+            # a deleted branch may have been merged: only a main at least as new shows that
+            if self._repository.includes(str(self.snapshot.commit), heads.main):
+                self._approvals.check(self.snapshot, heads)
+        except (RemoteAway, PushDenied) as error:
+            log.warning("%s; the demands that await approval keep waiting", error)
+
+    def _try_to_carry_out_changes(self) -> None:
+        try:
+            self._carry_out_changes()
+        except StateRepoError as error:
+            self._record_unreachable(error)
+
+    def _carry_out_changes(self) -> bool:
+        """Publish what follows from people's changes up to the fetched tip; return if anything did.
+
+        Does not fetch first.
+        """
+        for _ in range(_TRIES):
+            commits = self._new_commit_batch()
+            if commits.publish():
+                self._set_snapshot(commits.head)
+                return not commits.is_empty
+            self._repository.refresh()
+            pause = random.uniform(0, _LONGEST_PAUSE_S)  # noqa: S311 - not for security
+            self._stopped_retrying.wait(pause)
+        return False  # other generators are faster, and they carry out the same changes
+
+    def _new_commit_batch(self) -> CommitBatch:
         """Return a commit batch on the newest known tip, which carries out people's changes."""
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems:
-            commits = commit_batch.CommitBatch(self._repository, before)
-            self._override_expiry.end_due(commits, _now())
-            return commits
-        advance = self._ahead.advance(self._repository.objects, before, tip)
-        commits = commit_batch.CommitBatch(self._repository, advance.snapshot)
-        commits.follow(advance, before, _now())
-        self.fetcher.log_problems(commits.head.problems)
+            commits = CommitBatch(self._repository, before)
+        else:
+            advance = self._ahead.advance(self._repository.objects, before, tip)
+            commits = CommitBatch(self._repository, advance.snapshot)
+            commits.follow(advance, before, _now())
+            self._log_problems(commits.head.problems)
         self._override_expiry.end_due(commits, _now())
         return commits
+
+    def _log_problems(self, problems: Iterable[Fault]) -> None:
+        """Log each fault once, and each file once that is valid again."""
+        current = list(dict.fromkeys(problems))
+        for problem in current:
+            if problem not in self._logged:
+                log.error("%s (its last valid version stays in effect)", problem)
+        for file in sorted({old.file for old in self._logged} - {new.file for new in current}):
+            log.info("%s is valid again", file or "the state repo")
+        self._logged = frozenset(current)
+
+    def _set_snapshot(self, snapshot: Snapshot) -> None:
+        before, self.snapshot = self.snapshot, snapshot
+        if snapshot.commit != before.commit:  # a merge may need no commit of the generator
+            self._on_published(snapshot.state.config)
+
+    def _record_reached(self, *, pushed: bool) -> None:
+        self._demands.blocked = ""
+        self.remote.record_reached(pushed=pushed)
+        self._timer.finished(reached=True)
+
+    def _record_unreachable(self, error: StateRepoError) -> None:
+        if self._stopped_retrying.is_set():  # there is no retry to report
+            return
+        self._demands.blocked = str(error)
+        self.remote.record_unreachable(str(error))
+        self._timer.finished(reached=False)
 
 
 def _mark_maybe_published(batch: list[Ticket], start: Snapshot) -> None:

@@ -185,7 +185,7 @@ def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
     petra.delete(no)
     with rig.running(address) as generator:
         rig.wait_until(lambda: branches(bare) == [], "the merged branch is taken away")
-        rig.wait_until(lambda: generator._queue.operations == (), "both are answered")
+        rig.wait_until(lambda: generator.operations == (), "both are answered")
     assert rig.books(bare) == rig.books_after([goal(1)])
     assert branches(bare) == []
 
@@ -513,7 +513,7 @@ def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the
     drivers.start(address, lanes, opening=opening, die_at="retracting").listen()
     with rig.running(address) as generator:
         rig.wait_until(lambda: not branches(bare), "the branch is deleted")
-        rig.wait_until(lambda: generator._queue.operations == (), "both are answered")
+        rig.wait_until(lambda: generator.operations == (), "both are answered")
     assert rig.claims(bare) == []
 
 

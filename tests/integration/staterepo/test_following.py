@@ -280,13 +280,18 @@ def test_two_generators_follow_a_change_once(
     rig.assert_sound(bare)
 
 
-def test_off_means_off(url: str, bare: Path, person: Person) -> None:
-    with rig.running(url) as generator:
-        rig.book(generator, goal(1))
-        made = person.change(_move_broker(bare))
-        assert generator._worker.fetcher.seconds_until_due() is None
-        generator.fetch_now()  # as a webhook would
-        followed(bare, made)
+def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> None:
+    with (
+        rig.running(url) as off,
+        rig.running(url, fetch_interval=SOON_S, data=tmp_path / "other") as on,
+    ):
+        rig.book(off, goal(1))
+        known = off.state_repo_status.commit
+        commit = followed(bare, person.change(_move_broker(bare)))
+        rig.wait_until(lambda: on.state_repo_status.commit == commit.id, "the other follows")
+        assert off.state_repo_status.commit == known
+        off.fetch_now()  # as a webhook would
+        rig.wait_until(lambda: off.state_repo_status.commit == commit.id, "it follows now")
 
 
 # ---- the remote is slow, or away ----
@@ -296,14 +301,13 @@ def test_a_look_that_hangs_holds_up_no_demand(http: str, server: Server, bare: P
     with rig.running(http, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
         hang = server.faults.hang = threading.Event()
-        fetcher = generator._worker.fetcher
         rig.wait_until(lambda: generator._repository._process, "a look is under way and hangs")  # type: ignore[attr-defined]
         talking = generator._repository._process  # type: ignore[attr-defined]
         stages = Stages()
         ticket = generator.submit(goal(2), listener=stages)
         rig.wait_until(lambda: "committed" in stages.names, "it is judged although the look hangs")
         assert talking.poll() is not None, "the look was ended for it"
-        assert not fetcher.remote.is_unreachable
+        assert not generator.state_repo_status.remote.unreachable
         server.faults.hang = None
         hang.set()
         assert rig.receipt(ticket).outcome == "booked"

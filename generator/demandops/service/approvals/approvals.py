@@ -1,7 +1,8 @@
 """The proposals that await approval, and how each one ends.
 
 Belongs to the worker thread. A proposal is complete once main has its claims, however they got
-there. Until then its branch is kept up to date: merging it must give what main would render.
+there. Until then its branch is kept up to date: merging it must give what main would render. A
+:class:`Proposal` says what becomes of it; this module carries that out.
 """
 
 from __future__ import annotations
@@ -9,24 +10,38 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from pathlib import Path
+from typing import TypeAlias
 
-from demandops.decision import Decision, State, decide
+from demandops.decision import Decision, State
 from demandops.demand.demand_request import DemandRequest, Put
 from demandops.errors import (
     DemandOpsError,
     InvalidInput,
     Refused,
     ShuttingDown,
-    TurnedDown,
     Withdrawn,
     fault,
 )
-from demandops.service.approvals.branch_sync import BranchSync
-from demandops.service.approvals.proposal import Key, Proposal, admit_or_none, is_release, key_of
-from demandops.service.demand_queue import TAKEN_BACK, DemandQueue
+from demandops.service.approvals.forge_worker import ForgeWorker
+from demandops.service.approvals.proposal import (
+    Decided,
+    Key,
+    Proposal,
+    admit_or_none,
+    decide_in_turn,
+    decide_or_fault,
+    is_release,
+    key_of,
+    name_of,
+    pull_request_body,
+    push_option_description,
+    waiting_text,
+)
+from demandops.service.demands import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import ProposalRecord, Receipt, Ticket
 from demandops.staterepo.git.repository import PushDenied, StateRepository
@@ -34,8 +49,14 @@ from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.history.commit_log import RecordedOutcome
 from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write import commit_batch
-from demandops.staterepo.write.proposal_branch import BranchHeads, BranchMoved, branch_name
+from demandops.staterepo.write.commit_batch import CommitBatch
+from demandops.staterepo.write.proposal_branch import (
+    BranchHeads,
+    BranchMoved,
+    ProposalBranches,
+    branch_name,
+    gitlab_options,
+)
 
 log = logging.getLogger("demandops")
 
@@ -58,45 +79,46 @@ class Deferred:
     decision: Decision
 
 
+Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Deferred]
+
+
 class Approvals:
     """The proposals that await approval."""
 
     def __init__(
         self,
         repository: StateRepository,
-        queue: DemandQueue,
+        state: State,
+        demands: Demands,
         with_targets: bool,
         token_file: Path | None,
     ) -> None:
+        """Find the proposals of an earlier run again; ``state`` is main's."""
         self._repository = repository
-        self._queue = queue
+        self._demands = demands
         self._with_targets = with_targets
-        self._branch_sync = BranchSync(repository, queue, token_file, self._on_forge_update)
-        self._proposals: dict[Key, Proposal] = {}
-        self._releasing: set[str] = set()
+        self._branches = ProposalBranches(repository)
+        self._forge = ForgeWorker(token_file, self._on_forge_update)
         self._interval = CHECK_EMBEDDED_S if repository.always_current else CHECK_REMOTE_S
+        self._proposals: dict[Key, Proposal] = {}
         self._changed: deque[str] = deque()
         self._checked_at, self._check_began, self._rest_until, self._next_check = "", 0.0, 0.0, 0.0
+        for ticket in demands.proposed:
+            self._resume(ticket, admit_or_none(state, ticket.goal))
+
+    def _resume(self, ticket: Ticket, request: DemandRequest | None) -> None:
+        record = ticket.proposal or ProposalRecord("")
+        proposal = next((p for p in self._proposals.values() if p.branch == record.branch), None)
+        if proposal is None:
+            key = key_of(request) if request else ("operation", ticket.operation)
+            if key in self._proposals:  # an earlier run proposed the same demand
+                key = ("operation", ticket.operation)
+            proposal = self._proposals[key] = Proposal(key, record, searched_to=ticket.base)
+        proposal.tickets.append(ticket)
+        proposal.requests += [request] if request else []
+        self._changed.append(proposal.branch)
 
     # ---- while a batch is evaluated ----
-
-    def resume(self, batch: list[Ticket], state: State) -> None:
-        """Move the demands that an earlier run proposed from the batch to their proposals."""
-        for ticket in [ticket for ticket in batch if ticket.proposal is not None]:
-            batch.remove(ticket)
-            request = admit_or_none(state, ticket.goal)
-            record = ticket.proposal or ProposalRecord("")
-            proposal = next(
-                (p for p in self._proposals.values() if p.branch == record.branch), None
-            )
-            if proposal is None:
-                key = key_of(request) if request else ("operation", ticket.operation)
-                if key in self._proposals:  # an earlier run proposed the same demand
-                    key = ("operation", ticket.operation)
-                proposal = self._proposals[key] = Proposal(key, record, searched_to=ticket.base)
-            proposal.tickets.append(ticket)
-            proposal.requests += [request] if request else []
-            self._changed.append(proposal.branch)
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
         """Remove the proposals that demands of the batch release, before these are evaluated.
@@ -108,36 +130,30 @@ class Approvals:
             RemoteAway, PushDenied: if the branch could not be deleted.
         """
         for ticket in batch if self._proposals else ():
-            request = admit_or_none(state, ticket.goal) if is_release(ticket.goal) else None
+            request = _release_request(ticket, state)
             if request is None:
                 continue
             for proposal in [p for p in self._proposals.values() if p.is_released_by(request)]:
-                self._queue.withdraw_proposed(proposal.tickets, RELEASED)
-                self._branch_sync.delete(proposal, self._branch_sync.fetch_heads())
-                self._queue.answer((old, Withdrawn(RELEASED)) for old in proposal.tickets)
-                self._forget(proposal, close=True)
-                self._releasing.add(ticket.operation)
+                self._demands.withdraw_proposed(proposal.tickets, RELEASED)
+                self._delete_branch(proposal, self._branches.heads())
+                self._end(proposal, Withdrawn(RELEASED))
+                ticket.has_released = True
 
-    def released_in_batch(
-        self, ticket: Ticket, state: State, earlier: Iterable[tuple[Ticket, object]]
-    ) -> set[str]:
-        """Return the operation ids of the earlier demands that a demand releases."""
-        request = admit_or_none(state, ticket.goal) if is_release(ticket.goal) else None
-        if request is None:
-            return set()
-        released = {
-            other.operation
-            for other, result in earlier
-            if isinstance(result, Deferred)
-            and _proposal_of(other, result.decision).is_released_by(request)
-        }
-        if released:
-            self._releasing.add(ticket.operation)
-        return released
+    def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
+        """Withdraw the earlier demands of a batch that a demand releases before they are proposed.
 
-    def has_released_a_proposal(self, ticket: Ticket) -> bool:
-        """Return whether a demand released a proposal; then it may hold no claims."""
-        return ticket.operation in self._releasing
+        Args:
+            earlier: their results; those of withdrawn ones are replaced.
+            by: the demand that comes after them.
+            state: the state that it is evaluated on.
+        """
+        request = _release_request(by, state) if earlier else None
+        for index, (ticket, result) in enumerate(earlier if request else ()):
+            if isinstance(result, Deferred):
+                proposal = Proposal((), ProposalRecord(""), requests=[result.decision.request])
+                if request and proposal.is_released_by(request):
+                    earlier[index] = (ticket, Withdrawn(RELEASED))
+                    by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
         """Add a demand that needs approval, to an existing proposal of the same demand if any."""
@@ -146,16 +162,16 @@ class Approvals:
         if proposal is not None and not proposal.requesters() & set(request.requesters()):
             owners = ", ".join(sorted(proposal.requesters()))
             message = f"'{request.demand}' is a demand of {owners}; choose another demand id"
-            self._queue.answer([(ticket, Refused([fault("demand", message, code="not-yours")]))])
+            self._demands.fail([ticket], Refused([fault("demand", message, code="not-yours")]))
             return
         if proposal is None:
             branch = branch_name(request.demand or request.id, ticket.operation)
             proposal = Proposal(key, ProposalRecord(branch), searched_to=ticket.base)
         elif isinstance(request, Put) and request not in proposal.requests:
             replaced, proposal.tickets, proposal.requests = proposal.tickets, [], []
-            self._queue.answer((old, Withdrawn(REPLACED)) for old in replaced)
-        if not self._queue.set_proposal(ticket, proposal.record):
-            self._queue.answer([(ticket, Withdrawn(TAKEN_BACK))])
+            self._demands.fail(replaced, Withdrawn(REPLACED))
+        if not self._demands.propose(ticket, proposal.record):
+            self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
             return
         self._proposals[key] = proposal
         proposal.tickets.append(ticket)
@@ -166,7 +182,7 @@ class Approvals:
         """Withdraw the proposal of a demand that was put again and needs no approval now."""
         proposal = self._proposals.get(key_of(request))
         if proposal is not None and isinstance(request, Put):
-            self._queue.withdraw_proposed(proposal.tickets, REPLACED)
+            self._demands.withdraw_proposed(proposal.tickets, REPLACED)
 
     # ---- after main was read ----
 
@@ -191,10 +207,14 @@ class Approvals:
         return min(longest, max(self._next_check - time.monotonic(), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
-        """Fetch the commits of the branches, and plan the next check even if this one fails."""
+        """Fetch the commits of the branches, and plan the next check even if this one fails.
+
+        Raises:
+            RemoteAway: if the remote cannot be reached.
+        """
         self._check_began = time.monotonic()
         self._next_check, self._checked_at = self._check_began + self._interval, _UNFINISHED
-        return self._branch_sync.fetch_heads()
+        return self._branches.heads()
 
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
         """Answer the proposals that are decided or withdrawn, and update the others.
@@ -222,79 +242,60 @@ class Approvals:
                 if proposal.record.pushed:  # the existing branch can still be merged
                     log.warning("%s; %s is not rebuilt", error, proposal.branch)
                 else:
-                    self._fail(proposal, error)
+                    self._end(proposal, error)
             except PushDenied as error:
-                self._fail(proposal, error)
+                self._end(proposal, error)
         ended = time.monotonic()
-        self._checked_at, self._rest_until = (
-            str(snapshot.commit),
-            ended + _PAUSE_FACTOR * (ended - self._check_began),
-        )
-
-    def _fail(self, proposal: Proposal, error: DemandOpsError) -> None:
-        self._queue.answer([(ticket, error) for ticket in proposal.tickets])
-        self._forget(proposal, close=True)
+        self._checked_at = str(snapshot.commit)
+        self._rest_until = ended + _PAUSE_FACTOR * (ended - self._check_began)
 
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
-        objects = self._repository.objects
-        arrived = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
-        proposal.searched_to = str(snapshot.commit)
-        results = [(t, self._result(t, snapshot, arrived)) for t in proposal.tickets]
-        done = [(t, v) for t, v in results if isinstance(v, Receipt)]
-        self._queue.answer(done)
-        proposal.tickets = [t for t, v in results if not isinstance(v, Receipt)]
-        errors = [(t, v) for t, v in results if isinstance(v, DemandOpsError)]
-        left = [(t, v) for t, v in results if isinstance(v, Decision) and v.approval]
-        free = [t for t, v in results if isinstance(v, Decision) and not v.approval]
-        why_not = "" if done else self._branch_sync.turned_down_because(proposal, heads)
-        if why_not:
-            errors += [(ticket, TurnedDown(why_not)) for ticket, _ in left]
-            left = []
-        if not left:
-            self._branch_sync.delete(proposal, heads, if_unchanged=bool(done))
-        self._queue.answer(errors)
-        self._queue.requeue(free)
-        proposal.tickets = [ticket for ticket, _ in left]
-        if not left:
-            self._forget(proposal, close=not done)
-            return
-        if done and proposal.branch not in heads.branches:  # only a part was merged
-            proposal.record = replace(proposal.record, pushed=False)
+        """Carry out what becomes of a proposal."""
+        objects, tip = self._repository.objects, str(snapshot.commit)
+        on_main = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
+        proposal.searched_to = tip
+        read = CommitBatch(self._repository, snapshot).read
         head = heads.branches.get(proposal.branch, "")
-        if self._branch_sync.update(proposal, left, snapshot, head):
-            proposal.checked_at = str(snapshot.commit)
+        verdict = proposal.verdict(
+            [
+                (ticket, decide_or_fault(snapshot.state, ticket, read))
+                for ticket in proposal.tickets
+            ],
+            on_main,
+            head,
+            self._forge.pull_request(proposal.branch),
+        )
+        booked = [
+            (ticket, self._receipt(ticket, decision, snapshot, on_main.get(ticket.operation)))
+            for ticket, decision in verdict.booked
+        ]
+        self._demands.answer(booked)
+        proposal.drop(booked)
+        if not verdict.rebuild and (not booked or head in proposal.record.commits):
+            self._delete_branch(proposal, heads)
+        self._demands.answer(verdict.failed)
+        self._demands.requeue(verdict.free)
+        proposal.wait_for(verdict.rebuild)
+        if not verdict.rebuild:
+            self._forget(proposal, close=not booked)
+            return
+        if booked and not head:  # only a part was merged
+            proposal.record = replace(proposal.record, pushed=False)
+        if self._update(proposal, verdict.rebuild, snapshot, head):
+            proposal.checked_at = tip
         else:
             self._changed.append(proposal.branch)
 
-    def _result(
-        self, ticket: Ticket, snapshot: Snapshot, arrived: dict[str, RecordedOutcome]
-    ) -> Receipt | DemandOpsError | Decision:
-        """Return the receipt or error of a demand that is decided, else its decision on main.
-
-        It is booked if the history of main has its operation id, or if the ledger has its claims:
-        a squash merge may lose the trailer.
-        """
-        read = commit_batch.CommitBatch(self._repository, snapshot).read
-        decision: Decision | DemandOpsError
-        try:
-            decision = decide(snapshot.state, ticket.goal, ticket.received, read)
-        except InvalidInput as error:
-            decision = error
-        arrival = arrived.get(ticket.operation)
-        if arrival is not None or (isinstance(decision, Decision) and not decision.files):
-            commit = arrival.commit if arrival else str(snapshot.commit)
-            return self._receipt(ticket, decision, snapshot.state, commit)
-        if ticket.state == "withdrawn" and ticket.proposal:
-            return Withdrawn(ticket.proposal.withdrawn or TAKEN_BACK)
-        return decision
-
     def _receipt(
-        self, ticket: Ticket, decision: Decision | DemandOpsError, state: State, commit: str
+        self,
+        ticket: Ticket,
+        decision: Decision | InvalidInput,
+        snapshot: Snapshot,
+        recorded: RecordedOutcome | None,
     ) -> Receipt:
-        if not isinstance(decision, Decision) or decision.files:  # merged, and changed since
-            goal = ticket.goal if isinstance(ticket.goal, dict) else {}
-            name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
-            return Receipt(ticket.operation, str(name), "booked", commit)
+        commit = recorded.commit if recorded else str(snapshot.commit)
+        if isinstance(decision, InvalidInput) or decision.files:  # merged, and changed since
+            return Receipt(ticket.operation, name_of(ticket.goal), "booked", commit)
         return Receipt(
             operation=ticket.operation,
             request_id=decision.request.id,
@@ -302,29 +303,123 @@ class Approvals:
             commit=commit,
             warnings=decision.warnings,
             lease_s=decision.lease_s,
-            targets=targets_of_decision(state.ledger, decision) if self._with_targets else (),
+            targets=targets_of_decision(snapshot.state.ledger, decision)
+            if self._with_targets
+            else (),
         )
 
-    def _forget(self, proposal: Proposal, *, close: bool) -> None:
-        self._proposals = {k: p for k, p in self._proposals.items() if p is not proposal}
-        self._branch_sync.forget(proposal, close=close)
+    # ---- the branch and its pull request ----
 
-    # ---- updates and the end ----
+    def _update(self, proposal: Proposal, left: Decided, snapshot: Snapshot, head: str) -> bool:
+        """Update the branch, so that merging it gives what main would render now.
+
+        Args:
+            left: the demands that still need approval, each with its decision on main.
+            head: the commit of the branch; empty if there is no branch yet.
+
+        Returns:
+            False if a demand was withdrawn meanwhile and the proposal must be checked again.
+
+        Raises:
+            BranchMoved, RemoteAway, PushDenied: if the branch could not be pushed.
+        """
+        if head and head not in proposal.record.commits:
+            if not proposal.edited:
+                log.info("%s has commits by a person and stays unchanged", proposal.branch)
+            proposal.edited = True
+        elif not self._rebuild(proposal, left, snapshot, head):
+            return False
+        forge = snapshot.state.config.repo_settings.proposals
+        if forge.forge in ("github", "gitea"):
+            message = self._branches.message(proposal.record.commits[-1])
+            body = pull_request_body(message, proposal.reasons)
+            self._forge.open(forge, proposal.branch, message.split("\n", 1)[0], body)
+            if not self._forge.has_answered(proposal.branch):
+                return True  # the requester is notified once the link is known
+        request = self._forge.pull_request(proposal.branch)
+        link = request.link if request else proposal.record.link
+        for ticket in proposal.tickets:
+            ticket.notify("proposed", waiting_text(proposal.branch, link, proposal.reasons))
+        return True
+
+    def _rebuild(self, proposal: Proposal, left: Decided, snapshot: Snapshot, head: str) -> bool:
+        """Commit the demands on main and push the branch, unless it is up to date."""
+        read = CommitBatch(self._repository, snapshot).read
+        steps, failed = decide_in_turn(left, snapshot.state, read)
+        self._demands.answer(failed)
+        proposal.drop(failed)
+        if not steps:
+            return False
+        old, tip = proposal.record, snapshot.commit
+        files = {path: text for _, step in steps for path, text in step.files.items()}
+        if head and self._branches.is_up_to_date(tip, head, old.base, files):
+            return True
+        demands = [(ticket.operation, ticket.received, step) for ticket, step in steps]
+        commit = self._branches.commit(proposal.branch, snapshot, demands, _now())
+        commits = (head, str(commit)) if head else (str(commit),)
+        record = replace(old, commits=commits, base=str(tip))
+        if not self._journal(proposal, record):
+            return False
+        options = self._push_options(proposal, snapshot, str(commit))
+        link = self._branches.put(proposal.branch, commit, head, options)
+        self._journal(proposal, replace(record, pushed=True, link=link or old.link))
+        log.info("%s %s", proposal.branch, "was rebuilt" if head else "awaits approval")
+        return True
+
+    def _push_options(self, proposal: Proposal, snapshot: Snapshot, commit: str) -> Sequence[str]:
+        forge = snapshot.state.config.repo_settings.proposals
+        if forge.forge != "gitlab":
+            return ()
+        message = self._branches.message(commit)
+        description = push_option_description(message, proposal.reasons)
+        return gitlab_options(message.split("\n", 1)[0], description, forge.labels)
+
+    def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
+        """Journal a record for each demand; return False if one was withdrawn."""
+        proposal.record = record
+        waiting = [self._demands.propose(ticket, record) for ticket in proposal.tickets]
+        return all(waiting)
+
+    def _delete_branch(self, proposal: Proposal, heads: BranchHeads) -> None:
+        """Delete the branch, if there is one.
+
+        Raises:
+            BranchMoved, RemoteAway, PushDenied: if it could not be deleted.
+        """
+        head = heads.branches.get(proposal.branch)
+        if head:
+            self._branches.remove(proposal.branch, head)
+
+    # ---- the end ----
+
+    def _end(self, proposal: Proposal, error: DemandOpsError) -> None:
+        self._demands.fail(proposal.tickets, error)
+        self._forget(proposal, close=True)
+
+    def _forget(self, proposal: Proposal, *, close: bool) -> None:
+        """Forget a proposal; ``close``: also close its pull request if it is open."""
+        self._proposals = {k: p for k, p in self._proposals.items() if p is not proposal}
+        self._forge.forget(proposal.branch, close=close)
 
     def _on_forge_update(self, branch: str) -> None:
         """Check a branch again, because the forge answered; from the forge worker's thread."""
         self._changed.append(branch)
-        self._queue.wake()
+        self._demands.wake()
 
     def suspend(self) -> None:
         """Answer all demands that await approval; the journal keeps them for the next start."""
         error = ShuttingDown("awaits approval; it is resumed at the next start")
         for proposal in self._proposals.values():
-            self._queue.fail(proposal.tickets, error, keep=True)
+            self._demands.fail(proposal.tickets, error, keep=True)
         self._proposals = {}
 
 
-def _proposal_of(ticket: Ticket, decision: Decision) -> Proposal:
-    """Return a proposal with one demand."""
-    request = decision.request
-    return Proposal(key_of(request), ProposalRecord(""), [ticket], [request])
+def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
+    """Return the request of a demand that releases something, or None if it does not."""
+    if ticket.state == "withdrawn" or not is_release(ticket.goal):
+        return None
+    return admit_or_none(state, ticket.goal)
+
+
+def _now() -> datetime:
+    return datetime.now(timezone.utc)

@@ -1,23 +1,46 @@
 """A proposal: demands that wait together on one branch for a person's approval.
 
-Its key, the requests that release it, and the texts that describe it to people.
+What becomes of it now, as a pure function; the requests that release it; and the texts that
+describe it to people.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
-from demandops.decision import State, admit
+from demandops.decision import Decision, State, admit, decide
+from demandops.demand import approval_rule
 from demandops.demand.demand_request import DemandRequest, Release
-from demandops.errors import InvalidInput
+from demandops.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
+from demandops.forge import PullRequest
+from demandops.render.changes.changeset import FileReader
+from demandops.service.demands import TAKEN_BACK
 from demandops.service.ticket import ProposalRecord, Ticket
 from demandops.subject import Subject
 
 Key = tuple[str, ...]
+Decided: TypeAlias = list[tuple[Ticket, Decision]]
+Failed: TypeAlias = list[tuple[Ticket, DemandOpsError]]
 
 _PREFIX = "awaiting approval: "
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What becomes of the demands of a proposal.
+
+    ``booked``: main has them, each with what it would do on main now. ``failed``: they were
+    withdrawn, turned down, or cannot be booked any more. ``free``: they need no approval any more.
+    ``rebuild``: they wait on, each with what it would do on main.
+    """
+
+    booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
+    failed: Failed = field(default_factory=list)
+    free: list[Ticket] = field(default_factory=list)
+    rebuild: Decided = field(default_factory=list)
 
 
 @dataclass(eq=False)
@@ -49,6 +72,62 @@ class Proposal:
         all_wait = all(ticket.state == "proposed" for ticket in self.tickets)
         return all_wait and self.checked_at == tip and head in self.record.commits[-1:]
 
+    def verdict(
+        self,
+        decisions: Iterable[tuple[Ticket, Decision | InvalidInput]],
+        on_main: Container[str],
+        head: str,
+        pull_request: PullRequest | None,
+    ) -> Verdict:
+        """Return what becomes of its demands.
+
+        A demand is booked if the history of main has its operation id, or if the ledger has its
+        claims: a squash merge may lose the trailer.
+
+        Args:
+            decisions: each demand with what it would do on main.
+            on_main: the operation ids of the new commits on main.
+            head: the commit of the branch; empty if there is none.
+            pull_request: the pull request, if it is known.
+        """
+        verdict = Verdict()
+        for ticket, decision in decisions:
+            changes_main = isinstance(decision, InvalidInput) or decision.files
+            if ticket.operation in on_main or not changes_main:
+                verdict.booked.append((ticket, decision))
+            elif ticket.state == "withdrawn" and ticket.proposal:
+                reason = ticket.proposal.withdrawn or TAKEN_BACK
+                verdict.failed.append((ticket, Withdrawn(reason)))
+            elif isinstance(decision, InvalidInput):
+                verdict.failed.append((ticket, decision))
+            elif decision.approval:
+                verdict.rebuild.append((ticket, decision))
+            else:
+                verdict.free.append(ticket)
+        why_not = "" if verdict.booked else self._turned_down_because(head, pull_request)
+        if why_not:
+            verdict.failed.extend((ticket, TurnedDown(why_not)) for ticket, _ in verdict.rebuild)
+            verdict.rebuild.clear()
+        return verdict
+
+    def _turned_down_because(self, head: str, pull_request: PullRequest | None) -> str:
+        if self.record.pushed and not head:
+            return f"was turned down: {self.branch} is gone and was not merged"
+        if pull_request is not None and pull_request.state == "closed":
+            return f"was turned down: {pull_request.link} was closed"
+        return ""
+
+    def drop(self, answered: Iterable[tuple[Ticket, object]]) -> None:
+        """Remove demands that have an answer."""
+        gone = [ticket for ticket, _ in answered]
+        self.tickets = [ticket for ticket in self.tickets if ticket not in gone]
+
+    def wait_for(self, left: Decided) -> None:
+        """Keep only the demands that still need approval."""
+        self.tickets = [ticket for ticket, _ in left]
+        self.requests = [decision.request for _, decision in left]
+        self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
+
     def requesters(self) -> set[str]:
         """Return the requesters of its demands."""
         return {name for request in self.requests for name in request.requesters()}
@@ -72,6 +151,47 @@ def key_of(request: DemandRequest) -> Key:
     if request.is_reference:
         return ("request", request.id, *sorted(request.requesters()))
     return ("demand", request.demand)
+
+
+def decide_or_fault(state: State, ticket: Ticket, read: FileReader) -> Decision | InvalidInput:
+    """Return what a demand would do in a state, or why it cannot."""
+    try:
+        return decide(state, ticket.goal, ticket.received, read)
+    except InvalidInput as error:
+        return error
+
+
+def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decided, Failed]:
+    """Decide demands one after the other, with leases that start at the approval.
+
+    Returns:
+        What each demand does after those before it, and those that cannot be booked then.
+    """
+    written: dict[str, str | None] = {}
+    steps, failed = Decided(), Failed()
+    for ticket, decision in left:
+        request = approval_rule.with_leases_from_approval(decision.request)
+        try:
+            step = decide(
+                state,
+                request,
+                ticket.received,
+                lambda path: written[path] if path in written else read(path),
+            )
+        except InvalidInput as error:
+            failed.append((ticket, error))
+            continue
+        state = step.state
+        written.update(step.files)
+        steps.append((ticket, step))
+    return steps, failed
+
+
+def name_of(goal: object) -> str:
+    """Return the id that a goal gives itself, even if it is not valid any more."""
+    fields = goal if isinstance(goal, dict) else {}
+    keys = ("id", "request", "demand", "name")
+    return str(next((fields[key] for key in keys if fields.get(key)), ""))
 
 
 def is_release(goal: object) -> bool:

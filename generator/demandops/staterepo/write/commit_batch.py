@@ -69,6 +69,11 @@ class CommitBatch:
         self.start = start
         self.head = start
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to publish."""
+        return self.head.commit == self.start.commit
+
     def read(self, path: str) -> str | None:
         """Return a file's text at the newest commit of the batch, or None."""
         return trees.read_text(self._tree, path)
@@ -262,7 +267,7 @@ class CommitBatch:
         Raises:
             RemoteAway, PushDenied: they could not be published for another reason.
         """
-        if self.head.commit == self.start.commit:
+        if self.is_empty:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)
 

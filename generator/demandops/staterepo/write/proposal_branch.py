@@ -16,6 +16,7 @@ import git
 import pygit2
 from pygit2 import Oid, Repository
 
+from demandops.decision import Decision
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
@@ -23,6 +24,8 @@ from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import MAIN, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
+from demandops.staterepo.load.snapshot import Snapshot
+from demandops.staterepo.write.commit_batch import CommitBatch
 
 PREFIX = "demand/"
 _HEADS = "refs/heads/"
@@ -132,10 +135,26 @@ class ProposalBranches:
         else:
             references.create(reference, commit)
 
-    def tree(self, tip: Oid, files: Mapping[str, str | None]) -> Oid:
-        """Return the tree of ``tip`` with ``files`` changed."""
-        objects = self._repository.objects
-        return trees.write(objects, commit_of(objects, tip).tree, files)
+    def commit(
+        self,
+        branch: str,
+        tip: Snapshot,
+        demands: Iterable[tuple[str, datetime, Decision]],
+        now: datetime,
+    ) -> Oid:
+        """Commit demands for a branch on top of main; does not move the branch.
+
+        Args:
+            branch: its name, for the commits' trailers.
+            tip: main.
+            demands: the operation id, the time received and the decision of each.
+            now: the time of the commits.
+        """
+        commits = CommitBatch(self._repository, tip)
+        for operation, received, decision in demands:
+            if decision.files:
+                commits.commit(decision, operation, received, now, branch)
+        return commits.head.commit
 
     def message(self, commit: str) -> str:
         """Return a commit's message; empty if the commit is not here."""
@@ -144,14 +163,16 @@ class ProposalBranches:
         except StateRepoError:
             return ""
 
-    def is_up_to_date(self, tip: Oid, commit: str, base: str, wanted: Oid) -> bool:
-        """Return whether merging ``commit`` into ``tip`` gives the tree ``wanted``, cleanly.
+    def is_up_to_date(
+        self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
+    ) -> bool:
+        """Return whether merging ``commit`` into ``tip`` changes ``files`` and no others, cleanly.
 
         Args:
             tip: the current commit of main.
             commit: the proposal, on top of ``base``.
             base: the commit of main that the proposal was made on.
-            wanted: the tree that the demand gives on the current main.
+            files: what the demands write on the current main.
         """
         objects = self._repository.objects
         try:
@@ -159,7 +180,7 @@ class ProposalBranches:
         except StateRepoError:
             return False  # the clone was made again, or `git gc` removed the commit
         now = commit_of(objects, tip).tree
-        new = objects[wanted].peel(pygit2.Tree)
+        new = objects[trees.write(objects, now, files)].peel(pygit2.Tree)
         proposed = dict(trees.differences(old, proposal))
         if proposed != dict(trees.differences(now, new)):
             return False

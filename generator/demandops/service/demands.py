@@ -1,0 +1,279 @@
+"""The demands under way: each is in one state, and each change of state is one method.
+
+| state | the demand | next |
+| --- | --- | --- |
+| arrived | was submitted | waiting, withdrawn, done |
+| waiting | is in the journal and may be evaluated | committed, proposed, withdrawn, done |
+| committed | has a commit that may be published, so it gets an answer | committed, proposed, done |
+| proposed | awaits a person's approval | proposed, waiting, withdrawn, done |
+| withdrawn | was taken back, released or replaced | done |
+| done | is answered | |
+
+A method writes to the journal, then changes the state, then wakes the worker, all under one lock.
+So a demand is withdrawn before it is committed or not at all. Any thread may let a demand arrive or
+withdraw it; the other changes belong to the worker's thread.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import replace
+
+from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, StateRepoError, Withdrawn
+from demandops.service.ticket import ProposalRecord, Receipt, State, Ticket, ticket_from_journal
+from demandops.staterepo.write.journal import Journal
+
+log = logging.getLogger("demandops")
+
+TAKEN_BACK = "the demand was taken back before it was committed"
+
+_NEXT: dict[State, tuple[State, ...]] = {
+    "arrived": ("waiting", "withdrawn", "done"),
+    "waiting": ("committed", "proposed", "withdrawn", "done"),
+    "committed": ("committed", "proposed", "done"),
+    "proposed": ("proposed", "waiting", "withdrawn", "done"),
+    "withdrawn": ("done",),
+    "done": (),
+}
+
+
+class Demands:
+    """The demands without an answer, and the journal.
+
+    ``blocked`` is why no demand can be published now, or empty; it is part of the error when too
+    many wait.
+    """
+
+    def __init__(self, journal: Journal, limit: int) -> None:
+        self._journal = journal
+        self._limit = limit
+        self._changed = threading.Condition()
+        resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
+        self._tickets = {ticket.operation: ticket for ticket in resumed}
+        self._arrived: list[Ticket] = []
+        self._waiting = deque(ticket for ticket in resumed if ticket.proposal is None)
+        self._taken_back: list[Ticket] = []
+        self._closed = self._woken = False
+        self.blocked = ""
+
+    # ---- questions ----
+
+    @property
+    def operations(self) -> tuple[str, ...]:
+        """The operation ids of the demands that have no answer yet."""
+        with self._changed:
+            return tuple(self._tickets)
+
+    @property
+    def proposed(self) -> list[Ticket]:
+        """The demands with a proposal."""
+        with self._changed:
+            return [ticket for ticket in self._tickets.values() if ticket.proposal is not None]
+
+    @property
+    def unpublished(self) -> int:
+        """How many demands are in the journal and do not await approval."""
+        with self._changed:
+            return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
+
+    @property
+    def has_waiting(self) -> bool:
+        """Whether a demand waits to be taken."""
+        return bool(self._arrived or self._waiting)
+
+    @property
+    def must_not_wait(self) -> bool:
+        """Whether there is something to do that must not wait for a fetch."""
+        return self.has_waiting or self._closed
+
+    # ---- waiting for demands ----
+
+    def close(self) -> None:
+        """Accept no more demands."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def wake(self) -> None:
+        """End a wait although no demand came; from any thread."""
+        with self._changed:
+            self._woken = True
+            self._changed.notify()
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait for a demand, :meth:`wake` or ``timeout``; return False once closed and empty."""
+        with self._changed:
+            if not self.must_not_wait and not self._woken:
+                self._changed.wait(timeout)
+            self._woken = False
+            return self.has_waiting or not self._closed
+
+    def journal_arrivals(self, timeout: float) -> list[Ticket]:
+        """Wait for new demands and journal them, while nothing can be published.
+
+        Returns:
+            The new demands; none after ``timeout`` seconds, a withdrawal or :meth:`wake`.
+        """
+        with self._changed:
+            if not self._arrived and not self._woken:
+                self._changed.wait(timeout)
+            self._woken = False
+            return self._journal_arrived()
+
+    def take(self, batch: list[Ticket], limit: int) -> None:
+        """Journal all that arrived, and move demands into ``batch``, up to ``limit`` in all."""
+        with self._changed:
+            self._journal_arrived()
+            room = min(limit - len(batch), len(self._waiting))
+            batch += [self._waiting.popleft() for _ in range(room)]
+
+    # ---- changes of state ----
+
+    def arrive(self, ticket: Ticket) -> None:
+        """Add a demand.
+
+        Raises:
+            ShuttingDown, QueueFull: if no demand is accepted, or too many wait.
+        """
+        with self._changed:
+            if self._closed:
+                raise ShuttingDown("the generator is shutting down; send the demand again later")
+            if len(self._arrived) + len(self._waiting) >= self._limit:
+                why = f" for the state repo: {self.blocked}" if self.blocked else ""
+                raise QueueFull(
+                    f"{self._limit} demands are waiting already{why}; send it again later"
+                )
+            ticket.state = "arrived"
+            self._arrived.append(ticket)
+            self._tickets[ticket.operation] = ticket
+            self._changed.notify()
+
+    def _journal_arrived(self) -> list[Ticket]:
+        """Journal what arrived; if that fails, answer it with the error."""
+        arrived, self._arrived = self._arrived, []
+        new = [
+            ticket
+            for ticket in arrived
+            if ticket.state == "arrived" and ticket.operation not in self._journal.pending
+        ]
+        try:
+            self._journal.append(ticket.journal_entry() for ticket in new)
+        except StateRepoError as error:
+            log.error("%s", error)
+            self.fail(new, error)
+            new = []
+        for ticket in arrived:
+            _change(ticket, "waiting")
+        self._waiting += (ticket for ticket in arrived if ticket.state != "done")
+        return new
+
+    def commit(self, ticket: Ticket) -> bool:
+        """Refuse further withdrawals of a demand; return False if it was withdrawn before."""
+        with self._changed:
+            return _change(ticket, "committed")
+
+    def propose(self, ticket: Ticket, record: ProposalRecord) -> bool:
+        """Journal the proposal that a demand waits for; return False if it was withdrawn.
+
+        A demand that awaits approval can still be withdrawn.
+        """
+        with self._changed:
+            if not _may_become(ticket, "proposed"):
+                return False
+            self._journal.append([ticket.journal_entry(record)])
+            ticket.proposal = record
+            return _change(ticket, "proposed")
+
+    def requeue(self, tickets: Iterable[Ticket]) -> None:
+        """Let demands wait again that no longer need approval."""
+        with self._changed:
+            for ticket in tickets:
+                self._journal.append([ticket.journal_entry()])
+                ticket.proposal = None
+                _change(ticket, "waiting")
+                self._waiting.append(ticket)
+            self._changed.notify()
+
+    def withdraw(self, operation: str) -> bool:
+        """Withdraw a demand; return False if it is too late or impossible."""
+        with self._changed:
+            ticket = self._tickets.get(operation)
+            if ticket is None or not _may_become(ticket, "withdrawn"):
+                return ticket is not None and ticket.state == "withdrawn"
+            try:
+                self._withdraw(ticket, TAKEN_BACK)
+            except StateRepoError as error:
+                log.error("demand %s cannot be withdrawn: %s", operation, error)
+                return False
+        return True
+
+    def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
+        """Withdraw demands that await approval; a restart knows it as well."""
+        with self._changed:
+            for ticket in tickets:
+                if ticket.state == "proposed":
+                    self._withdraw(ticket, reason)
+
+    def _withdraw(self, ticket: Ticket, reason: str) -> None:
+        if ticket.proposal is None:
+            # a restart must not resume it
+            self._journal.mark_done([ticket.operation], durably=True)
+            self._taken_back.append(ticket)
+        else:  # it stays in the journal until its branch is deleted, so that none merges it
+            record = replace(ticket.proposal, withdrawn=reason)
+            self._journal.append([ticket.journal_entry(record)])
+            ticket.proposal = record
+        _change(ticket, "withdrawn")
+        self.wake()  # the worker answers it even while nothing can be published
+
+    def answer_withdrawn(self, batch: list[Ticket]) -> None:
+        """Answer the demands that were withdrawn before a commit, and remove them from a batch.
+
+        A withdrawn proposal is answered later: its branch is deleted first.
+        """
+        with self._changed:
+            withdrawn, self._taken_back = self._taken_back, []
+            if not withdrawn:
+                return
+            self._waiting = deque(t for t in self._waiting if t not in withdrawn)
+            batch[:] = [ticket for ticket in batch if ticket not in withdrawn]
+        self.fail(withdrawn, Withdrawn(TAKEN_BACK))
+
+    def answer(
+        self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
+    ) -> None:
+        """Answer each demand with its result and remove it from the journal, unless ``keep``.
+
+        A demand is answered once: a later result is dropped.
+        """
+        with self._changed:
+            results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
+            if not keep:
+                self._journal.mark_done(ticket.operation for ticket, _ in results)
+            for ticket, _ in results:
+                _change(ticket, "done")
+                self._tickets.pop(ticket.operation, None)
+        for ticket, result in results:
+            if isinstance(result, Receipt):
+                ticket.notify("pushed", f"pushed {result.commit}")
+                ticket.future.set_result(result)
+            else:
+                ticket.future.set_exception(result)
+
+    def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
+        """Answer every demand of a batch with an error."""
+        self.answer([(ticket, error) for ticket in batch], keep)
+
+
+def _may_become(ticket: Ticket, state: State) -> bool:
+    return state in _NEXT[ticket.state]
+
+
+def _change(ticket: Ticket, state: State) -> bool:
+    """Change a demand's state; return False, and leave it, if that one may not follow."""
+    if _may_become(ticket, state):
+        ticket.state = state
+    return ticket.state == state
