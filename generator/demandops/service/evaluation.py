@@ -6,18 +6,17 @@ A demand that fails gets its error as the answer. The other demands of the batch
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from datetime import datetime, timezone
 
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand import decommission_goal
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
-from demandops.service.approvals.approvals import Approvals, Deferred
+from demandops.service.approvals.approvals import Approvals
 from demandops.service.approvals.proposal import is_release, name_of
 from demandops.service.demands import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
-from demandops.service.ticket import Receipt, Ticket
+from demandops.service.ticket import Receipt, Ticket, receipt_of
 from demandops.service.timing.rate_limit import RateLimit
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import SigningFailed
@@ -47,11 +46,14 @@ class Evaluator:
         commits: CommitBatch,
         ticket: Ticket,
         published: dict[str, commit_log.RecordedOutcome],
-    ) -> Receipt | DemandOpsError | Deferred:
+    ) -> Receipt | DemandOpsError | Decision:
         """Decide a demand, commit it on the commit batch and return its result.
 
         Args:
             published: what :meth:`published_before` returned for the batch.
+
+        Returns:
+            Its receipt or error; if it needs approval, the decision, which is not committed.
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
@@ -72,13 +74,13 @@ class Evaluator:
                 ),
             )
             if decision.approval:
-                return Deferred(decision)
+                return decision
             if not self._demands.commit(ticket):
                 return Withdrawn(TAKEN_BACK)
             self._approvals.withdraw_replaced(decision.request)
             before = commits.head.state.ledger
             targets = targets_of_decision(before, decision) if self._with_targets else ()
-            return replace(_commit(commits, ticket, decision), targets=targets)
+            return receipt_of(ticket, decision, _commit(commits, ticket, decision), targets)
         except InvalidInput as error:
             if ticket.has_released:  # a proposal, which held no claims yet
                 commits.note_settled(ticket.operation, "Unchanged")
@@ -106,23 +108,13 @@ class Evaluator:
         return published
 
 
-def _commit(commits: CommitBatch, ticket: Ticket, decision: Decision) -> Receipt:
-    if decision.files:
-        commit = commits.commit(decision, ticket.operation, ticket.received, _now())
-        ticket.notify("committed", f"committed {commit}")
-    else:
-        commit = str(commits.head.commit)
+def _commit(commits: CommitBatch, ticket: Ticket, decision: Decision) -> str:
+    if not decision.files:
         commits.note_settled(ticket.operation, "Unchanged")
-    return Receipt(
-        operation=ticket.operation,
-        request_id=decision.request.id,
-        outcome=decision.outcome,
-        commit=commit,
-        warnings=decision.warnings,
-        not_held=decision.changes.not_held,
-        lease_s=decision.lease_s,
-        changes=decision.changes.claims,
-    )
+        return str(commits.head.commit)
+    commit = commits.commit(decision, ticket.operation, ticket.received, _now())
+    ticket.notify("committed", f"committed {commit}")
+    return commit
 
 
 def _receipt_of_published(

@@ -73,14 +73,12 @@ class Generator:
         self.address = repository.address
         self.queue_limit = queue_limit
         self._demands = Demands(self._slot.journal, queue_limit)
-        self._listeners: list[Callable[[Config], None]] = []
         token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,
             snapshot,
             self._demands,
             Approvals(repository, snapshot.state, self._demands, with_targets, token_file),
-            self._call_listeners,
             with_targets,
             fetch_interval,
         )
@@ -169,11 +167,7 @@ class Generator:
 
         It gets the configuration in effect and must return at once.
         """
-        self._listeners.append(listener)
-
-    def _call_listeners(self, config: Config) -> None:
-        for listener in self._listeners:
-            listener(config)
+        self._worker.listeners.append(listener)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
         """Refuse further demands, finish the queued ones and stop; returns at once.

@@ -13,7 +13,7 @@ from datetime import datetime, timezone
 from typing import Any, Literal
 
 from demandops.cluster.health import Target
-from demandops.decision import Outcome
+from demandops.decision import Decision, Outcome
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import ClaimChange
 from demandops.staterepo.write.journal import JournalEntry
@@ -114,6 +114,23 @@ class Ticket:
         """Return what the journal keeps of the demand."""
         record = asdict(proposal) if proposal else None
         return JournalEntry(self.operation, self.goal, self.received.isoformat(), self.base, record)
+
+
+def receipt_of(
+    ticket: Ticket, decision: Decision, commit: str, targets: tuple[Target, ...]
+) -> Receipt:
+    """Return the receipt of a demand for what was decided on it."""
+    return Receipt(
+        operation=ticket.operation,
+        request_id=decision.request.id,
+        outcome=decision.outcome,
+        commit=commit,
+        warnings=decision.warnings,
+        not_held=decision.changes.not_held,
+        lease_s=decision.lease_s,
+        targets=targets,
+        changes=decision.changes.claims,
+    )
 
 
 def new_ticket(goal: object, operation: str | None, listener: Listener) -> Ticket:

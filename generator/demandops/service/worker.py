@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterable
 from datetime import datetime, timezone
 
 from demandops.config.config import Config
+from demandops.decision import Decision
 from demandops.errors import DemandOpsError, Fault, ShuttingDown, StateRepoError
-from demandops.service.approvals.approvals import Approvals, Deferred, Result
+from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.demands import Demands
 from demandops.service.evaluation import Evaluator
 from demandops.service.remote_status import RemoteMonitor
@@ -43,7 +44,8 @@ _LONGEST_PAUSE_S = 0.05
 class Worker:
     """Follows the state repo and turns batches of demands into published commits.
 
-    Any thread may read ``snapshot``, the newest published state, and ``remote``.
+    Any thread may read ``snapshot``, the newest published state, and ``remote``. The ``listeners``
+    are called with the configuration in effect after every publication.
     """
 
     def __init__(
@@ -52,14 +54,13 @@ class Worker:
         snapshot: Snapshot,
         demands: Demands,
         approvals: Approvals,
-        on_published: Callable[[Config], None],
         with_targets: bool,
         fetch_interval: float,
     ) -> None:
         self.snapshot = snapshot
+        self.listeners: list[Callable[[Config], None]] = []
         self.remote = RemoteMonitor(repository.address)
         self._repository, self._demands, self._approvals = repository, demands, approvals
-        self._on_published = on_published
         self._evaluator = Evaluator(repository, demands, approvals, with_targets)
         self._timer = PollTimer(fetch_interval, embedded=repository.always_current)
         self._lease_expiry, self._override_expiry = LeaseExpiry(), OverrideExpiry()
@@ -119,8 +120,8 @@ class Worker:
 
     def _seconds_until_due(self) -> float:
         """Return the seconds until a lease, override, proposal or fetch is due."""
-        state = self.snapshot.state
-        seconds = self._approvals.seconds_until_due(LONGEST_WAIT_S)
+        state, tip = self.snapshot.state, str(self.snapshot.commit)
+        seconds = self._approvals.seconds_until_due(tip, LONGEST_WAIT_S)
         seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
         seconds = self._override_expiry.seconds_until_due(state.config, _now(), seconds)
         fetch = self._timer.seconds_until_due()
@@ -230,11 +231,11 @@ class Worker:
 
     def _answer(self, results: list[Result]) -> None:
         """Answer the demands that have a final result; propose those that need approval."""
-        final = [(ticket, result) for ticket, result in results if not isinstance(result, Deferred)]
+        final = [(ticket, result) for ticket, result in results if not isinstance(result, Decision)]
         self._demands.answer(final)
         for ticket, result in results:
-            if isinstance(result, Deferred):
-                self._approvals.add(ticket, result.decision)
+            if isinstance(result, Decision):
+                self._approvals.add(ticket, result)
 
     def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
         """Wait; meanwhile journal new demands and report to them why they wait."""
@@ -334,7 +335,8 @@ class Worker:
     def _set_snapshot(self, snapshot: Snapshot) -> None:
         before, self.snapshot = self.snapshot, snapshot
         if snapshot.commit != before.commit:  # a merge may need no commit of the generator
-            self._on_published(snapshot.state.config)
+            for listener in self.listeners:
+                listener(snapshot.state.config)
 
     def _record_reached(self, *, pushed: bool) -> None:
         self._demands.blocked = ""

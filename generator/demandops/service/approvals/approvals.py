@@ -11,7 +11,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TypeAlias
@@ -43,7 +43,7 @@ from demandops.service.approvals.proposal import (
 )
 from demandops.service.demands import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
-from demandops.service.ticket import ProposalRecord, Receipt, Ticket
+from demandops.service.ticket import ProposalRecord, Receipt, Ticket, receipt_of
 from demandops.staterepo.git.repository import PushDenied, StateRepository
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
@@ -72,14 +72,8 @@ RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
 
 
-@dataclass(frozen=True, slots=True)
-class Deferred:
-    """The result of a demand that needs approval."""
-
-    decision: Decision
-
-
-Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Deferred]
+Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Decision]
+"""A demand of a batch with its answer, or with its decision if it needs approval."""
 
 
 class Approvals:
@@ -149,8 +143,8 @@ class Approvals:
         """
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier if request else ()):
-            if isinstance(result, Deferred):
-                proposal = Proposal((), ProposalRecord(""), requests=[result.decision.request])
+            if isinstance(result, Decision):
+                proposal = Proposal((), ProposalRecord(""), requests=[result.request])
                 if request and proposal.is_released_by(request):
                     earlier[index] = (ticket, Withdrawn(RELEASED))
                     by.has_released = True
@@ -190,21 +184,22 @@ class Approvals:
         """Return whether to check the proposals now, with main at ``tip``."""
         if not self._proposals:
             return False
-        now = time.monotonic()
-        if now < self._next_check and self._checked_at == _UNFINISHED:
-            return False
         tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)
-        if self._changed or any(ticket.state == "withdrawn" for ticket in tickets):
+        if self._checked_at != _UNFINISHED and (
+            self._changed or any(ticket.state == "withdrawn" for ticket in tickets)
+        ):
             return True
-        if tip != self._checked_at and now < self._rest_until:
-            self._next_check = min(self._next_check, self._rest_until)
-        return now >= self._next_check or (tip != self._checked_at and now >= self._rest_until)
+        return time.monotonic() >= self._due_time(tip)
 
-    def seconds_until_due(self, longest: float) -> float:
+    def seconds_until_due(self, tip: str, longest: float) -> float:
         """Return the seconds until the next check; ``longest`` without proposals."""
         if not self._proposals:
             return longest
-        return min(longest, max(self._next_check - time.monotonic(), 0.05))
+        return min(longest, max(self._due_time(tip) - time.monotonic(), 0.05))
+
+    def _due_time(self, tip: str) -> float:
+        has_moved = self._checked_at not in (tip, _UNFINISHED)
+        return min(self._next_check, self._rest_until) if has_moved else self._next_check
 
     def fetch_heads(self) -> BranchHeads:
         """Fetch the commits of the branches, and plan the next check even if this one fails.
@@ -296,17 +291,9 @@ class Approvals:
         commit = recorded.commit if recorded else str(snapshot.commit)
         if isinstance(decision, InvalidInput) or decision.files:  # merged, and changed since
             return Receipt(ticket.operation, name_of(ticket.goal), "booked", commit)
-        return Receipt(
-            operation=ticket.operation,
-            request_id=decision.request.id,
-            outcome="booked",
-            commit=commit,
-            warnings=decision.warnings,
-            lease_s=decision.lease_s,
-            targets=targets_of_decision(snapshot.state.ledger, decision)
-            if self._with_targets
-            else (),
-        )
+        before = snapshot.state.ledger
+        targets = targets_of_decision(before, decision) if self._with_targets else ()
+        return replace(receipt_of(ticket, decision, commit, targets), outcome="booked")
 
     # ---- the branch and its pull request ----
 

@@ -227,8 +227,7 @@ def pull_request_body(message: str, reasons: Iterable[str]) -> str:
 
     The message is fenced, because it has ids that anyone may choose: none must become a link.
     """
-    longest = max((len(run) for run in re.findall(r"`+", message)), default=0)
-    fence = "`" * max(3, longest + 1)
+    fence = _fence(message, 3)
     why = ", ".join(reasons) or "an access policy"
     return (
         f"A demand that needs approval, asked for by {why}. Merging carries it out; closing it or "
@@ -239,9 +238,14 @@ def pull_request_body(message: str, reasons: Iterable[str]) -> str:
 def push_option_description(message: str, reasons: Iterable[str]) -> str:
     """Return the text of a merge request on one line, because a push option has only one."""
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
-    fence = "`" * (max((len(run) for run in re.findall(r"`+", why)), default=0) + 1)
+    fence = _fence(why, 1)
     asks = ", ".join(reasons) or "an access policy"
     return (
         f"A demand that needs approval, asked for by {asks}. {fence} {why} {fence} Merging carries "
         "it out; deleting the branch turns it down."
     )
+
+
+def _fence(text: str, shortest: int) -> str:
+    """Return backticks that fence a text, which may have backticks itself."""
+    return "`" * max([shortest, *(len(run) + 1 for run in re.findall(r"`+", text))])
