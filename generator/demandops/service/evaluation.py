@@ -78,7 +78,7 @@ class Evaluator:
             if not self._demands.commit(ticket):
                 return Withdrawn(TAKEN_BACK)
             self._approvals.withdraw_replaced(decision.request)
-            before = commits.head.state.ledger
+            before = commits.head.state
             targets = targets_of_decision(before, decision) if self._with_targets else ()
             return receipt_of(ticket, decision, _commit(commits, ticket, decision), targets)
         except InvalidInput as error:

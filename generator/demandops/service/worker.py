@@ -123,7 +123,7 @@ class Worker:
         state, tip = self.snapshot.state, str(self.snapshot.commit)
         seconds = self._approvals.seconds_until_due(tip, LONGEST_WAIT_S)
         seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
-        seconds = self._override_expiry.seconds_until_due(state.config, _now(), seconds)
+        seconds = self._override_expiry.seconds_until_due(state, _now(), seconds)
         fetch = self._timer.seconds_until_due()
         return seconds if fetch is None else min(seconds, fetch)
 
@@ -258,7 +258,7 @@ class Worker:
 
         A repository on this disk is read each time, because that is cheap.
         """
-        override_is_due = self._override_expiry.is_due(self.snapshot.state.config, _now())
+        override_is_due = self._override_expiry.is_due(self.snapshot.state, _now())
         try:
             if self._timer.start_if_due():
                 self._repository.refresh_unless_urgent(lambda: self._demands.must_not_wait)

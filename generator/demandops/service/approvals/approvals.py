@@ -291,7 +291,7 @@ class Approvals:
         commit = recorded.commit if recorded else str(snapshot.commit)
         if isinstance(decision, InvalidInput) or decision.files:  # merged, and changed since
             return Receipt(ticket.operation, name_of(ticket.goal), "booked", commit)
-        before = snapshot.state.ledger
+        before = snapshot.state
         targets = targets_of_decision(before, decision) if self._with_targets else ()
         return replace(receipt_of(ticket, decision, commit, targets), outcome="booked")
 
