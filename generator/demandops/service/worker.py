@@ -98,7 +98,9 @@ class Worker:
         """Publish the demands that wait, or follow the state repo; then check the proposals."""
         batch: list[Ticket] = []
         try:
-            self._take(batch)
+            self._demands.take(batch, self._batch_limit)
+            if not self._demands.has_waiting:  # else one of them may renew a lease
+                batch += self._lease_expiry.tickets(self.snapshot.state.ledger)
             if batch:
                 self._publish(batch)
                 if self.snapshot.problems:  # a release may have made a change possible
@@ -126,15 +128,6 @@ class Worker:
         seconds = self._override_expiry.seconds_until_due(state, _now(), seconds)
         fetch = self._timer.seconds_until_due()
         return seconds if fetch is None else min(seconds, fetch)
-
-    def _take(self, batch: list[Ticket]) -> None:
-        """Move waiting demands into ``batch``, then the releases of ended leases.
-
-        No lease ends while demands wait, because one of them may renew it.
-        """
-        self._demands.take(batch, self._batch_limit)
-        if not self._demands.has_waiting:
-            batch += self._lease_expiry.tickets(self.snapshot.state.ledger)
 
     def _tidy(self) -> None:
         """Pack the repository every few hundred commits; each adds about twenty loose objects."""
@@ -177,9 +170,6 @@ class Worker:
 
         Returns:
             The seconds to wait before the next attempt, or None to continue at once.
-
-        Raises:
-            RemoteAway: if the remote cannot be reached.
         """
         # fetch first: a demand that was committed can no longer be withdrawn
         if self._must_fetch or self.remote.is_unreachable:

@@ -300,15 +300,8 @@ class Approvals:
     def _update(self, proposal: Proposal, left: Decided, snapshot: Snapshot, head: str) -> bool:
         """Update the branch, so that merging it gives what main would render now.
 
-        Args:
-            left: the demands that still need approval, each with its decision on main.
-            head: the commit of the branch; empty if there is no branch yet.
-
         Returns:
             False if a demand was withdrawn meanwhile and the proposal must be checked again.
-
-        Raises:
-            BranchMoved, RemoteAway, PushDenied: if the branch could not be pushed.
         """
         if head and head not in proposal.record.commits:
             if not proposal.edited:
@@ -368,11 +361,6 @@ class Approvals:
         return all(waiting)
 
     def _delete_branch(self, proposal: Proposal, heads: BranchHeads) -> None:
-        """Delete the branch, if there is one.
-
-        Raises:
-            BranchMoved, RemoteAway, PushDenied: if it could not be deleted.
-        """
         head = heads.branches.get(proposal.branch)
         if head:
             self._branches.remove(proposal.branch, head)

@@ -17,7 +17,6 @@ from demandops.demand.demand_request import DemandRequest, Release
 from demandops.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
 from demandops.forge import PullRequest
 from demandops.render.changes.changeset import FileReader
-from demandops.service.demands import TAKEN_BACK
 from demandops.service.ticket import ProposalRecord, Ticket
 from demandops.subject import Subject
 
@@ -96,8 +95,7 @@ class Proposal:
             if ticket.operation in on_main or not changes_main:
                 verdict.booked.append((ticket, decision))
             elif ticket.state == "withdrawn" and ticket.proposal:
-                reason = ticket.proposal.withdrawn or TAKEN_BACK
-                verdict.failed.append((ticket, Withdrawn(reason)))
+                verdict.failed.append((ticket, Withdrawn(ticket.proposal.withdrawn)))
             elif isinstance(decision, InvalidInput):
                 verdict.failed.append((ticket, decision))
             elif decision.approval:
