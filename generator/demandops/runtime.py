@@ -14,6 +14,8 @@ import uuid
 from collections.abc import Callable
 from datetime import datetime, timezone
 
+Thread = threading.Thread
+
 
 class Runtime:
     """The runtime of this machine; another one overrides what it replaces."""
@@ -50,9 +52,9 @@ class Runtime:
         """Return a lock whose holders may wait for a change. A wait may end without one."""
         return threading.Condition()
 
-    def start_thread(self, name: str, target: Callable[[], object]) -> threading.Thread:
+    def start_thread(self, name: str, target: Callable[[], object]) -> Thread:
         """Start a thread that ends with the process at the latest, and return it."""
-        thread = threading.Thread(target=target, name=f"demandops-{name}", daemon=True)
+        thread = Thread(target=target, name=f"demandops-{name}", daemon=True)
         thread.start()
         return thread
 
