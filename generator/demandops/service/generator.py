@@ -75,7 +75,7 @@ class Generator:
         self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
-        self._queue = DemandQueue(self._slot.journal, queue_limit)
+        self._queue = DemandQueue(self._slot.journal, queue_limit, runtime)
         self._listeners: list[Callable[[Config], None]] = []
         self._approvals = Approvals(
             repository, self._queue, with_targets, settings.forge_token_file()
@@ -135,7 +135,7 @@ class Generator:
         Raises:
             ShuttingDown, QueueFull: if the demand is not accepted at all.
         """
-        ticket = new_ticket(goal, operation, listener)
+        ticket = new_ticket(goal, operation, listener, self._runtime)
         if not ticket.future.done():
             ticket.base = str(self.snapshot.commit)
             self._queue.add(ticket)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 
 from demandops.errors import Fault
-from demandops.runtime import REAL, Runtime
+from demandops.runtime import Runtime
 
 log = logging.getLogger("demandops")
 
@@ -44,7 +44,7 @@ class StateRepoStatus:
 class RemoteMonitor:
     """Records and logs whether the remote can be reached; any thread may read ``status``."""
 
-    def __init__(self, address: str, runtime: Runtime = REAL) -> None:
+    def __init__(self, address: str, runtime: Runtime) -> None:
         self._address, self._runtime = address, runtime
         self.status = RemoteStatus()
 

@@ -6,7 +6,7 @@ are jittered and bounded, so no writer starves and a remote that comes back is n
 
 from __future__ import annotations
 
-from demandops.runtime import REAL, Runtime
+from demandops.runtime import Runtime
 
 FIRST_PAUSE_S = 0.05
 LONGEST_AWAY_S = 10.0
@@ -21,7 +21,7 @@ LIMIT_REMOTE = 200
 class Backoff:
     """The delays of one batch of demands."""
 
-    def __init__(self, limit: int, runtime: Runtime = REAL) -> None:
+    def __init__(self, limit: int, runtime: Runtime) -> None:
         self._limit, self._runtime = limit, runtime
         self.published()
 

@@ -13,7 +13,7 @@ from datetime import datetime, timedelta
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Expire
 from demandops.ledger.ledger import Ledger
-from demandops.runtime import REAL, Runtime
+from demandops.runtime import Runtime
 from demandops.service.ticket import Ticket
 
 log = logging.getLogger("demandops")
@@ -27,7 +27,7 @@ LONGEST_WAIT_S = 60.0
 class LeaseClock:
     """Decides which leases have ended, and when to check again."""
 
-    def __init__(self, runtime: Runtime = REAL) -> None:
+    def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._last = (runtime.now(), runtime.monotonic())
         self._jumped_at: datetime | None = None
@@ -76,7 +76,7 @@ class LeaseClock:
 class LeaseExpiry:
     """Makes the demands that release what has ended."""
 
-    def __init__(self, runtime: Runtime = REAL) -> None:
+    def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._clock = LeaseClock(runtime)
         self._tried: dict[str, datetime] = {}

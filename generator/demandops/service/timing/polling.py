@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 
 from demandops.config.policy import seconds_of
-from demandops.runtime import REAL, Runtime
+from demandops.runtime import Runtime
 
 DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
@@ -34,7 +34,7 @@ class PollTimer:
     Any thread may call :meth:`request`; everything else belongs to one thread.
     """
 
-    def __init__(self, interval: float, runtime: Runtime = REAL, *, embedded: bool = False) -> None:
+    def __init__(self, interval: float, runtime: Runtime, *, embedded: bool = False) -> None:
         """Start the timer; the first fetch is due at once.
 
         Args:
