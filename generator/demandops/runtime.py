@@ -1,8 +1,9 @@
 """Time, chance and threads: the only module that asks the machine for them.
 
 The service and the cluster's watchers are handed a :class:`Runtime`, so that another one can run
-them: with a clock that it moves, numbers from a seed, and threads that take turns. What belongs to
-this machine in any case uses :data:`REAL`: commands, git's processes, HTTP calls, ROS's executors.
+them: with a clock that it moves, numbers from a seed, and threads that take turns. What holds a
+state repo takes that of the repository. What belongs to this machine in any case uses
+:data:`REAL`: commands, git's processes and locks, HTTP, ROS's executors.
 """
 
 from __future__ import annotations
