@@ -5,13 +5,13 @@ from __future__ import annotations
 import signal
 import sys
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import click
 from demandops import strict_yaml
 from demandops.cli.output import console, errors, output_option, print_json
 from demandops.errors import InvalidInput, fault
+from demandops.runtime import REAL
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 
 from demandops_ros.client import Answer, DemandClient, DemandError
@@ -104,7 +104,7 @@ def _print_answer(answer: Answer, output: str) -> None:
 
 
 def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
-    over = Event()
+    over = REAL.event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.set())
     client.requesters = tuple(data.get("requesters", ()))

@@ -17,12 +17,12 @@ withdraw it; the other changes belong to the worker's thread.
 from __future__ import annotations
 
 import logging
-import threading
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 
 from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, StateRepoError, Withdrawn
+from demandops.runtime import Runtime
 from demandops.service.ticket import ProposalRecord, Receipt, State, Ticket, ticket_from_journal
 from demandops.staterepo.write.journal import Journal
 
@@ -47,10 +47,10 @@ class Demands:
     many wait.
     """
 
-    def __init__(self, journal: Journal, limit: int) -> None:
+    def __init__(self, journal: Journal, limit: int, runtime: Runtime) -> None:
         self._journal = journal
         self._limit = limit
-        self._changed = threading.Condition()
+        self._changed = runtime.condition()
         resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
         self._arrived: list[Ticket] = []

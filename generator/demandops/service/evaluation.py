@@ -6,7 +6,7 @@ A demand that fails gets its error as the answer. The other demands of the batch
 from __future__ import annotations
 
 import logging
-from datetime import datetime, timezone
+from datetime import datetime
 
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand import decommission_goal
@@ -80,7 +80,8 @@ class Evaluator:
             self._approvals.withdraw_replaced(decision.request)
             before = commits.head.state
             targets = targets_of_decision(before, decision) if self._with_targets else ()
-            return receipt_of(ticket, decision, _commit(commits, ticket, decision), targets)
+            commit = _commit(commits, ticket, decision, self._repository.runtime.now())
+            return receipt_of(ticket, decision, commit, targets)
         except InvalidInput as error:
             if ticket.has_released:  # a proposal, which held no claims yet
                 commits.note_settled(ticket.operation, "Unchanged")
@@ -108,11 +109,11 @@ class Evaluator:
         return published
 
 
-def _commit(commits: CommitBatch, ticket: Ticket, decision: Decision) -> str:
+def _commit(commits: CommitBatch, ticket: Ticket, decision: Decision, now: datetime) -> str:
     if not decision.files:
         commits.note_settled(ticket.operation, "Unchanged")
         return str(commits.head.commit)
-    commit = commits.commit(decision, ticket.operation, ticket.received, _now())
+    commit = commits.commit(decision, ticket.operation, ticket.received, now)
     ticket.notify("committed", f"committed {commit}")
     return commit
 
@@ -131,7 +132,3 @@ def _receipt_of_published(
     if arrival.outcome == "unchanged":
         outcome = "unchanged"
     return Receipt(ticket.operation, name_of(goal), outcome, arrival.commit)
-
-
-def _now() -> datetime:
-    return datetime.now(timezone.utc)

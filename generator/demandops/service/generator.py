@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 
 from demandops import settings
 from demandops.config.config import Config
+from demandops.runtime import REAL, Runtime
 from demandops.service.approvals.approvals import Approvals
 from demandops.service.demands import Demands
 from demandops.service.remote_status import StateRepoStatus
@@ -40,6 +40,7 @@ class Generator:
         fetch_interval: float = 0.0,
         signing_key: Path | None = None,
         progress: Progress = lambda done, total: None,
+        runtime: Runtime = REAL,
     ) -> None:
         """Open the state repo, start the worker and resume what is in the journal.
 
@@ -53,6 +54,7 @@ class Generator:
                 that a repository on this disk is checked every minute.
             signing_key: an SSH key that signs the commits (:mod:`demandops.staterepo.git.signing`).
             progress: called with (files read, files in all) while the ledger is loaded.
+            runtime: tells the time and runs the threads.
 
         Raises:
             StateRepoError, InvalidInput: if the state repo or the key cannot be used.
@@ -63,16 +65,16 @@ class Generator:
             repository = repository_choice.connect(
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
-            repository.signer = signer
+            repository.signer, repository.runtime = signer, runtime
             snapshot = state_in_effect.first_snapshot(repository, progress)
         except BaseException:
             self._slot.close()
             raise
-        self._repository = repository
+        self._repository, self._runtime = repository, runtime
         self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
-        self._demands = Demands(self._slot.journal, queue_limit)
+        self._demands = Demands(self._slot.journal, queue_limit, runtime)
         token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,
@@ -83,13 +85,10 @@ class Generator:
             fetch_interval,
         )
         self._finished: Future[bool] | None = None
-        self._stop_lock = threading.Lock()
+        self._stop_lock = runtime.lock()
         for operation in self.operations:
             log.info("resuming demand %s from the journal", operation)
-        self._thread = threading.Thread(
-            target=self._worker.run, name="demandops-writer", daemon=True
-        )
-        self._thread.start()
+        self._thread = runtime.start_thread("writer", self._worker.run)
 
     @property
     def snapshot(self) -> Snapshot:
@@ -136,7 +135,7 @@ class Generator:
         Raises:
             ShuttingDown, QueueFull: if the demand is not accepted at all.
         """
-        ticket = new_ticket(goal, operation, listener)
+        ticket = new_ticket(goal, operation, listener, self._runtime)
         if not ticket.future.done():
             ticket.base = str(self.snapshot.commit)
             self._demands.arrive(ticket)
@@ -184,9 +183,7 @@ class Generator:
                 return self._finished
             self._finished = finished = Future[bool]()
         self._demands.close()
-        threading.Thread(
-            target=self._end, args=(timeout, finished), name="demandops-stop", daemon=True
-        ).start()
+        self._runtime.start_thread("stop", lambda: self._end(timeout, finished))
         return finished
 
     def _end(self, timeout: float, finished: Future[bool]) -> None:

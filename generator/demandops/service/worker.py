@@ -7,11 +7,7 @@ when one arrives, because its push shows what is new too.
 from __future__ import annotations
 
 import logging
-import random
-import threading
-import time
 from collections.abc import Callable, Iterable
-from datetime import datetime, timezone
 
 from demandops.config.config import Config
 from demandops.decision import Decision
@@ -59,17 +55,23 @@ class Worker:
     ) -> None:
         self.snapshot = snapshot
         self.listeners: list[Callable[[Config], None]] = []
-        self.remote = RemoteMonitor(repository.address)
+        self.remote = RemoteMonitor(repository.address, repository.runtime)
         self._repository, self._demands, self._approvals = repository, demands, approvals
+        self._runtime = repository.runtime
         self._evaluator = Evaluator(repository, demands, approvals, with_targets)
-        self._timer = PollTimer(fetch_interval, embedded=repository.always_current)
-        self._lease_expiry, self._override_expiry = LeaseExpiry(), OverrideExpiry()
+        self._timer = PollTimer(
+            fetch_interval, repository.runtime, embedded=repository.always_current
+        )
+        self._lease_expiry, self._override_expiry = (
+            LeaseExpiry(repository.runtime),
+            OverrideExpiry(),
+        )
         self._ahead = ReadAhead()
         self._batch_limit = LIMIT_EMBEDDED if repository.always_current else LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
         self._commits_since_tidy = 0
         self._logged: frozenset[Fault] = frozenset()
-        self._stopped_retrying = threading.Event()
+        self._stopped_retrying = self._runtime.event()
 
     # ---- from any thread ----
 
@@ -125,7 +127,7 @@ class Worker:
         state, tip = self.snapshot.state, str(self.snapshot.commit)
         seconds = self._approvals.seconds_until_due(tip, LONGEST_WAIT_S)
         seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
-        seconds = self._override_expiry.seconds_until_due(state, _now(), seconds)
+        seconds = self._override_expiry.seconds_until_due(state, self._runtime.now(), seconds)
         fetch = self._timer.seconds_until_due()
         return seconds if fetch is None else min(seconds, fetch)
 
@@ -145,7 +147,7 @@ class Worker:
             DemandOpsError: if the state repo cannot be used; likewise.
         """
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
-        backoff = Backoff(self._batch_limit)
+        backoff = Backoff(self._batch_limit, self._runtime)
         while batch:
             try:
                 wait = self._attempt(batch, backoff)
@@ -179,13 +181,13 @@ class Worker:
         part = batch[: backoff.max_demands]
         self._approvals.remove_released(part, self.snapshot.state)
         commits = self._new_commit_batch()
-        began = time.monotonic()
+        began = self._runtime.monotonic()
         published = self._evaluator.published_before(commits.start, part)
         results: list[Result] = []
         for ticket in part:
             self._approvals.withdraw_released(results, ticket, commits.head.state)
             results.append((ticket, self._evaluator.evaluate(commits, ticket, published)))
-        evaluated = time.monotonic()
+        evaluated = self._runtime.monotonic()
         if commits.is_empty and not self._tip_is_fresh:
             # nothing to push, so only a fetch shows whether the remote has moved
             self._tip_is_fresh = True
@@ -199,7 +201,9 @@ class Worker:
         log.info("the state repo has moved; evaluating %d demands again", len(part))
         _mark_maybe_published(part, commits.start)
         self._must_fetch = True
-        return backoff.overtaken(len(part), evaluated - began, time.monotonic() - evaluated)
+        return backoff.overtaken(
+            len(part), evaluated - began, self._runtime.monotonic() - evaluated
+        )
 
     def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
         """Publish a commit batch; return False if another writer was first.
@@ -229,14 +233,14 @@ class Worker:
 
     def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
         """Wait; meanwhile journal new demands and report to them why they wait."""
-        end = time.monotonic() + seconds
+        end = self._runtime.monotonic() + seconds
         to_notify = list(batch)
         while not self._stopped_retrying.is_set():
             if self.remote.is_unreachable:
                 for ticket in to_notify:
                     ticket.notify("away", f"waiting: {self.remote.status.unreachable}")
             self._demands.answer_withdrawn(batch)
-            left = end - time.monotonic()
+            left = end - self._runtime.monotonic()
             if left <= 0:
                 return
             to_notify = self._demands.journal_arrivals(left)
@@ -248,7 +252,7 @@ class Worker:
 
         A repository on this disk is read each time, because that is cheap.
         """
-        override_is_due = self._override_expiry.is_due(self.snapshot.state, _now())
+        override_is_due = self._override_expiry.is_due(self.snapshot.state, self._runtime.now())
         try:
             if self._timer.start_if_due():
                 self._repository.refresh_unless_urgent(lambda: self._demands.must_not_wait)
@@ -260,7 +264,7 @@ class Worker:
             self._timer.interrupted()
         except StateRepoError as error:
             self._record_unreachable(error)
-            self._override_expiry.postpone(_now())
+            self._override_expiry.postpone(self._runtime.now())
 
     def _check_proposals(self) -> None:
         """Check the demands that await approval against the newest main, if it is time to."""
@@ -294,8 +298,7 @@ class Worker:
                 self._set_snapshot(commits.head)
                 return not commits.is_empty
             self._repository.refresh()
-            pause = random.uniform(0, _LONGEST_PAUSE_S)  # noqa: S311 - not for security
-            self._stopped_retrying.wait(pause)
+            self._stopped_retrying.wait(self._runtime.uniform(0, _LONGEST_PAUSE_S))
         return False  # other generators are faster, and they carry out the same changes
 
     def _new_commit_batch(self) -> CommitBatch:
@@ -307,9 +310,9 @@ class Worker:
         else:
             advance = self._ahead.advance(self._repository.objects, before, tip)
             commits = CommitBatch(self._repository, advance.snapshot)
-            commits.follow(advance, before, _now())
+            commits.follow(advance, before, self._runtime.now())
             self._log_problems(commits.head.problems)
-        self._override_expiry.end_due(commits, _now())
+        self._override_expiry.end_due(commits, self._runtime.now())
         return commits
 
     def _log_problems(self, problems: Iterable[Fault]) -> None:
@@ -344,7 +347,3 @@ class Worker:
 def _mark_maybe_published(batch: list[Ticket], start: Snapshot) -> None:
     for ticket in batch:
         ticket.mark_maybe_published(str(start.commit))
-
-
-def _now() -> datetime:
-    return datetime.now(timezone.utc)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from demandops.decision import decide
 from demandops.demand import decommission_goal
 from demandops.errors import Refused
 from demandops.ledger.ledger import ClaimChange
+from demandops.runtime import REAL
 from demandops.service import Generator
 from demandops.staterepo import reader
 from demandops.staterepo.history import authorship
@@ -103,7 +103,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(progress=report)
         try:
-            decision = decide(snapshot.state, goal, datetime.now(timezone.utc), repo.file_reader())
+            decision = decide(snapshot.state, goal, REAL.now(), repo.file_reader())
         except Refused as error:
             if _holds_nothing(error, goal["name"], snapshot):
                 raise _NothingHeld from None

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from demandops.cli.output import (
 )
 from demandops.decision import Decision, admit, decide, form_faults
 from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
+from demandops.runtime import REAL
 from demandops.service import Generator, Receipt
 from demandops.service.approvals.proposal import parse_waiting_text
 from demandops.staterepo import reader
@@ -225,7 +225,7 @@ def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[d
 
         for index, document in enumerate(documents):
             try:
-                decision = decide(state, document.goal, datetime.now(timezone.utc), read)
+                decision = decide(state, document.goal, REAL.now(), read)
             except InvalidInput as error:
                 rows.append(_refused(index, document, error))
                 continue

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timezone
 from typing import Any
 
 import click
@@ -18,6 +17,7 @@ from demandops.cli.output import (
 )
 from demandops.config.override import ImagePin, format_time
 from demandops.plan.views.override_report import Entry, override_report
+from demandops.runtime import REAL
 from demandops.staterepo import reader
 
 
@@ -34,7 +34,7 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(at, report)
     state = snapshot.state
-    entries = override_report(state, datetime.now(timezone.utc))
+    entries = override_report(state, REAL.now())
     if output == "json":
         print_json([_row(entry) for entry in entries])
         return

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from demandops.cluster import access
 from demandops.cluster.health import Health, ObjectSelector, Target, health_reader
 from demandops.cluster.object_cache import ObjectCache
 from demandops.plan.release import Release, ServiceRelease
+from demandops.runtime import REAL
 from demandops.service import rollout_targets
 from demandops.staterepo import reader
 from demandops.staterepo.load.problem_report import Problem
@@ -95,8 +96,12 @@ def _read(
         for name, cluster in clusters.items()
         if cluster.kubeconfig and name in wanted
     }
-    with ThreadPoolExecutor(max(len(stores), 1)) as pool:
-        list(pool.map(lambda store: store.read_once(wanted[store.name]), stores.values()))
+    threads = [
+        REAL.start_thread(f"read-{name}", partial(store.read_once, wanted[name]))
+        for name, store in stores.items()
+    ]
+    for thread in threads:
+        thread.join()
     return stores
 
 

@@ -8,11 +8,9 @@ there. Until then its branch is kept up to date: merging it must give what main 
 from __future__ import annotations
 
 import logging
-import time
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import TypeAlias
 
@@ -88,11 +86,11 @@ class Approvals:
         token_file: Path | None,
     ) -> None:
         """Find the proposals of an earlier run again; ``state`` is main's."""
-        self._repository = repository
+        self._repository, self._runtime = repository, repository.runtime
         self._demands = demands
         self._with_targets = with_targets
         self._branches = ProposalBranches(repository)
-        self._forge = ForgeWorker(token_file, self._on_forge_update)
+        self._forge = ForgeWorker(token_file, self._on_forge_update, repository.runtime)
         self._interval = CHECK_EMBEDDED_S if repository.always_current else CHECK_REMOTE_S
         self._proposals: dict[Key, Proposal] = {}
         self._changed: deque[str] = deque()
@@ -189,13 +187,13 @@ class Approvals:
             self._changed or any(ticket.state == "withdrawn" for ticket in tickets)
         ):
             return True
-        return time.monotonic() >= self._due_time(tip)
+        return self._runtime.monotonic() >= self._due_time(tip)
 
     def seconds_until_due(self, tip: str, longest: float) -> float:
         """Return the seconds until the next check; ``longest`` without proposals."""
         if not self._proposals:
             return longest
-        return min(longest, max(self._due_time(tip) - time.monotonic(), 0.05))
+        return min(longest, max(self._due_time(tip) - self._runtime.monotonic(), 0.05))
 
     def _due_time(self, tip: str) -> float:
         has_moved = self._checked_at not in (tip, _UNFINISHED)
@@ -207,7 +205,7 @@ class Approvals:
         Raises:
             RemoteAway: if the remote cannot be reached.
         """
-        self._check_began = time.monotonic()
+        self._check_began = self._runtime.monotonic()
         self._next_check, self._checked_at = self._check_began + self._interval, _UNFINISHED
         return self._branches.heads()
 
@@ -240,7 +238,7 @@ class Approvals:
                     self._end(proposal, error)
             except PushDenied as error:
                 self._end(proposal, error)
-        ended = time.monotonic()
+        ended = self._runtime.monotonic()
         self._checked_at = str(snapshot.commit)
         self._rest_until = ended + _PAUSE_FACTOR * (ended - self._check_began)
 
@@ -335,7 +333,7 @@ class Approvals:
         if head and self._branches.is_up_to_date(tip, head, old.base, files):
             return True
         demands = [(ticket.operation, ticket.received, step) for ticket, step in steps]
-        commit = self._branches.commit(proposal.branch, snapshot, demands, _now())
+        commit = self._branches.commit(proposal.branch, snapshot, demands, self._runtime.now())
         commits = (head, str(commit)) if head else (str(commit),)
         record = replace(old, commits=commits, base=str(tip))
         if not self._journal(proposal, record):
@@ -394,7 +392,3 @@ def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None
     return admit_or_none(state, ticket.goal)
-
-
-def _now() -> datetime:
-    return datetime.now(timezone.utc)

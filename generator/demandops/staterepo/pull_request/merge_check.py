@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
+from datetime import datetime
 from pathlib import Path
 
 from demandops import strict_yaml
@@ -29,6 +29,7 @@ from demandops.plan.views.override_report import override_report, warnings
 from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview
 from demandops.render.changes.override_suggestion import Suggestion
+from demandops.runtime import REAL
 from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.load import ledger_files
@@ -69,7 +70,7 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
-    edit = _Edit(files, start, now or datetime.now(timezone.utc))
+    edit = _Edit(files, start, now or REAL.now())
     claims = ledger_files.read(sorted(files.items()))
     faults += claims.faults
     result = CheckResult((), base=start.commit if start else None)

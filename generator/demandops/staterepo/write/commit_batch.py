@@ -7,7 +7,6 @@ evaluated again on the new tip.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -256,7 +255,7 @@ class CommitBatch:
                 # object while it is read
                 if attempt == _ATTEMPTS:
                     raise
-                time.sleep(_PAUSE_S * attempt)
+                self._repository.runtime.sleep(_PAUSE_S * attempt)
         return made
 
     def publish(self) -> bool:
