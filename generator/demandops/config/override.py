@@ -131,7 +131,7 @@ class Selector(FrozenModel):
         others = [name for name in ("applications", "appdefs", "services") if getattr(self, name)]
         if self.connections and others:
             raise ValueError(
-                f"connections and {others[0]} never match the same thing; write two selectors"
+                f"nothing matches both connections and {others[0]}; write two selectors"
             )
         return self
 

@@ -94,8 +94,8 @@ def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
         return
     yield fault(
         "lease",
-        f"is {lease_s} s, above leases.longest of access domain '{domain.name}', {longest}; "
-        "request that, and renew",
+        f"is {lease_s} s, but leases.longest of access domain '{domain.name}' is {longest}; "
+        "request a shorter lease, and renew it",
         code="not-allowed",
     )
 

@@ -61,7 +61,7 @@ def _of_connection(one: Demanded, demanded: Connection, ledger: Ledger) -> Itera
             yield one.fault(
                 name,
                 f"'{new}' contradicts an existing claim: {held} with {name} '{current}'; use "
-                "the same, or another connection id",
+                f"the same {name}, or another connection id",
                 code="conflict",
             )
             return

@@ -30,7 +30,7 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
         faults += conflicts(one, others)
         key = ClaimKey(one.held.subject, demand)
         if ledger.get(key) is not None:
-            message = f"'{key.subject.id}' is listed twice; list it once, with all it takes"
+            message = f"'{key.subject.id}' is listed twice; list it once, with all its topics"
             faults.append(one.fault("id", message))
         ledger = book(ledger, one, request.id, key, start.get(key), now)
         keys.append(key)

@@ -54,7 +54,7 @@ class CheckResult:
 
 
 def check(folder: Path, base: str | None = None, now: datetime | None = None) -> CheckResult:
-    """Check the files of a folder, render them, and preview what merging would do.
+    """Check the files of a folder, render them, and preview the effect of a merge.
 
     Args:
         folder: a checked-out state repo, or its files without Git.
