@@ -112,7 +112,7 @@ class DemandClient:
         self._spinner.start()
 
     def __enter__(self) -> DemandClient:
-        """Return itself."""
+        """Return the client itself."""
         return self
 
     def __exit__(self, *reason: object) -> None:
@@ -137,7 +137,7 @@ class DemandClient:
         request: str = "",
         on_stage: StageListener = lambda stage, text: None,
     ) -> Answer:
-        """Set what a demand consists of, and return once that is published.
+        """Replace the content of a demand; return when that is published.
 
         Args:
             demand: the demand's id.

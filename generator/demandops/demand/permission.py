@@ -60,7 +60,7 @@ def _service_nodes(app: Application, config: Config) -> Iterable[str]:
 
 
 def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
-    """Yield a fault for each requester without a rule of the domain that grants the access."""
+    """Yield a fault for each requester to whom no rule of the domain grants the access."""
     for index, requester in enumerate(one.requesters if domain.rules else ()):
         own = [rule for rule in domain.rules if matches(requester, rule.requesters)]
         misses = [first_uncovered(rule, access) for rule in own]

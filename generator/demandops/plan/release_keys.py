@@ -29,8 +29,8 @@ def keys_of(
 ) -> Iterator[ReleaseKey]:
     """Yield the keys of the releases that the claims on ``subject`` need, except suspended claims.
 
-    If an application's definition is missing, yield none, or refuse if ``strict``: what runs must
-    not stop because a file that it needs was deleted.
+    If an application's definition is missing, yield none. If ``strict``, refuse instead: a deleted
+    file must not stop what runs.
     """
     ledger = without_suspended(ledger, config)
     yield from keys_of_claims(ledger, config, ledger.claims_on(subject), strict=strict)
@@ -103,7 +103,8 @@ def affected_keys(
 ) -> tuple[ReleaseKey, ...]:
     """Return the key of every release that these changes of claims may add, change or remove.
 
-    The cost follows the topics that differ, unless a change moves or redefines an application.
+    The cost grows with the number of changed topics. If a change moves or redefines an application,
+    it grows with all topics of the application.
 
     Raises:
         Refused: if an application definition that ``after`` needs is missing.

@@ -1,4 +1,4 @@
-"""Why a demand contradicts existing claims on the same application or connection."""
+"""Contradictions between a demand and existing claims on the same application or connection."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def _service_traits(one: Demanded, after: Ledger, config: Config) -> Iterator[Tr
 
 
 def _denied_field(override: Override, one: Demanded, services: list[Traits], config: Config) -> str:
-    """Return the field that makes an override deny what is demanded, or an empty text."""
+    """Return the field of a demand that an override denies, or an empty text."""
     for selector in override.select:
         for traits in services if selector.services else [traits_of(one)]:
             if fits(selector, traits, config):

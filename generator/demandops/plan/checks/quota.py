@@ -1,4 +1,4 @@
-"""Quotas: what a booking must not exceed in an access domain."""
+"""Quotas: the limits of an access domain that a booking must not exceed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the ledger needs when overrides change or end: kept claims, and markers of ended overrides.
+"""Changes to the ledger when overrides change or end: kept claims, markers of ended overrides.
 
 An override whose end had passed when it was merged never applies. The generator ends an override
 that was in effect with a commit of its own.
@@ -25,11 +25,11 @@ class LedgerAndConfig(Protocol):
 
     @property
     def ledger(self) -> Ledger:
-        """What is booked."""
+        """The claims."""
 
     @property
     def config(self) -> Config:
-        """What people wrote."""
+        """The files that people write."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,7 +57,7 @@ class Verdict:
 
 
 class _Proof:
-    """A commit that was rendered again, and what the proof of the next one reuses."""
+    """A commit that was rendered again; the proof of the next commit reuses its results."""
 
     def __init__(self, state: State, commit: Commit) -> None:
         """Render a commit whole."""
@@ -77,7 +77,7 @@ class _Proof:
         return trees.differ(self._commit.tree, commit.tree, roots)
 
     def advance(self, commit: Commit) -> None:
-        """Render what a later commit changed in the ledger, and record which files it changed.
+        """Render the releases that a later commit affects, and record the files that it changed.
 
         Raises:
             _Unreadable: a claim file is not valid.
@@ -101,7 +101,7 @@ class _Proof:
         self._render(changes)
 
     def _render(self, changes: Sequence[ClaimChange]) -> None:
-        """Plan and render what the changes affect, and what overrides hold."""
+        """Plan and render the releases that changes affect, and those that overrides hold."""
         for key, release in self._plan.advance(self.state.ledger, changes).items():
             self._planned.pop(key, None)
             self._held.pop(key, None)
@@ -118,7 +118,7 @@ class _Proof:
         return path, _blob(release_file.release_text(release, state.config, state.engine, current))
 
     def differing(self) -> tuple[str, ...]:
-        """Return the files that differ from what was rendered."""
+        """Return the committed files that differ from the rendered ones."""
         wanted = self._undemanded | dict(self._planned.values())
         before = trees.parent_tree(self._commit)
         if before is not None and _holds(self.state.config):
@@ -172,7 +172,7 @@ class _Proofs:
         self._proof: _Proof | None = None
 
     def differing(self, commit: Commit, entry: LogEntry, *, whole: bool) -> tuple[str, ...]:
-        """Return the files of a commit that differ from what was rendered.
+        """Return the files of a commit that differ from the rendered ones.
 
         Args:
             whole: do not reuse results of another commit.

@@ -1,1 +1,1 @@
-"""Loading a commit: configuration, ledger, and what stays in effect while a file is invalid."""
+"""Loading a commit: its configuration and ledger, and last valid versions of invalid files."""

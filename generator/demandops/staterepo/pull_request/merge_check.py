@@ -1,4 +1,4 @@
-"""Whether an edit of a checked-out state repo can be merged, and what merging would do.
+"""The check of a pull request: whether an edit can be merged, and the effect of the merge.
 
 All files must be valid and render, generated files must not have manual edits, and a changed chart
 must have a new version, because Flux and Argo CD compare only versions. The edit is compared with
