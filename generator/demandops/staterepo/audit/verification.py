@@ -3,7 +3,7 @@
 A commit is proven whole (everything is loaded and rendered) or by its differences from the commit
 proven before it. The second way relies on object ids, and on plans and files that depend on their
 input only. It does not trust which releases the generator considered affected: it plans and renders
-every release again if any input of its plan changed (:mod:`demandops.plan.incremental_plan`), and
+every release again if any input of its plan changed (:mod:`demandops.plan.traced_plan`), and
 compares every file that differs in Git. The first and the last commit are proven whole.
 """
 
@@ -20,9 +20,9 @@ from demandops.decision import State, rendered_files
 from demandops.errors import InvalidInput
 from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import ClaimChange
-from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
+from demandops.plan.traced_plan import TracedPlan
 from demandops.render import release_file
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
@@ -62,7 +62,7 @@ class _Proof:
     def __init__(self, state: State, commit: Commit) -> None:
         """Render a commit whole."""
         self.state, self._commit = state, commit
-        self._plan = IncrementalPlan(state.config)
+        self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         self._held: dict[ReleaseKey, Release] = {}
         """Releases whose files an override holds: they depend on the parent commit."""
