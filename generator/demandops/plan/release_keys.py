@@ -1,4 +1,4 @@
-"""The keys of releases that follow from claims.
+"""The keys of the releases that claims need, and that a change of claims affects.
 
 :func:`affected_keys` names the releases that a change of claims may touch, so the cost of a demand
 does not grow with the number of others. :mod:`demandops.plan.planner` derives each release.
