@@ -84,7 +84,7 @@ def claims_needing(ledger: Ledger, config: Config, key: ServiceKey) -> tuple[Cla
 
 
 def _role(ledger: Ledger, config: Config, application: str, key: ServiceKey) -> str | None:
-    """Return the inputs that an application's service has an instance for each of.
+    """Return the role whose inputs have one instance each of an application's service.
 
     The text is empty if there is one instance for the application. ``None`` means that ``key`` is
     not a service of the application, for example because it moved or changed its definition.

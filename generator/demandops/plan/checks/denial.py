@@ -25,7 +25,7 @@ from demandops.plan.release_keys import keys_of_claims
 def faults(
     request: DemandRequest, after: Ledger, changes: Changes, config: Config
 ) -> Iterator[Fault]:
-    """Yield every new application and connection of a request that an override denies."""
+    """Yield a fault for each new application or connection that an override denies."""
     denying = [one for one in reversed(config.active_overrides) if one.deny]
     if not denying or not request.adds_claims:
         return

@@ -16,7 +16,7 @@ from demandops.subject import Subject, SubjectKind
 
 
 def faults(before: Ledger, after: Ledger, changes: Changes, config: Config) -> Iterator[Fault]:
-    """Yield every quota that ``changes`` exceed, unless the count does not grow."""
+    """Yield a fault for each quota that is exceeded and whose count ``changes`` raised."""
     booked = [change.after for change in changes.claims if change.after]
     holders = {(claim.held.home, who) for claim in booked for who in claim.requesters}
     domains = {

@@ -21,7 +21,7 @@ from demandops.subject import SubjectKind
 
 @dataclass(frozen=True, slots=True)
 class ServiceEntry:
-    """Who requests one service, and its inputs (role → sorted topics)."""
+    """One service: its requesters and its inputs (role → sorted topics)."""
 
     applications: tuple[str, ...]
     service: str
@@ -34,7 +34,7 @@ class ServiceEntry:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionEntry:
-    """Who requests one connection, and which source topics it carries."""
+    """One connection: its requesters and the source topics that it carries."""
 
     source: str
     target: str
@@ -67,7 +67,7 @@ class Bookkeeping:
 
 
 def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
-    """Return who requests what."""
+    """Return the requesters of each service and connection."""
     services = {}
     for key in all_keys(ledger, config):
         release = plan(ledger, config, key)

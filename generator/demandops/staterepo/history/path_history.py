@@ -31,7 +31,7 @@ class PathChange:
 
 @dataclass(frozen=True, slots=True)
 class PathHistory:
-    """When a path was added last, changed since, and removed.
+    """The commits that last added a path, changed it since, and removed it.
 
     ``newest`` are the commits that changed it since it was added, newest first; ``more`` is how
     many are left out. ``stopped`` is the commit that removed it, or None if it exists.

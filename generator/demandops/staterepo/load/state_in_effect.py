@@ -86,7 +86,7 @@ def state_at(
 def start_at(
     repo: Repository, commit: Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the newest state up to a commit that is known: recorded, or of an all valid commit.
+    """Return the newest known state up to a commit: a recorded one, or one without invalid files.
 
     Raises:
         InvalidInput, StateRepoError: there never was a valid state.
