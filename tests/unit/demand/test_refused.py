@@ -154,7 +154,7 @@ class TestContradictions:
     def test_another_node_for_a_claimed_application(self, books: MemoryRepo) -> None:
         assert books.faults(goal([application(node="cloud", who=["vehicle01"])])) == [
             f"apps[0].header.node_id: 'cloud' contradicts an existing claim: '{APP}'"
-            " is held by vehicle00 on 'edge'; ask for that node, or wait until it is released"
+            " is held by vehicle00 on 'edge'; request that node, or wait until it is released"
         ]
 
     def test_another_node_for_an_application_that_the_same_demand_claimed(
