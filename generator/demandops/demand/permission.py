@@ -69,7 +69,8 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
         if not own:
             rules = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
             message = (
-                f"no rule of access domain '{domain.name}' is for '{requester}'; its rules: {rules}"
+                f"no rule of access domain '{domain.name}' is for '{requester}', only {rules}; "
+                "have policy/ changed"
             )
         else:
             reasons = "; ".join(
@@ -77,7 +78,7 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
                 f"{kind} {' '.join(getattr(rule, kind))}, not '{value}'"
                 for rule, (kind, value) in zip(own, filter(None, misses), strict=True)
             )
-            message = f"{reasons}; ask for what is allowed, or have policy/ changed"
+            message = f"{reasons}; request what is allowed, or have policy/ changed"
         yield one.fault(f"requesters[{index}]", message, code="not-allowed")
 
 
