@@ -32,7 +32,7 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
             snapshot = repo.snapshot(at, report)
         for problem in repo.problems() if at is None else ():
             errors.print(f"warning: {problem}; its last valid version is in effect")
-    books, commit = derive(snapshot.state.ledger, snapshot.state.config), str(snapshot.commit)
+    books, commit = derive(snapshot.state), str(snapshot.commit)
     if output == "json":
         print_json(as_data(books, commit))
         return

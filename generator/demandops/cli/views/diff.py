@@ -43,7 +43,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
     with reader.opened(state_repo) as repo:
         old, new = (_loaded(repo, revision) for revision in (before, after))
         releases, others = _releases(repo, old, new)
-    sides = [bookkeeping(each.state.ledger, each.state.config) for each in (old, new)]
+    sides = [bookkeeping(each.state) for each in (old, new)]
     entries = bookkeeping_changes(*sides)
     if output == "json":
         was, now = map(asdict, sides)
@@ -83,8 +83,7 @@ def _releases(
     before, after = repo.file_reader(str(old.commit)), repo.file_reader(str(new.commit))
     differing = repo.changed_files(str(old.commit), str(new.commit), CLUSTERS_ROOT)
     files = {path: (before(path), after(path)) for path in differing}
-    sides = [(each.state.ledger, each.state.config) for each in (old, new)]
-    return compare(sides[0], sides[1], files)
+    return compare(old.state, new.state, files)
 
 
 def _row(release: ReleaseDifference) -> dict[str, Any]:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from demandops.config.config import Config
 from demandops.config.override import Override, format_time
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.plan.planner import denied_release, plan
@@ -28,19 +27,19 @@ class Entry:
     claims: tuple[str, ...]
 
 
-def override_report(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
+def override_report(world: World, now: datetime) -> list[Entry]:
     """Return every override, sorted by name, with what it does."""
-    releases = _releases(ledger, config)
-    claims = _claims(ledger, config)
+    releases = _releases(world)
+    claims = _claims(world)
     found = []
-    for name, override in sorted(config.overrides.items()):
+    for name, override in sorted(world.config.overrides.items()):
         entry = (
             tuple(sorted(releases.get(name, ()))),
             tuple(sorted(claims.get(name, ()))),
         )
         state: State = "in force" if any(entry) else "matches nothing"
         expired = override.end is not None and override.end <= now
-        if expired or override not in config.active_overrides:
+        if expired or override not in world.overrides:
             state, entry = "expired", ((), ())
         found.append(Entry(override, state, *entry))
     return found
@@ -60,26 +59,26 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
             yield override.path, "matches nothing now; if it should, correct select"
 
 
-def _releases(ledger: Ledger, config: Config) -> dict[str, set[str]]:
+def _releases(world: World) -> dict[str, set[str]]:
     """Return override → the releases that it changes or denies."""
     found: dict[str, set[str]] = {}
-    for key in all_keys(ledger, config):
-        release = plan(ledger, config, key)
+    for key in all_keys(world):
+        release = plan(world, key)
         if release is not None:
             for override, _ in release.shaping.by:
                 found.setdefault(override.name, set()).add(release.name)
             continue
-        stopped = denied_release(ledger, config, key)
+        stopped = denied_release(world, key)
         if stopped is not None:
             found.setdefault(stopped[1].name, set()).add(stopped[0].name)
     return found
 
 
-def _claims(ledger: Ledger, config: Config) -> dict[str, set[str]]:
+def _claims(world: World) -> dict[str, set[str]]:
     """Return override → the claims that it suspends or would keep."""
     found: dict[str, set[str]] = {}
-    for claim in ledger:
-        by = [suspended_by(claim, config), *kept_claims.keeping_overrides(claim, config)]
+    for claim in world.ledger:
+        by = [suspended_by(claim, world), *kept_claims.keeping_overrides(claim, world)]
         for override in by:
             if override is not None:
                 found.setdefault(override.name, set()).add(f"{claim.subject} of {claim.demand}")

@@ -10,9 +10,8 @@ import difflib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from demandops.config.config import Config
 from demandops.errors import Refused
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import all_keys
@@ -36,15 +35,15 @@ class ReleaseDifference:
 
 
 def compare(
-    before: tuple[Ledger, Config], after: tuple[Ledger, Config], files: Mapping[str, Sides]
+    before: World, after: World, files: Mapping[str, Sides]
 ) -> tuple[list[ReleaseDifference], list[str]]:
     """Return the releases that differ, and the differing files that are not of a release.
 
     Args:
-        before, after: the ledger and configuration of each commit.
+        before, after: the world of each commit.
         files: all generated files that differ.
     """
-    old, new = _by_name(*before), _by_name(*after)
+    old, new = _by_name(before), _by_name(after)
     by_release: dict[str, dict[str, Sides]] = {}
     others = []
     for path, sides in sorted(files.items()):
@@ -61,11 +60,11 @@ def compare(
     return differences, others
 
 
-def _by_name(ledger: Ledger, config: Config) -> dict[str, Release]:
+def _by_name(world: World) -> dict[str, Release]:
     releases = {}
-    for key in all_keys(ledger, config):
+    for key in all_keys(world):
         try:
-            release = plan(ledger, config, key)
+            release = plan(world, key)
         except Refused:  # a person's change that cannot be carried out
             continue
         if release is not None:
