@@ -91,7 +91,7 @@ def _too_slow(timeout: float) -> str:
 
 
 def _cause(error: httpx.TransportError) -> str:
-    """Return why there is no answer, without what was sent."""
+    """Return why there is no answer; the text holds nothing that was sent."""
     if type(error).__name__ in ("LocalProtocolError", "UnsupportedProtocol"):
         return "the URL or a header is not valid; check them"
     text = str(error) or type(error).__name__

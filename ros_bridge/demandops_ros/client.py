@@ -111,7 +111,7 @@ class DemandClient:
         self._spinner = REAL.start_thread("client", self._executor.spin)
 
     def __enter__(self) -> DemandClient:
-        """Return itself."""
+        """Return the client itself."""
         return self
 
     def __exit__(self, *reason: object) -> None:
@@ -136,7 +136,7 @@ class DemandClient:
         request: str = "",
         on_stage: StageListener = lambda stage, text: None,
     ) -> Answer:
-        """Set what a demand consists of, and return once that is published.
+        """Replace the content of a demand; return when that is published.
 
         Args:
             demand: the demand's id.

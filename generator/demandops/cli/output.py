@@ -104,7 +104,7 @@ output_option = click.option(
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Yield a function that shows progress on a terminal, unless the work is short."""
+    """Yield a function that shows a progress bar, on a terminal and if the work takes long."""
     start = REAL.monotonic()
     bar: Bar | None = None
     task: Any = None

@@ -230,7 +230,7 @@ class Reader:
         return {path: blob is not None for path, blob in changed}
 
     def changes_node(self, commit: str, node: str) -> bool:
-        """Return whether a commit changed what runs on a node, or a claim that names it."""
+        """Return whether a commit changed a release on a node, or a claim that names the node."""
         return ledger_files.changes_node(self._objects, commit, node)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:

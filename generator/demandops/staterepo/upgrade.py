@@ -51,7 +51,7 @@ class UpgradeRequest:
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """What an upgrade changes: no files if nothing changed. ``commit`` is the newest commit."""
+    """The files that an upgrade changes, none if nothing changed; ``commit`` is the newest."""
 
     commit: str
     old: Config
@@ -60,7 +60,7 @@ class Upgrade:
 
     @property
     def handover(self) -> SwitchSteps:
-        """What to do on the clusters before and after."""
+        """The steps on the clusters before and after."""
         return switch_steps(self.old, self.new)
 
 

@@ -68,8 +68,8 @@ def request(
 
     FILE contains goals of the action DeploymentRequest as YAML, as for `ros2 action send_goal`, or
     documents of the kind Demand (docs/demand.md). Write - for standard input. Nothing is booked
-    unless all documents parse. They are then booked in order; the next one is booked even if one
-    is refused.
+    unless all documents parse. They are then booked in order; if one is refused, the
+    others are still booked.
     """
     documents = [document for file in files for document in _documents(file)]
     if not documents:

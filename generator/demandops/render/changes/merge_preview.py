@@ -1,4 +1,4 @@
-"""What a change of the configuration or the ledger would do to all releases and files. Pure.
+"""The effect of a changed configuration or ledger on all releases and files. Pure.
 
 A demand's changeset covers only the releases that the demand touches. A change of the configuration
 may affect any release, so this compares all of them.

@@ -71,7 +71,7 @@ class RemoteRepository(StateRepository):
         except RemoteAway as error:
             if not allow_offline:
                 raise
-            log.warning("%s; continuing with what was fetched last", error)
+            log.warning("%s; continuing with the commits of the last fetch", error)
 
     def _is_usable(self) -> bool:
         """Return whether an earlier run left a complete clone."""

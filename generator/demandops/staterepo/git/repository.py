@@ -49,7 +49,7 @@ class StateRepository(ABC):
     always_current: bool
     """Whether :meth:`tip` is never out of date (a repository on this disk)."""
     main_reference = MAIN
-    """The branch, or what was last fetched of it."""
+    """The branch, or its remote-tracking branch of the last fetch."""
 
     def tip(self) -> Oid:
         """Return the newest published commit that is known here; does not ask the remote.

@@ -1,4 +1,4 @@
-"""Whether an edit of a checked-out state repo can be merged, and what merging would do.
+"""The check of a pull request: whether an edit can be merged, and the effect of the merge.
 
 All files must be valid and render, generated files must not have manual edits, and a changed chart
 must have a new version, because Flux and Argo CD compare only versions. The edit is compared with
@@ -56,7 +56,7 @@ class CheckResult:
 
 
 def check(folder: Path, base: str | None = None, now: datetime | None = None) -> CheckResult:
-    """Check the files of a folder, render them, and preview what merging would do.
+    """Check the files of a folder, render them, and preview the effect of a merge.
 
     Args:
         folder: a checked-out state repo, or its files without Git.

@@ -50,7 +50,7 @@ _PAUSE_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class _Followed:
-    """What follows from people's changes: the state in effect, the files, the kept claims."""
+    """The effect of people's changes: the state in effect, the files and the kept claims."""
 
     snapshot: Snapshot
     change: Changeset
@@ -121,7 +121,7 @@ class CommitBatch:
         self._settled.append((f"{outcome}-Operation-Id", operation))
 
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
-        """Render what people changed and commit the files that differ, if any.
+        """Apply people's changes: render, and commit the files that differ, if any.
 
         What cannot be planned or rendered (a claim's node was removed from the inventory) stays
         as it was and is listed in the head's problems.
@@ -155,7 +155,7 @@ class CommitBatch:
         self.commit_files(files, followed.snapshot.state, text, author, now)
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Return what follows, with the old configuration if the new one cannot be planned."""
+        """Return the effect, with the old configuration if the new one cannot be planned."""
         judgement = quarantine.judge(self._objects, advance, before, self._tree)
         accepted = judgement.with_new_config()
         if advance.config_changed:
@@ -194,7 +194,7 @@ class CommitBatch:
         return {} if wanted == current else {problem_report.PATH: wanted}
 
     def end_override(self, override: Override, now: datetime) -> None:
-        """Commit the end of an expired override, and what it changes.
+        """Commit the end of an expired override, with its effect on claims and releases.
 
         Raises:
             Refused, InvalidInput: the state without the override cannot be planned or rendered.
