@@ -10,7 +10,8 @@ from typing import Any
 
 import click
 from demandops import strict_yaml
-from demandops.cli.output import console, errors, output_option, print_json
+from demandops.cli.json_output import output_option, print_json
+from demandops.cli.output import console, errors
 from demandops.errors import InvalidInput, fault
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 
@@ -93,6 +94,7 @@ def _print_answer(answer: Answer, output: str) -> None:
                 "commit": answer.commit,
                 "reached": answer.reached,
                 "lease": answer.lease_s or None,
+                "faults": [],
                 "warnings": list(answer.warnings),
             }
         )

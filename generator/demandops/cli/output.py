@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -34,10 +33,15 @@ def _console(stderr: bool) -> Console:
     return Console(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
-SIGNS = {"start": "+", "change": "~", "stop": "-"}
-"""The mark of a release, by its change."""
-
-REV_HELP = "A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h"
+SIGNS = {
+    "start": "+",
+    "change": "~",
+    "stop": "-",
+    "added": "+",
+    "changed": "~",
+    "removed": "-",
+}
+"""The mark of a release or an entry, by its change."""
 
 
 class _Errors:
@@ -63,12 +67,12 @@ def console() -> Console:
 def warn_of(problems: Iterable[object]) -> None:
     """Warn about invalid files whose last valid version is in effect."""
     for problem in problems:
-        errors.print(f"warning: {problem} (its last valid version is in effect)")
+        errors.print(f"warning: {problem}; its last valid version is in effect")
 
 
-def print_json(data: object) -> None:
-    """Print ``data`` as JSON."""
-    click.echo(json.dumps(data, indent=2, ensure_ascii=False))
+def printable(text: str) -> str:
+    """Return text without characters that would control a terminal or a page."""
+    return "".join(char if char.isprintable() or char in "\n\t" else "�" for char in text)
 
 
 state_repo_option = click.option(
@@ -91,13 +95,12 @@ signing_option = click.option(
     "key of a key in an SSH agent; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
 )
 
-output_option = click.option(
-    "--output",
-    "output",
-    type=click.Choice(["text", "json"]),
-    default="text",
-    show_default=True,
-    help="The output format.",
+at_option = click.option(
+    "--at",
+    "at",
+    metavar="REV|TIME",
+    help="A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h; default: "
+    "the newest commit.",
 )
 
 

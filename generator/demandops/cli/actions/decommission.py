@@ -9,20 +9,13 @@ from typing import Any
 
 import click
 
-from demandops.cli.actions.request import show_releases
-from demandops.cli.output import (
-    console,
-    output_option,
-    print_json,
-    progress,
-    signing_option,
-    state_repo_option,
-)
+from demandops.cli.actions.ledger_change import show_consequences, started_generator
+from demandops.cli.json_output import claim_data, output_option, print_json
+from demandops.cli.output import console, progress, signing_option, state_repo_option
 from demandops.decision import decide
 from demandops.demand import decommission_goal
 from demandops.errors import Refused
 from demandops.ledger.ledger import ClaimChange
-from demandops.service import Generator
 from demandops.staterepo import reader
 from demandops.staterepo.history import authorship
 from demandops.staterepo.load.snapshot import Snapshot
@@ -84,19 +77,14 @@ def _holds_nothing(error: Refused, name: str, snapshot: Snapshot) -> bool:
 def _decommission(
     goal: dict[str, Any], state_repo: str, signing_key: Path | None
 ) -> dict[str, Any]:
-    with progress("reading the ledger") as report:
-        generator = Generator(
-            state_repo, start_offline=False, signing_key=signing_key, progress=report
-        )
-    try:
-        receipt = generator.submit(goal).future.result()
-        return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)
-    except Refused as error:
-        if _holds_nothing(error, goal["name"], generator.snapshot):
-            raise _NothingHeld from None
-        raise
-    finally:
-        generator.close(timeout=0)
+    with started_generator(state_repo, signing_key) as generator:
+        try:
+            receipt = generator.submit(goal).future.result()
+        except Refused as error:
+            if _holds_nothing(error, goal["name"], generator.snapshot):
+                raise _NothingHeld from None
+            raise
+    return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)
 
 
 def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any]:
@@ -109,7 +97,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
                 raise _NothingHeld from None
             raise
     if output == "text":
-        show_releases(decision)
+        show_consequences(decision)
     return _row(goal["name"], decision.outcome, None, decision.changes.claims)
 
 
@@ -121,14 +109,10 @@ def _row(
         "outcome": outcome,
         "commit": commit,
         "claims": [
-            {
-                "kind": change.key.subject.kind.value[:-1],
-                "id": change.key.subject.id,
-                "demand": change.key.demand,
-                "requesters": list(change.before.requesters) if change.before else [],
-                "left": list(change.after.requesters) if change.after else None,
-            }
+            claim_data(change.before)
+            | {"left": list(change.after.requesters) if change.after else None}
             for change in changes
+            if change.before
         ],
     }
 
@@ -140,7 +124,8 @@ def _print(row: dict[str, Any], dry_run: bool) -> None:
         return
     would = "would be " if dry_run else ""
     for claim in row["claims"]:
-        text = f"{claim['kind']} '{claim['id']}' for {', '.join(claim['requesters'])}"
+        subject = claim["subject"]
+        text = f"{subject['kind']} '{subject['id']}' for {', '.join(claim['requesters'])}"
         if claim["left"] is None:
             out.print(f"{would}released: {text}")
         else:

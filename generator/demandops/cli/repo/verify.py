@@ -7,7 +7,9 @@ from typing import Any
 
 import click
 
-from demandops.cli.output import console, output_option, print_json, progress, state_repo_option
+from demandops.cli.json_output import fault_data, output_option, print_json
+from demandops.cli.output import console, progress, state_repo_option
+from demandops.errors import fault
 from demandops.staterepo import reader
 from demandops.staterepo.audit.verification import Verdict
 
@@ -45,7 +47,7 @@ def _row(verdict: Verdict) -> dict[str, Any]:
         "summary": verdict.summary,
         "holds": verdict.holds,
         "skipped": verdict.skipped or None,
-        "fault": verdict.fault or None,
+        "faults": [fault_data(fault("", verdict.fault))] if verdict.fault else [],
         "differing": list(verdict.differing),
         "touched": list(verdict.touched),
         "signed": verdict.signed,

@@ -11,7 +11,8 @@ from typing import Any
 import click
 from rich.table import Table
 
-from demandops.cli.output import console, output_option, print_json, state_repo_option
+from demandops.cli.json_output import commit_data, output_option, print_json
+from demandops.cli.output import console, state_repo_option
 from demandops.errors import StateRepoError
 from demandops.staterepo import reader
 from demandops.staterepo.history import revisions
@@ -107,7 +108,7 @@ def log(
         commits = _walked(repo, commit_range, given.pop("release"))
         entries = list(islice(_matching(repo, commits, _Filters(**given)), max_count))
     if output == "json":
-        print_json([_row(entry) for entry in entries])
+        print_json([commit_data(entry) for entry in entries])
         return
     if not entries:
         console().print("no commit matches")
@@ -167,20 +168,3 @@ def _table(entries: Iterable[LogEntry]) -> Table:
             entry.summary,
         )
     return table
-
-
-def _row(entry: LogEntry) -> dict[str, Any]:
-    return {
-        "commit": entry.commit,
-        "time": entry.time.isoformat(),
-        "author": entry.author,
-        "summary": entry.summary,
-        "operation": entry.first("Operation") or None,
-        "operation_id": entry.first("Operation-Id") or None,
-        "request_id": entry.first("Request-Id") or None,
-        "demand_ids": entry.trailers.get("Demand-Id", []),
-        "requesters": entry.trailers.get("Requester", []),
-        "applications": entry.trailers.get("Application", []),
-        "connections": entry.trailers.get("Connection", []),
-        "render_version": entry.first("Render-Version") or None,
-    }

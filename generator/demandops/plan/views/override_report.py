@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
@@ -9,10 +10,12 @@ from typing import Literal
 
 from demandops.config.config import Config
 from demandops.config.override import Override, format_time
+from demandops.demand.claim import Claim
 from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.plan.planner import denied_release, plan
+from demandops.plan.release import Release
 from demandops.plan.release_keys import all_keys
 
 State = Literal["in force", "expired", "matches nothing"]
@@ -24,8 +27,8 @@ class Entry:
 
     override: Override
     state: State
-    releases: tuple[str, ...]
-    claims: tuple[str, ...]
+    releases: tuple[Release, ...]
+    claims: tuple[Claim, ...]
 
 
 def override_report(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
@@ -34,15 +37,12 @@ def override_report(ledger: Ledger, config: Config, now: datetime) -> list[Entry
     claims = _claims(ledger, config)
     found = []
     for name, override in sorted(config.overrides.items()):
-        entry = (
-            tuple(sorted(releases.get(name, ()))),
-            tuple(sorted(claims.get(name, ()))),
-        )
-        state: State = "in force" if any(entry) else "matches nothing"
+        applied = sorted(releases[name], key=lambda one: one.name), claims[name]
+        state: State = "in force" if any(applied) else "matches nothing"
         expired = override.end is not None and override.end <= now
         if expired or override not in config.active_overrides:
-            state, entry = "expired", ((), ())
-        found.append(Entry(override, state, *entry))
+            state, applied = "expired", ([], [])
+        found.append(Entry(override, state, tuple(applied[0]), tuple(applied[1])))
     return found
 
 
@@ -60,27 +60,26 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
             yield override.path, "matches nothing now; if it should, correct select"
 
 
-def _releases(ledger: Ledger, config: Config) -> dict[str, set[str]]:
+def _releases(ledger: Ledger, config: Config) -> dict[str, list[Release]]:
     """Return override → the releases that it changes or denies."""
-    found: dict[str, set[str]] = {}
+    found = defaultdict[str, list[Release]](list)
     for key in all_keys(ledger, config):
         release = plan(ledger, config, key)
         if release is not None:
             for override, _ in release.shaping.by:
-                found.setdefault(override.name, set()).add(release.name)
+                found[override.name].append(release)
             continue
         stopped = denied_release(ledger, config, key)
         if stopped is not None:
-            found.setdefault(stopped[1].name, set()).add(stopped[0].name)
+            found[stopped[1].name].append(stopped[0])
     return found
 
 
-def _claims(ledger: Ledger, config: Config) -> dict[str, set[str]]:
+def _claims(ledger: Ledger, config: Config) -> dict[str, list[Claim]]:
     """Return override → the claims that it suspends or would keep."""
-    found: dict[str, set[str]] = {}
-    for claim in ledger:
+    found = defaultdict[str, list[Claim]](list)
+    for claim in sorted(ledger, key=lambda one: (str(one.subject), one.demand)):
         by = [suspended_by(claim, config), *kept_claims.keeping_overrides(claim, config)]
-        for override in by:
-            if override is not None:
-                found.setdefault(override.name, set()).add(f"{claim.subject} of {claim.demand}")
+        for name in {override.name for override in by if override is not None}:
+            found[name].append(claim)
     return found
