@@ -293,7 +293,7 @@ class TestRequest:
         told, text = demandops(*command, *where), demandops(*command, *where[:2])
         (fault,) = told.json()["faults"]
         assert (told.code, text.code, text.out) == (1, 1, "")
-        assert list(fault) == ["code", "file", "field", "message"]
+        assert list(fault) == ["code", "field", "message", "file"]
         assert told.err == text.err == f"error: {fault['message']}\n"
 
     def test_a_dry_run_shows_the_consequence_and_books_nothing(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from datetime import datetime
 from functools import wraps
 from typing import Any
@@ -69,12 +70,7 @@ def faults_of(error: DemandOpsError) -> list[Json]:
 
 def fault_data(each: Fault) -> Json:
     """Return a fault; ``file`` and ``field`` may be empty."""
-    return {
-        "code": each.code,
-        "file": each.file,
-        "field": each.field,
-        "message": each.message,
-    }
+    return asdict(each)
 
 
 def time_data(moment: datetime | None) -> str | None:
@@ -135,14 +131,7 @@ def release_change_data(release: ReleaseChange) -> Json:
 
 def entry_change_data(entry: EntryChange) -> Json:
     """Return an entry of the bookkeeping that is added, changed or removed."""
-    return {
-        "kind": entry.kind,
-        "name": entry.name,
-        "change": entry.change,
-        "requesters": list(entry.requesters),
-        "lost": list(entry.lost),
-        "gained": list(entry.gained),
-    }
+    return asdict(entry)
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:

@@ -24,7 +24,7 @@ _PATIENCE_S = 0.5
 Progress = Callable[[int, int], None]
 
 
-def _console(stderr: bool) -> Console:
+def console(stderr: bool = False) -> Console:
     """Return a console; if the stream is not a terminal, it is wide and has no colors."""
     from rich.console import Console  # noqa: PLC0415
 
@@ -57,11 +57,6 @@ def _visible(char: str) -> str:
 
 
 errors = _Errors()
-
-
-def console() -> Console:
-    """Return a console for the current standard output."""
-    return _console(stderr=False)
 
 
 def warn_of(problems: Iterable[object]) -> None:
@@ -118,7 +113,7 @@ def progress(title: str) -> Iterator[Progress]:
                 return
             from rich.progress import Progress as Bar  # noqa: PLC0415
 
-            bar = Bar(console=_console(stderr=True), transient=True)
+            bar = Bar(console=console(stderr=True), transient=True)
             task = bar.add_task(title, total=total)
             bar.start()
         bar.update(task, completed=done, total=total)

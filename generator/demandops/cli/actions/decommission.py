@@ -52,53 +52,43 @@ def decommission(
     goal = decommission_goal.as_data(
         name, (kinds,) if kinds else ("node", "requester"), str(authorship.operator())
     )
-    try:
-        if dry_run:
-            row = _dry_run(goal, state_repo, output)
-        else:
-            row = _decommission(goal, state_repo, signing_key)
-    except _NothingHeld:
-        row = _row(name, "unchanged", None, ())
+    done = _dry_run(goal, state_repo, output) if dry_run else _book(goal, state_repo, signing_key)
+    row = done or _row(name, "unchanged", None, ())
     if output == "json":
         print_json(row)
     else:
         _print(row, dry_run)
 
 
-class _NothingHeld(Exception):
-    """Raised when a known node holds no claims, which is not an error."""
-
-
-def _holds_nothing(error: Refused, name: str, snapshot: Snapshot) -> bool:
-    codes = {each.code for each in error.faults}
-    return codes == {"not-held"} and name in snapshot.state.config.nodes
-
-
-def _decommission(
-    goal: dict[str, Any], state_repo: str, signing_key: Path | None
-) -> dict[str, Any]:
+def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any] | None:
+    """Return what was released, or None if a known node holds nothing, which is not an error."""
     with started_generator(state_repo, signing_key) as generator:
         try:
             receipt = generator.submit(goal).future.result()
         except Refused as error:
-            if _holds_nothing(error, goal["name"], generator.snapshot):
-                raise _NothingHeld from None
-            raise
+            _require_nothing_held(error, goal["name"], generator.snapshot)
+            return None
     return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)
 
 
-def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any]:
+def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any] | None:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(progress=report)
         try:
             decision = decide(snapshot.state, goal, datetime.now(timezone.utc), repo.file_reader())
         except Refused as error:
-            if _holds_nothing(error, goal["name"], snapshot):
-                raise _NothingHeld from None
-            raise
+            _require_nothing_held(error, goal["name"], snapshot)
+            return None
     if output == "text":
         show_consequences(decision)
     return _row(goal["name"], decision.outcome, None, decision.changes.claims)
+
+
+def _require_nothing_held(error: Refused, name: str, snapshot: Snapshot) -> None:
+    """Raise the error unless it says that a known node holds nothing."""
+    codes = {each.code for each in error.faults}
+    if codes != {"not-held"} or name not in snapshot.state.config.nodes:
+        raise error
 
 
 def _row(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from itertools import islice
 from typing import Any
@@ -22,18 +21,12 @@ from demandops.staterepo.reader import Reader
 _BY_HAND = "by-hand"
 
 
-@dataclass(frozen=True, slots=True)
-class _Filters:
-    """What a commit must match. None matches every commit."""
-
-    requester: str | None
-    application: str | None
-    connection: str | None
-    node: str | None
-    demand: str | None
-    operation: str | None
-    since: datetime | None
-    until: datetime | None
+_TRAILERS = {
+    "requester": "Requester",
+    "application": "Application",
+    "connection": "Connection",
+    "demand": "Demand-Id",
+}
 
 
 class _Time(click.ParamType):  # type: ignore[type-arg]
@@ -106,7 +99,7 @@ def log(
     """
     with reader.opened(state_repo) as repo:
         commits = _walked(repo, commit_range, given.pop("release"))
-        entries = list(islice(_matching(repo, commits, _Filters(**given)), max_count))
+        entries = list(islice(_matching(repo, commits, **given), max_count))
     if output == "json":
         print_json([commit_data(entry) for entry in entries])
         return
@@ -130,26 +123,27 @@ def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iter
     return repo.commits_changing(path, commit_range)
 
 
-def _matching(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Iterable[LogEntry]:
-    trailers = {
-        "Requester": given.requester,
-        "Application": given.application,
-        "Connection": given.connection,
-        "Demand-Id": given.demand,
-    }
-    wanted = [(key, value) for key, value in trailers.items() if value is not None]
+def _matching(
+    repo: Reader,
+    entries: Iterable[LogEntry],
+    *,
+    node: str | None,
+    operation: str | None,
+    since: datetime | None,
+    until: datetime | None,
+    **trailers: str | None,
+) -> Iterable[LogEntry]:
+    """Return the commits that match all that is given; the trailers are those of ``_TRAILERS``."""
+    wanted = [(_TRAILERS[name], value) for name, value in trailers.items() if value is not None]
 
     def matches(entry: LogEntry) -> bool:
-        if any(value not in entry.trailers.get(key, ()) for key, value in wanted):
-            return False
-        operation = entry.first("Operation") or _BY_HAND
-        if given.operation is not None and operation != given.operation:
-            return False
-        if given.since is not None and entry.time < given.since:
-            return False
-        if given.until is not None and entry.time > given.until:
-            return False
-        return given.node is None or repo.changes_node(entry.commit, given.node)
+        return (
+            all(value in entry.trailers.get(key, ()) for key, value in wanted)
+            and operation in (None, entry.first("Operation") or _BY_HAND)
+            and (since is None or entry.time >= since)
+            and (until is None or entry.time <= until)
+            and (node is None or repo.changes_node(entry.commit, node))
+        )
 
     return filter(matches, entries)
 

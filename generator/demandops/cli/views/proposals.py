@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import click
@@ -74,16 +75,7 @@ def _forge(configured: Proposals) -> Forge | None:
 
 
 def _row(proposal: PendingProposal, forge: Forge | None) -> dict[str, Any]:
-    return {
-        "branch": proposal.branch,
-        "commit": proposal.commit,
-        "demands": list(proposal.demands),
-        "requesters": list(proposal.requesters),
-        "since": time_data(proposal.since),
-        "summary": proposal.summary,
-        "operations": list(proposal.operations),
-        "link": _link(proposal, forge),
-    }
+    return asdict(proposal) | {"since": time_data(proposal.since), "link": _link(proposal, forge)}
 
 
 def _link(proposal: PendingProposal, forge: Forge | None) -> str | None:

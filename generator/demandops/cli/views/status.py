@@ -18,7 +18,6 @@ from demandops.cluster.health import Health, ObjectSelector, Target, health_read
 from demandops.cluster.object_cache import ObjectCache
 from demandops.service import rollout_targets
 from demandops.staterepo import reader
-from demandops.staterepo.load.problem_report import Problem
 from demandops.staterepo.reader import Reader
 
 _SHORT = 10
@@ -56,26 +55,15 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
         faults = [{"code": "invalid", **asdict(problem)} for problem in problems]
         print_json({"commit": commit, "releases": rows, "faults": faults})
         return
-    _print_problems(problems)
+    if problems:
+        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        console().print(f"{count}; of each file the last valid version is in effect:")
+    for problem in problems:
+        console().print(f"  {problem}", soft_wrap=True)
     console().print(_table(rows))
     console().print(f"desired: {commit}")
     if not clusters:
         errors.print("the state of the clusters is unknown: give --clusters FILE")
-
-
-def _print_problems(problems: Iterable[Problem]) -> None:
-    """Print the problems that the generator reported in the state repo."""
-    lines = [f"  {problem}" for problem in problems]
-    if lines:
-        console().print(
-            f"{_counted(len(lines))}; of each file the last valid version is in effect:"
-        )
-    for line in lines:
-        console().print(line, soft_wrap=True)
-
-
-def _counted(number: int) -> str:
-    return f"{number} problem{'s' if number > 1 else ''}"
 
 
 def _read(
