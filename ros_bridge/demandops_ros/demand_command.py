@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
-from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -13,6 +11,7 @@ from demandops import strict_yaml
 from demandops.cli.json_output import output_option, print_json
 from demandops.cli.output import console, errors
 from demandops.errors import InvalidInput, fault
+from demandops.input_file import read_input
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 
 from demandops_ros.client import Answer, DemandClient, DemandError
@@ -67,12 +66,9 @@ def demand(
 
 
 def _read_document(file: str) -> dict[str, Any]:
-    name = "standard input" if file == "-" else file
+    name, text = read_input(file)
     try:
-        text = sys.stdin.read() if file == "-" else Path(file).read_text()
         data = strict_yaml.load(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput([fault("", f"cannot be read: {error}").within(name)]) from None
     except InvalidInput as error:
         raise InvalidInput(strict_yaml.faults_in(error, name)) from None
     if not isinstance(data, dict) or data.get("kind") != "Demand":

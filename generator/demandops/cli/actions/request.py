@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -14,10 +13,11 @@ import click
 
 from demandops import strict_yaml
 from demandops.cli.actions.ledger_change import fault_lines, show_consequences, started_generator
-from demandops.cli.json_output import fault_data, faults_of, output_option, print_json
+from demandops.cli.json_output import faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress, signing_option, state_repo_option
 from demandops.decision import admit, decide, form_faults
 from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
+from demandops.input_file import read_input
 from demandops.service import Generator, Receipt
 from demandops.service.approvals.proposal import parse_waiting_text
 from demandops.staterepo import reader
@@ -83,15 +83,7 @@ def request(
 
 
 def _documents(file: str) -> Iterable[_Document]:
-    name = "standard input" if file == "-" else file
-    try:
-        data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
-        text = data.decode("utf-8")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise InvalidInput([fault("", f"cannot be read: {reason}").within(name)]) from None
-    except UnicodeDecodeError:
-        raise InvalidInput([fault("", "is not UTF-8 text").within(name)]) from None
+    name, text = read_input(file)
     try:
         return [_Document(name, goal) for goal in strict_yaml.load_all(text) if goal is not None]
     except InvalidInput as error:
@@ -118,15 +110,14 @@ def _unbooked(
         state = repo.snapshot().state
     rows = []
     for index, (document, form) in enumerate(zip(documents, faulty, strict=True)):
-        faults = [fault("", "not booked because another request of this call does not parse")]
+        message = "not booked because another request of this call does not parse"
+        refusal = InvalidInput([fault("", message)])
         if form:
             try:
                 admit(state, document.goal)
             except InvalidInput as error:
-                faults = list(error.faults)
-        rows.append(
-            _row(index, document.request_id, "refused", faults=list(map(fault_data, faults)))
-        )
+                refusal = error
+        rows.append(_refused(index, document, refusal))
     return rows
 
 
@@ -146,10 +137,11 @@ def _book(
             except DemandOpsError as error:
                 rows.append(_refused(index, document, error))
                 continue
-            if isinstance(result, Receipt):
-                rows.append(_booked(index, result))
-            else:
+            if not isinstance(result, Receipt):
                 rows.append(_row(index, document.request_id, "proposed", proposal=result))
+                continue
+            told = {name: getattr(result, name) for name in ("commit", "warnings", "not_held")}
+            rows.append(_row(index, result.request_id, result.outcome, **told))
         return rows
 
 
@@ -179,17 +171,6 @@ def _submitted(
 
     generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
     return answer
-
-
-def _booked(index: int, receipt: Receipt) -> dict[str, Any]:
-    return _row(
-        index,
-        receipt.request_id,
-        receipt.outcome,
-        commit=receipt.commit,
-        warnings=list(receipt.warnings),
-        not_held=list(receipt.not_held),
-    )
 
 
 def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[dict[str, Any]]:

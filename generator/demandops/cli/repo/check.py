@@ -66,8 +66,11 @@ def check(directory: Path, base: str | None, output: str) -> None:
 
 def _data(checked: CheckResult) -> dict[str, Any]:
     found, entries = checked.preview, checked.bookkeeping
-    diffs, left = _bounded(found.files if found else (), _MOST_DIFF_LINES_JSON)
     files = found.files if found else ()
+    diffs, left = _bounded(files, _MOST_DIFF_LINES_JSON)
+    changes = [
+        {"file": each.path, "change": each.change, "diff": diffs.get(each.path)} for each in files
+    ]
     return {
         "faults": [fault_data(each) for each in checked.faults],
         "warnings": [fault_data(each) for each in checked.warnings],
@@ -84,12 +87,7 @@ def _data(checked: CheckResult) -> dict[str, Any]:
         "base": checked.base,
         "base_valid": checked.base_valid,
         "releases": [release_change_data(each) for each in found.releases] if found else None,
-        "files": [
-            {"file": each.path, "change": each.change, "diff": diffs.get(each.path)}
-            for each in files
-        ]
-        if found
-        else None,
+        "files": changes if found else None,
         "diff_lines_left_out": left,
         "bookkeeping": None if entries is None else [entry_change_data(each) for each in entries],
     }
