@@ -32,6 +32,7 @@ from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Changes, Ledger, changes_on
 from demandops.ledger.operations import restoration
 from demandops.ledger.operations.restoration import Restoration
+from demandops.ledger.world import World
 from demandops.plan import implied_connections
 from demandops.plan.checks import denial, quota
 from demandops.plan.connection_clients import is_bridged
@@ -62,17 +63,15 @@ Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 
 
 @dataclass(frozen=True, slots=True)
-class State:
-    """The configuration and the ledger at one commit."""
+class State(World):
+    """The world at one commit, with the engine of its configuration."""
 
-    config: Config
     engine: Engine
-    ledger: Ledger
 
     @classmethod
     def of(cls, config: Config, ledger: Ledger) -> State:
         """Return a state with a fresh engine for ``config``."""
-        return cls(config, Engine(config.files), ledger)
+        return cls(config, ledger, Engine(config.files))
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,15 +128,14 @@ def decide(
     """
     request = goal if isinstance(goal, DemandRequest) else admit(state, goal, throttle)
     if isinstance(request, Restoration):
-        faults = list(restoration.faults(request, state.ledger, state.config))
+        faults = list(restoration.faults(request, state))
         if faults:
             raise Refused(faults)
     on_stage("admitted")
     ledger, changes = _book(state, request, now)
-    keys = affected_keys(state.ledger, ledger, state.config, changes.claims)
-    rendered = changeset.build_changeset(
-        state.ledger, ledger, changes.claims, keys, (state.config, state.engine, read)
-    )
+    after = replace(state, ledger=ledger)
+    keys = affected_keys(state, after, changes.claims)
+    rendered = changeset.build_changeset(state, after, changes.claims, keys, state.engine, read)
     on_stage("booked")
     outcome: Outcome = "unchanged"
     if changes.claims:
@@ -145,15 +143,15 @@ def decide(
     return Decision(
         request=request,
         outcome=outcome,
-        state=replace(state, ledger=ledger),
+        state=after,
         changes=changes,
         files=rendered.files if changes.claims else {},
         releases=rendered.releases,
         warnings=(
-            *_missing_connections(request, ledger, state.config),
+            *_missing_connections(request, after),
             *_already_bridged(request, state.config),
             *rendered.blocked,
-            *denial.warnings(request, ledger, state.config),
+            *denial.warnings(request, after),
         ),
         approval=approval_rule.approval_reasons(
             request, ((c.before, c.after) for c in changes.claims), state.config
@@ -168,13 +166,14 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
     Raises:
         Refused: if existing claims, an override or a quota forbid it.
     """
-    subjects, config = request.subjects(), state.config
+    subjects = request.subjects()
     ledger, changes = apply(kept_claims.without_kept_claims(state.ledger, subjects), request, now)
-    refusals = list(denial.faults(request, ledger, changes, config))
-    refusals = refusals or list(quota.faults(state.ledger, ledger, changes, config))
+    after = replace(state, ledger=ledger)
+    refusals = list(denial.faults(request, after, changes))
+    refusals = refusals or list(quota.faults(state, after, changes))
     if refusals:
         raise Refused(refusals)
-    return kept_claims.with_kept_claims(state.ledger, ledger, changes, subjects, config, now)
+    return kept_claims.with_kept_claims(state.ledger, after, changes, subjects, now)
 
 
 def admit(
@@ -227,12 +226,9 @@ def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
     """Return the changes to rendered files that follow when a person changes claims."""
-    keys = affected_keys(
-        before, state.ledger, state.config, changes_on(before, state.ledger, subjects)
-    )
-    return changeset.build_changeset(
-        before, state.ledger, (), keys, (state.config, state.engine, read)
-    )
+    old = replace(state, ledger=before)
+    keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
+    return changeset.build_changeset(old, state, (), keys, state.engine, read)
 
 
 def rendered_files(
@@ -243,8 +239,7 @@ def rendered_files(
     Args:
         current: the current generated files; an override with ``hold`` keeps some of them.
     """
-    keys = all_keys(state.ledger, state.config)
-    return changeset.render_all(state.ledger, state.config, state.engine, keys, current)
+    return changeset.render_all(state, state.engine, all_keys(state), current)
 
 
 def _with_parents(field: str) -> Iterator[str]:
@@ -260,16 +255,16 @@ def _subject_of(field: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else ("", 0)
 
 
-def _missing_connections(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
+def _missing_connections(request: DemandRequest, world: World) -> Iterator[str]:
     """Yield a warning for each input that no connection brings to the application's node."""
     if not request.adds_claims:
         return
-    ledger = without_suspended(ledger, config)
+    ledger = without_suspended(world).ledger
     for one in request.demanded:
         app = one.held
         if not isinstance(app, Application):
             continue
-        for foreign in implied_connections.foreign_inputs(app, config):
+        for foreign in implied_connections.foreign_inputs(app, world.config):
             topic = foreign.topic
             if not ledger.is_carried_to(app.node, topic.topic):
                 yield (
@@ -306,4 +301,4 @@ def try_configuration(state: State) -> None:
     Raises:
         Refused, InvalidInput: with the template, the values or the override that does not work.
     """
-    trial_render.render_trial_demands(state.config, state.engine)
+    trial_render.render_trial_demands(state, state.engine)

@@ -26,7 +26,7 @@ def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # 
                 snapshot = repo.snapshot(request.at)
         else:
             snapshot = generator.snapshot
-        books = bookkeeping(snapshot.state.ledger, snapshot.state.config)
+        books = bookkeeping(snapshot.state)
     except DemandOpsError as error:
         response.ok, response.message = False, str(error)
         return response
@@ -73,7 +73,7 @@ class BookkeepingTopic:
             self._changed.clear()
             began = time.monotonic()
             snapshot = self._generator.snapshot
-            books = bookkeeping(snapshot.state.ledger, snapshot.state.config)
+            books = bookkeeping(snapshot.state)
             commit = str(snapshot.commit)
             text = json.dumps(as_data(books, commit), ensure_ascii=False)
             message = BookkeepingMessage(commit=commit, bookkeeping_json=text)

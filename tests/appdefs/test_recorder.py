@@ -18,6 +18,7 @@ from demandops.demand.demand_request import Demanded, Join, Place
 from demandops.errors import Refused
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import all_keys
@@ -283,8 +284,9 @@ class TestParameters:
 
     @staticmethod
     def planned(books: MemoryRepo, ledger: Ledger, service: str = "recorder") -> dict[str, object]:
-        for key in all_keys(ledger, books.config):
-            release = plan(ledger, books.config, key)
+        world = World(books.config, ledger)
+        for key in all_keys(world):
+            release = plan(world, key)
             if isinstance(release, ServiceRelease) and key.service == service:  # type: ignore[union-attr]
                 return dict(release.parameters)
         raise AssertionError(f"no {service} is planned")
@@ -376,7 +378,7 @@ class TestParameters:
         ledger = self.book(Ledger(), "a", rate=7, title="{{ x }}\n: 'y'", labels=["yes", "1e3"])
         from demandops.decision import State, rendered_files
 
-        files = rendered_files(State(books.config, books.state.engine, ledger))
+        files = rendered_files(State(books.config, ledger, books.state.engine))
         (text,) = (text for path, text in files.items() if "/rec-" in path)
         values = yaml.safe_load(text)["spec"]["values"]
         assert values["rate"] == 7

@@ -127,7 +127,7 @@ def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, fur
             request = admit(state, goal(edge_id(number), vehicle_id(number, place)))
             ledger, _ = apply(ledger, request, now)
     files |= {claim_file.path_of(claim.key): claim_file.text_of(claim) for claim in ledger}
-    files |= rendered_files(State(config, state.engine, ledger))
+    files |= rendered_files(State(config, ledger, state.engine))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
     tree = trees.write(repo, None, files)

@@ -55,7 +55,7 @@ def decided(on: State, goal: object) -> Any:
 
 def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> None:
     decision = decided(state(), demand())
-    books = as_data(bookkeeping(decision.state.ledger, decision.state.config), "")
+    books = as_data(bookkeeping(decision.state), "")
     assert {entry["service"] for entry in books["services"].values()} == {
         "object-detection",
         "object-fusion",

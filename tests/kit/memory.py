@@ -101,7 +101,7 @@ class MemoryRepo:
 
     def bookkeeping(self) -> dict[str, Any]:
         """Return the bookkeeping as plain data, with an empty commit."""
-        return as_data(bookkeeping(self.state.ledger, self.state.config), "")
+        return as_data(bookkeeping(self.state), "")
 
     def books(self) -> dict[str, Any]:
         """Return the services and connections of the bookkeeping."""

@@ -246,7 +246,7 @@ def branches(repo: Path) -> list[str]:
 
 def books(repo: Path, revision: str = "main") -> dict[str, Any]:
     state = snapshots.load(pygit2.Repository(str(repo)), revision).state
-    return as_data(bookkeeping(state.ledger, state.config), "")
+    return as_data(bookkeeping(state), "")
 
 
 def claims(repo: Path, needle: str = "") -> list[str]:

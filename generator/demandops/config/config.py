@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 
 from demandops.config.appdef import ApplicationDefinition, Service
 from demandops.config.inventory import Broker, Cluster, Node
-from demandops.config.override import OVERRIDES_ROOT, Override, by_rank, still_active
+from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import Chart, Image
 from demandops.config.repo_settings import RepoSettings
@@ -31,8 +30,7 @@ class Config:
     """What can run, where, and from which charts and images.
 
     ``files`` maps the paths of templates and chart schemas to their texts. ``overrides`` has every
-    override. ``ended_overrides`` maps the name of an ended override to the expiry that it had then.
-    ``active_overrides`` are the others, in the order in which they apply.
+    override; :class:`demandops.ledger.world.World` knows which of them have ended.
     """
 
     repo_settings: RepoSettings
@@ -46,24 +44,10 @@ class Config:
     domain_of: Mapping[str, AccessDomain]
     files: Mapping[str, str]
     overrides: Mapping[str, Override] = field(default_factory=dict)
-    ended_overrides: Mapping[str, str] = field(default_factory=dict)
-    active_overrides: tuple[Override, ...] = ()
-    denial_cache: dict[Hashable, Override | None] = field(
-        default_factory=dict, compare=False, repr=False
-    )
-    """The override that denies a claim, if any; ``suspended_claims`` fills it."""
-
-    def with_ended_overrides(self, ended: Mapping[str, str]) -> Config:
-        """Return the configuration with exactly these overrides ended."""
-        active_overrides = by_rank(still_active(self.overrides, ended))
-        ended = MappingProxyType(dict(ended))
-        return replace(
-            self, ended_overrides=ended, active_overrides=active_overrides, denial_cache={}
-        )
 
     def without_overrides(self) -> Config:
         """Return the configuration without any override."""
-        return replace(self, overrides={}, ended_overrides={}, active_overrides=(), denial_cache={})
+        return replace(self, overrides={})
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
         """Return a node and its access domain.

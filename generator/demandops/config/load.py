@@ -78,7 +78,7 @@ def load(files: Mapping[str, str]) -> Config:
         domain_of=_domains_of_nodes(reader, nodes, domains),
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
         overrides=_read_overrides(reader),
-    ).with_ended_overrides({})
+    )
     cross_check(config, reader)
     if reader.faults:
         raise InvalidInput(dict.fromkeys(reader.faults))

@@ -15,7 +15,7 @@ from demandops.connections.connection import Connection
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.demand.lease import LONGEST_S, Term
-from demandops.errors import Fault, fault
+from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import id_problem, topic_problem
 from demandops.subject import Subject
 
@@ -214,8 +214,8 @@ def _connection(place: Place, connection: Connection, claiming: bool) -> Iterato
         if claiming and same_place and route.source == route.target:
             yield fault(
                 place.at(f"topics[{index}].target"),
-                f"'{route.target}' would feed itself, because source and target are both "
-                f"'{connection.source}'; name another target node or topic",
+                f"{quoted(route.target)} would feed itself, because source and target are both "
+                f"{quoted(connection.source)}; name another target node or topic",
             )
 
 

@@ -5,7 +5,7 @@ A :class:`Ledger` never changes. A new one costs what a request touches, not wha
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from typing import TypeAlias
@@ -82,11 +82,13 @@ class Ledger:
 
     ``index`` maps each entry of :func:`index_entries` to the claims that have it.
     ``minutes`` are those in which a lease ends. They give the next end without a full scan.
+    ``ended`` maps the name of each override that ended to the expiry that it had then.
     """
 
     claims: HashTrieMap[Subject, SubjectClaims] = field(default_factory=HashTrieMap)
     index: Index = field(default_factory=HashTrieMap)
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
+    ended: Mapping[str, str] = field(default_factory=dict)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
@@ -232,7 +234,7 @@ class Ledger:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
             if entry[0] == _ENDS:
                 minutes = minutes.insert(entry[1])
-        return Ledger(claims, index, minutes)
+        return Ledger(claims, index, minutes, self.ended)
 
     def without(self, claims: Iterable[Claim]) -> Ledger:
         """Return the ledger without these claims."""

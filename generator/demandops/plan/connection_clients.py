@@ -15,6 +15,7 @@ from demandops.demand.claim import Claim
 from demandops.demand.connection_type_choice import route_faults
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 
 
 def client_keys(ledger: Ledger, connection: str) -> Iterator[ClientKey]:
@@ -24,26 +25,25 @@ def client_keys(ledger: Ledger, connection: str) -> Iterator[ClientKey]:
         yield from first.known_type.keys(connection, *first.nodes)
 
 
-def client_at(ledger: Ledger, config: Config, key: ClientKey) -> Client | None:
+def client_at(world: World, key: ClientKey) -> Client | None:
     """Return the client at a key, or ``None`` if it carries no topic.
 
     Raises:
         Refused: if claims contradict each other, or the configuration no longer has what they need.
     """
-    return key.type.client(key, _ClaimedConnections(ledger, config, key.type), config)
+    return key.type.client(key, _ClaimedConnections(world, key.type), world.config)
 
 
 @dataclass(frozen=True, slots=True)
 class _ClaimedConnections:
     """The connections that the ledger has of one type."""
 
-    ledger: Ledger
-    config: Config
+    world: World
     type: ConnectionType
 
     def at(self, node: str) -> Iterable[str]:
         """Return the connections that end at a node, sorted."""
-        return self.ledger.connections_at(self.type, node)
+        return self.world.ledger.connections_at(self.type, node)
 
     def get(self, id: str) -> Connection | None:
         """Return a connection, or ``None`` if it is not claimed with this type.
@@ -52,15 +52,15 @@ class _ClaimedConnections:
             Refused: if a person wrote a claim that its type cannot carry, or removed what it needs
                 from the inventory.
         """
-        first, claims = self.ledger.connection(id), self.ledger.connection_claims(id)
+        first, claims = self.world.ledger.connection(id), self.world.ledger.connection_claims(id)
         if first is None or first.type is not self.type:
             return None
         topics = tuple(
             route
             for route in connection_topics(claims)
-            if not is_bridged(route, *first.nodes, self.config)
+            if not is_bridged(route, *first.nodes, self.world.config)
         )
-        problems = list(route_faults(self.type, topics, first.nodes, self.config))
+        problems = list(route_faults(self.type, topics, first.nodes, self.world.config))
         if problems:
             raise Refused(
                 replace(one, field="connections", message=f"'{id}': {one.message}")

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias, TypeVar, cast
 
 from demandops.config.config import Config
 from demandops.ledger.ledger import ClaimChange, Ledger, index_entries
+from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, keys_of
@@ -27,7 +28,7 @@ _ALL: _Read = ("all",)
 
 
 class IncrementalPlan:
-    """The plan of one configuration for a sequence of ledgers."""
+    """The plan of one configuration for a sequence of ledgers with the same ended overrides."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -56,7 +57,7 @@ class IncrementalPlan:
                 self._keys[subject] = self._traced(
                     ledger,
                     subject,
-                    lambda seen, of=subject: tuple(keys_of(seen, self._config, of, strict=True)),  # type: ignore[misc]
+                    lambda seen, of=subject: tuple(keys_of(seen, of, strict=True)),  # type: ignore[misc]
                 )
         for subject in [unit for unit in stale if unit in self._keys]:
             if subject not in ledger.claims:
@@ -68,20 +69,20 @@ class IncrementalPlan:
             found[key] = self._traced(
                 ledger,
                 key,
-                lambda seen, of=key: plan(seen, self._config, of),  # type: ignore[misc]
+                lambda seen, of=key: plan(seen, of),  # type: ignore[misc]
             )
         self._planned = needed
         return found
 
-    def _traced(self, ledger: Ledger, unit: _Unit, work: Callable[[Ledger], T]) -> T:
+    def _traced(self, ledger: Ledger, unit: _Unit, work: Callable[[World], T]) -> T:
         reads: set[_Read] = set()
-        result = work(
-            Ledger(
-                cast(Any, _Recording(ledger.claims, reads)),
-                cast(Any, _Recording(ledger.index, reads)),
-                cast(Any, None),  # planning does not read when leases end
-            )
+        traced = Ledger(
+            cast(Any, _Recording(ledger.claims, reads)),
+            cast(Any, _Recording(ledger.index, reads)),
+            cast(Any, None),  # planning does not read when leases end
+            ledger.ended,
         )
+        result = work(World(self._config, traced))
         for read in reads:
             self._readers.setdefault(read, set()).add(unit)
         return result

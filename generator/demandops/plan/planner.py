@@ -16,7 +16,7 @@ from demandops.config.registry import ChartSource
 from demandops.demand.application import InputTopic
 from demandops.demand.claim import Claim
 from demandops.errors import Refused, fault
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan import connection_clients, parameters
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.suspended_claims import without_suspended
@@ -28,40 +28,38 @@ from demandops.plan.release_keys import (
 )
 
 
-def plan(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
+def plan(world: World, key: ReleaseKey) -> Release | None:
     """Return the release at ``key`` with the effects of overrides, or ``None`` if it must not run.
 
     Raises:
         Refused: if claims contradict each other in a parameter, or if the configuration no longer
             has what a claim names.
     """
-    ledger = without_suspended(ledger, config)
-    release = _unshaped(ledger, config, key)
-    return release_overrides.apply_overrides(release, ledger, config) if release else None
+    world = without_suspended(world)
+    release = _unshaped(world, key)
+    return release_overrides.apply_overrides(release, world) if release else None
 
 
-def denied_release(
-    ledger: Ledger, config: Config, key: ReleaseKey
-) -> tuple[Release, Override] | None:
+def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
     """Return the release at ``key`` and the override that denies it, or ``None``."""
-    ledger = without_suspended(ledger, config)
-    release = _unshaped(ledger, config, key)
-    by = release_overrides.service_denied_by(release, ledger, config) if release else None
+    world = without_suspended(world)
+    release = _unshaped(world, key)
+    by = release_overrides.service_denied_by(release, world) if release else None
     return (release, by) if release and by else None
 
 
-def _unshaped(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
+def _unshaped(world: World, key: ReleaseKey) -> Release | None:
     if isinstance(key, ServiceKey):
-        return _service(ledger, config, key)
-    return connection_clients.client_at(ledger, config, key)
+        return _service(world, key)
+    return connection_clients.client_at(world, key)
 
 
-def _service(ledger: Ledger, config: Config, key: ServiceKey) -> ServiceRelease | None:
-    claims = claims_needing(ledger, config, key)
+def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
+    config, claims = world.config, claims_needing(world, key)
     if not claims:
         return None
     users = tuple(dict.fromkeys(claim.subject.id for claim in claims))
-    first = ledger.application(users[0]) or claims[0].application
+    first = world.ledger.application(users[0]) or claims[0].application
     appdef = appdef_of(config, first.appdef)
     service = appdef.services[key.service]
     node, domain = config.node_and_domain(key.node)

@@ -16,6 +16,7 @@ from demandops.demand.application import Application
 from demandops.demand.claim import Claim
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import ClaimChange, Ledger
+from demandops.ledger.world import World
 from demandops.plan import connection_clients
 from demandops.plan.overrides.suspended_claims import without_suspended
 from demandops.plan.release import ServiceKey
@@ -24,41 +25,37 @@ from demandops.subject import Subject, SubjectKind
 ReleaseKey = ServiceKey | ClientKey
 
 
-def keys_of(
-    ledger: Ledger, config: Config, subject: Subject, *, strict: bool = False
-) -> Iterator[ReleaseKey]:
+def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
     """Yield the keys of the releases that the claims on ``subject`` need, except suspended claims.
 
     If an application's definition is missing, yield none, or refuse if ``strict``: what runs must
     not stop because a file that it needs was deleted.
     """
-    ledger = without_suspended(ledger, config)
-    yield from keys_of_claims(ledger, config, ledger.claims_on(subject), strict=strict)
+    world = without_suspended(world)
+    yield from keys_of_claims(world, world.ledger.claims_on(subject), strict=strict)
 
 
 def keys_of_claims(
-    ledger: Ledger, config: Config, claims: Iterable[Claim], *, strict: bool = False
+    world: World, claims: Iterable[Claim], *, strict: bool = False
 ) -> Iterator[ReleaseKey]:
     """Yield the keys of the releases that these claims of ``ledger`` need, each once."""
     keys = (
         key
         for claim in claims
         for key in (
-            _service_keys(ledger, config, claim, strict)
+            _service_keys(world, claim, strict)
             if claim.is_on_application
-            else connection_clients.client_keys(ledger, claim.subject.id)
+            else connection_clients.client_keys(world.ledger, claim.subject.id)
         )
     )
     yield from dict.fromkeys(keys)
 
 
-def _service_keys(
-    ledger: Ledger, config: Config, claim: Claim, strict: bool
-) -> Iterator[ServiceKey]:
+def _service_keys(world: World, claim: Claim, strict: bool) -> Iterator[ServiceKey]:
     app = claim.application
-    first = ledger.application(app.id) or app
-    known = strict or first.appdef in config.appdefs
-    appdef = appdef_of(config, first.appdef) if known else None
+    first = world.ledger.application(app.id) or app
+    known = strict or first.appdef in world.config.appdefs
+    appdef = appdef_of(world.config, first.appdef) if known else None
     for name, service in (appdef.services if appdef else {}).items():
         if service.each is None:
             yield ServiceKey(name, first.node, application=app.id)
@@ -68,14 +65,14 @@ def _service_keys(
             yield ServiceKey(name, node, source=topic.source, topic=topic.topic)
 
 
-def claims_needing(ledger: Ledger, config: Config, key: ServiceKey) -> tuple[Claim, ...]:
+def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
     """Return the claims that need a service instance, by application and demand."""
     if key.application is not None:
-        needed = _role(ledger, config, key.application, key) is not None
-        return ledger.application_claims(key.application) if needed else ()
+        needed = _role(world, key.application, key) is not None
+        return world.ledger.application_claims(key.application) if needed else ()
     source, topic = str(key.source), str(key.topic)
-    claims = ledger.claims_taking(source, topic)
-    roles = {name: _role(ledger, config, name, key) for name in {one.subject.id for one in claims}}
+    claims = world.ledger.claims_taking(source, topic)
+    roles = {name: _role(world, name, key) for name in {one.subject.id for one in claims}}
     return tuple(
         one
         for one in claims
@@ -83,14 +80,14 @@ def claims_needing(ledger: Ledger, config: Config, key: ServiceKey) -> tuple[Cla
     )
 
 
-def _role(ledger: Ledger, config: Config, application: str, key: ServiceKey) -> str | None:
+def _role(world: World, application: str, key: ServiceKey) -> str | None:
     """Return the inputs that an application's service has an instance for each of.
 
     The text is empty if there is one instance for the application. ``None`` means that ``key`` is
     not a service of the application, for example because it moved or changed its definition.
     """
-    first = ledger.application(application)
-    appdef = config.appdefs.get(first.appdef) if first else None
+    first = world.ledger.application(application)
+    appdef = world.config.appdefs.get(first.appdef) if first else None
     service = appdef.services.get(key.service) if appdef else None
     if first is None or service is None or (service.each is None) is (key.application is None):
         return None
@@ -99,7 +96,7 @@ def _role(ledger: Ledger, config: Config, application: str, key: ServiceKey) -> 
 
 
 def affected_keys(
-    before: Ledger, after: Ledger, config: Config, changes: Iterable[ClaimChange]
+    before: World, after: World, changes: Iterable[ClaimChange]
 ) -> tuple[ReleaseKey, ...]:
     """Return the key of every release that these changes of claims may add, change or remove.
 
@@ -108,19 +105,19 @@ def affected_keys(
     Raises:
         Refused: if an application definition that ``after`` needs is missing.
     """
-    before, after = without_suspended(before, config), without_suspended(after, config)
+    before, after = without_suspended(before), without_suspended(after)
     keys: dict[ReleaseKey, None] = {}
     for change in changes:
-        subject, claims = change.key.subject, _differing(change, config)
-        for ledger, claim in zip((before, after), claims, strict=True):
-            own = [claim] if claim and ledger.get(claim.key) else []
-            if not _decided_alike(before, after, subject):
-                own += ledger.claims_on(subject)
-            keys |= dict.fromkeys(keys_of_claims(ledger, config, own, strict=ledger is after))
+        subject, claims = change.key.subject, _differing(change)
+        for world, claim in zip((before, after), claims, strict=True):
+            own = [claim] if claim and world.ledger.get(claim.key) else []
+            if not _decided_alike(before.ledger, after.ledger, subject):
+                own += world.ledger.claims_on(subject)
+            keys |= dict.fromkeys(keys_of_claims(world, own, strict=world is after))
     return tuple(keys)
 
 
-def _differing(change: ClaimChange, config: Config) -> tuple[Claim | None, Claim | None]:
+def _differing(change: ClaimChange) -> tuple[Claim | None, Claim | None]:
     """Return a changed claim before and after; if only inputs differ, with these inputs alone."""
     before, after = change.before, change.after
     if before is None or after is None or not before.is_on_application:
@@ -151,14 +148,14 @@ def _decided_alike(before: Ledger, after: Ledger, subject: Subject) -> bool:
     return not one or not other or (one.appdef, one.node) == (other.appdef, other.node)
 
 
-def all_keys(ledger: Ledger, config: Config) -> tuple[ReleaseKey, ...]:
+def all_keys(world: World) -> tuple[ReleaseKey, ...]:
     """Return the key of every release that the ledger needs.
 
     Raises:
         Refused: if the definition of a claimed application is missing.
     """
-    subjects = [Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)]
-    keys = (key for s in subjects for key in keys_of(ledger, config, s, strict=True))
+    subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
+    keys = (key for s in subjects for key in keys_of(world, s, strict=True))
     return tuple(dict.fromkeys(keys))
 
 

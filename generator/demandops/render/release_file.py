@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 from demandops.config.config import Config
 from demandops.config.override import Override, format_time
+from demandops.ledger.world import World
 from demandops.plan.release import Release
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
@@ -73,7 +74,7 @@ def split_comments(text: str) -> tuple[list[str], str]:
 
 
 def kept_charts(
-    files: Mapping[str, str], current: Mapping[str, str], config: Config
+    files: Mapping[str, str], current: Mapping[str, str], world: World
 ) -> dict[str, str]:
     """Return the chart sources to keep because a held release may still use them.
 
@@ -83,9 +84,9 @@ def kept_charts(
     Args:
         files: the generated files as they will be.
         current: the generated files in the state repo.
-        config: the configuration.
+        world: the overrides that apply.
     """
-    if not any(override.hold for override in config.active_overrides):
+    if not any(override.hold for override in world.overrides):
         return {}
     return {
         path: text

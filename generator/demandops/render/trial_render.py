@@ -6,13 +6,14 @@ from collections.abc import Iterable
 
 from demandops.config.config import Config
 from demandops.errors import Fault, InvalidInput
+from demandops.ledger.world import World
 from demandops.plan.checks import trial_demands
 from demandops.plan.release import ServiceRelease
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
 
 
-def render_trial_demands(config: Config, engine: Engine) -> None:
+def render_trial_demands(world: World, engine: Engine) -> None:
     """Render every service of every appdef once, with invented claims on a real node.
 
     This checks an appdef before its first demand, without overrides and with each override that is
@@ -21,13 +22,14 @@ def render_trial_demands(config: Config, engine: Engine) -> None:
     Raises:
         Refused, InvalidInput: naming the template, the values or the override that does not work.
     """
+    config = world.config
     invented = trial_demands.trial_releases(config)
     faults = [
         fault
         for releases in invented.values()
         for fault in _render_faults(releases, config, engine)
     ]
-    for override in () if faults else config.active_overrides:
+    for override in () if faults else world.overrides:
         overridden = [
             list(trial_demands.overridden_releases(override, releases, appdef, config))
             for appdef, releases in invented.items()

@@ -86,7 +86,7 @@ class Evaluator:
             if not self._queue.mark_committed(ticket):
                 return Withdrawn(TAKEN_BACK)
             self._approvals.withdraw_replaced(decision.request)
-            before = commits.head.state.ledger
+            before = commits.head.state
             targets = targets_of_decision(before, decision) if self._with_targets else ()
             return replace(_commit(commits, ticket, decision), targets=targets)
         except InvalidInput as error:

@@ -8,6 +8,7 @@ from demandops.decision import Decision, State
 from demandops.demand.demand_request import DemandRequest
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, keys_of
@@ -15,34 +16,35 @@ from demandops.render.gitops.argocd import project_of
 from demandops.subject import Subject
 
 
-def targets_of_decision(before: Ledger, decision: Decision) -> tuple[Target, ...]:
+def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:
     """Return the releases that a demand needs, and those that it removes."""
-    after, config = decision.state.ledger, decision.state.config
-    subjects = [*_requested_subjects(decision.request, after), *decision.changes.subjects()]
+    after = decision.state
+    requested = _requested_subjects(decision.request, after.ledger)
+    subjects = [*requested, *decision.changes.subjects()]
     keys: dict[ReleaseKey, None] = {}
     for subject in dict.fromkeys(subjects):
-        keys |= dict.fromkeys(keys_of(after, config, subject))
-    keys |= dict.fromkeys(affected_keys(before, after, config, decision.changes.claims))
+        keys |= dict.fromkeys(keys_of(after, subject))
+    keys |= dict.fromkeys(affected_keys(before, after, decision.changes.claims))
     targets = []
     for key in keys:
-        new = plan(after, config, key)
+        new = plan(after, key)
         old = None
         if new is None:
             try:
-                old = plan(before, config, key)
+                old = plan(before, key)
             except Refused:
                 continue
         release = new or old
         if release is not None:
-            targets.append(_target(release, config.repo_settings, wanted=new is not None))
+            targets.append(_target(release, after.config.repo_settings, wanted=new is not None))
     return tuple(dict.fromkeys(targets))
 
 
 def targets_of_state(state: State) -> list[tuple[Release, Target]]:
     """Return every release of a state with its target, sorted by cluster and name."""
     releases = []
-    for key in all_keys(state.ledger, state.config):
-        release = plan(state.ledger, state.config, key)
+    for key in all_keys(state):
+        release = plan(state, key)
         if release is not None:
             target = _target(release, state.config.repo_settings, wanted=True)
             releases.append((release, target))

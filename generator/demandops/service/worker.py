@@ -195,7 +195,7 @@ class Worker:
         state = self.snapshot.state
         seconds = self._approvals.seconds_until_due(LONGEST_WAIT_S)
         seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
-        seconds = self._override_expiry.seconds_until_due(state.config, _now(), seconds)
+        seconds = self._override_expiry.seconds_until_due(state, _now(), seconds)
         fetch = self.fetcher.seconds_until_due()
         return seconds if fetch is None else min(seconds, fetch)
 
@@ -206,7 +206,7 @@ class Worker:
 
     def fetch_if_due(self) -> None:
         """Carry out what others pushed and end overrides, while no demand comes."""
-        due = self._override_expiry.is_due(self.snapshot.state.config, _now())
+        due = self._override_expiry.is_due(self.snapshot.state, _now())
         if not self.fetcher.fetch_if_due(self.snapshot, due):
             self._override_expiry.postpone(_now())
 

@@ -143,13 +143,13 @@ def _plan(
     files = trees.texts(tree, CONFIG_ROOTS)
     before = files[ROOT_FILE]
     files[ROOT_FILE] = _root(before, old, request)
-    config = load(files).with_ended_overrides(last_valid_config.ended_overrides_at(tree))
+    config = load(files)
     state = State.of(config, snapshot.state.ledger)
     # what people changed since the generator's last commit is carried out too
     known = state_in_effect.start_at(objects, tip).state
     subjects = ledger_files.changed_subjects(known.ledger, state.ledger)
     applied = update_ledger(known, state, subjects, last_valid_config.end_markers_at(tree), now)
-    state = replace(state, ledger=applied.ledger, config=applied.config)
+    state = replace(state, ledger=applied.ledger)
     if old.repo_settings.gitops != config.repo_settings.gitops:
         _refuse_held(state)
     changed = dict(batch.render_all(state, applied.files).files)
@@ -167,7 +167,7 @@ def _refuse_held(state: State) -> None:
             f"holds {release.name} as rendered for the other controller; remove the hold, and add "
             "it again after the upgrade",
         ).within(override.path)
-        for release in planned_releases(state.ledger, state.config).values()
+        for release in planned_releases(state).values()
         if isinstance(release, ServiceRelease) and release.shaping.held
         for override, effects in release.shaping.by
         if "hold" in effects

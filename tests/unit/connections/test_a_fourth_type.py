@@ -183,7 +183,7 @@ def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
     world, _ = booked()
     ledger = world.state.ledger
     subject = Subject(SubjectKind.CONNECTION, "c")
-    (release,) = explanation.releases(ledger, world.config, subject)
+    (release,) = explanation.releases(world.state, subject)
     assert explanation.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
     files = [(one.file, one.entry) for one in explanation.shaping_files(release, world.config)]
     assert ("inventory/nodes.yaml", "edge.wan") in files

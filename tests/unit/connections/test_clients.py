@@ -79,7 +79,7 @@ class TestZenoh:
         world.send(demand("zenoh"))
         subject = Subject(SubjectKind.CONNECTION, "c")
         changes = changes_on(before, world.state.ledger, [subject])
-        keys = affected_keys(before, world.state.ledger, world.state.config, changes)
+        keys = affected_keys(replace(world.state, ledger=before), world.state, changes)
         assert keys == (ClientKey(ZENOH, "vehicle00"), ClientKey(ZENOH, "edge"))
         assert [(found.name, found.change) for found in world.releases] == [
             ("zenoh-vehicle00", "start"),
@@ -93,7 +93,7 @@ class TestZenoh:
         world.send(demand("mqtt"))
         subject = Subject(SubjectKind.CONNECTION, "c")
         changes = changes_on(before, world.state.ledger, [subject])
-        keys = affected_keys(before, world.state.ledger, world.state.config, changes)
+        keys = affected_keys(replace(world.state, ledger=before), world.state, changes)
         assert keys == (ClientKey(MQTT, "c", "source"), ClientKey(MQTT, "c", "target"))
 
     def test_topics_match_whole_names_and_nothing_else(self) -> None:

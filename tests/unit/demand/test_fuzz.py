@@ -114,6 +114,7 @@ def goals(text: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
 
 
 @examples(70)
+@example(goal([], [connection(ends=("\x7f", "\x7f"), topics=["/a"])]))
 @given(goals(TEXT))
 def test_a_goal_of_the_right_form_is_decided_or_refused(data: Any) -> None:
     found = outcome(data)

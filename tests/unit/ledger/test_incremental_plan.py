@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from random import Random
 
 import pytest
 from demandops.config.config import Config
 from demandops.decision import Decision
 from demandops.ledger.ledger import ClaimChange, Ledger
+from demandops.ledger.world import World
 from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
@@ -20,8 +22,8 @@ from tests.kit.memory import MemoryRepo
 from tests.model.goals import Maker
 
 
-def afresh(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release]:
-    plans = {key: plan(ledger, config, key) for key in all_keys(ledger, config)}
+def afresh(world: World) -> dict[ReleaseKey, Release]:
+    plans = {key: plan(world, key) for key in all_keys(world)}
     return {key: release for key, release in plans.items() if release}
 
 
@@ -50,7 +52,7 @@ def test_what_is_brought_forward_is_what_is_made_afresh(random: Random, length: 
         taken = repo.take(request)
         if isinstance(taken, Decision):
             following.take(repo.state.ledger, taken.changes.claims)
-            assert following.releases == afresh(repo.state.ledger, repo.state.config)
+            assert following.releases == afresh(repo.state)
 
 
 @pytest.mark.parametrize("seed", range(2 * TIMES))
@@ -65,7 +67,7 @@ def test_several_changes_at_once(seed: int) -> None:
         if random.random() < 0.2:
             following.take(repo.state.ledger, tuple(changes))
             changes.clear()
-            assert following.releases == afresh(repo.state.ledger, repo.state.config)
+            assert following.releases == afresh(repo.state)
 
 
 def test_what_reads_nothing_that_changed_is_left_alone() -> None:
@@ -76,9 +78,9 @@ def test_what_reads_nothing_that_changed_is_left_alone() -> None:
         repo.take(request)
     ledger = repo.state.ledger
     everything = following.take(ledger, ())
-    assert everything == len(all_keys(ledger, repo.state.config)) > 4
+    assert everything == len(all_keys(replace(repo.state, ledger=ledger))) > 4
     claim = next(claim for claim in ledger if claim.subject.kind.value == "connections")
     without = ledger.replace(claim.key, None)
     assert 0 < following.take(without, (ClaimChange(claim, None),)) < everything
-    assert following.releases == afresh(without, repo.state.config)
+    assert following.releases == afresh(replace(repo.state, ledger=without))
     assert following.take(without, ()) == 0

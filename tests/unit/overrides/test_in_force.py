@@ -7,6 +7,7 @@ the demands left behind one by one, and who is suspended or kept is told from th
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import timedelta
 from typing import Any
 
@@ -85,13 +86,13 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
             books.send(made)
         except Refused:
             continue
-        ledger, config = books.state.ledger, books.config
+        ledger = books.state.ledger
         generated = {p: t for p, t in books.files.items() if not p.startswith("ledger/")}
         standing = {p: t for p, t in before.items() if p.startswith(("clusters/", "bootstrap/"))}
         again = rendered_files(books.state, standing)
         assert {p: t for p, t in generated.items() if p in again} == again
         assert [p for p in generated if p.startswith("clusters/") and p not in again] == []
-        entries = bookkeeping(ledger, config)
+        entries = bookkeeping(books.state)
         told = {(one.id, one.demand) for one in entries.suspended}
         for claim in ledger:
             suspended = "eve" in claim.requesters or claim.subject.id == "v2/edge"
@@ -142,7 +143,7 @@ def test_what_is_higher_than_a_hold_changes_what_it_holds() -> None:
         before = dict(books.files)
         more = {"select": [{"nodes": ["edge"]}], "replicas": 4, "priority": priority}
         held = MemoryRepo(files(held=hold, more=more))
-        held.state = held.state.__class__(held.config, held.state.engine, books.state.ledger)
+        held.state = replace(held.state, ledger=books.state.ledger)
         after = rendered_files(held.state, before)
         path = "clusters/c-its/perception/edge/od-edge-vehicle00.yaml"
         assert (body(after[path]) != body(before[path])) is changed
@@ -236,7 +237,7 @@ def test_a_held_release_keeps_its_chart_when_the_registry_moves_on() -> None:
     hold = files(held={"select": [{"services": ["object-detection"]}], "hold": True})
     for overrides, kept in ((hold, True), ({}, False)):
         moved = MemoryRepo({"registry/charts.yaml": new, **overrides})
-        state = type(moved.state)(moved.config, moved.state.engine, books.state.ledger)
+        state = replace(moved.state, ledger=books.state.ledger)
         after = rendered_files(state, before)
         assert (f"{CHARTS}/object-detection-1.0.0.yaml" in after) is kept
         assert f"{CHARTS}/object-detection-1.1.0.yaml" in after

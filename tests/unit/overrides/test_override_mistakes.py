@@ -8,6 +8,8 @@ import pytest
 import yaml
 from demandops.config.load import load
 from demandops.errors import Fault, InvalidInput
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 
 from tests.kit.config import configuration
 
@@ -79,7 +81,7 @@ def test_notes_are_passed_over_and_a_sound_override_is_taken() -> None:
             {"overrides/README.md": "hello", "overrides/.gitkeep": "", "overrides/a.yaml": text()}
         )
     )
-    assert [one.path for one in config.active_overrides] == ["overrides/a.yaml"]
+    assert [one.path for one in World(config, Ledger()).overrides] == ["overrides/a.yaml"]
 
 
 def test_a_node_in_no_access_domain_takes_nothing() -> None:
@@ -121,4 +123,4 @@ def test_a_tie_names_both_files_and_the_remedy() -> None:
 def test_no_tie_where_it_does_not_matter_who_comes_last(other: dict[str, Any]) -> None:
     changed = {"replicas": 3} | other
     files = {"overrides/one.yaml": text(), "overrides/two.yaml": text(**changed)}
-    assert len(load(configuration(files)).active_overrides) == 2
+    assert len(World(load(configuration(files)), Ledger()).overrides) == 2

@@ -24,7 +24,7 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(at, report)
         warn_of(repo.problems() if at is None else ())
-    books, commit = derive(snapshot.state.ledger, snapshot.state.config), str(snapshot.commit)
+    books, commit = derive(snapshot.state), str(snapshot.commit)
     if output == "json":
         print_json(as_data(books, commit))
         return

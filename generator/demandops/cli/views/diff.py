@@ -37,9 +37,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
     with reader.opened(state_repo) as repo:
         old, new = (_loaded(repo, revision) for revision in (before, after))
         found = _compare(repo, old, new)
-    entries = bookkeeping_changes(
-        *(bookkeeping(each.state.ledger, each.state.config) for each in (old, new))
-    )
+    entries = bookkeeping_changes(*(bookkeeping(each.state) for each in (old, new)))
     if output == "json":
         print_json(
             {
@@ -71,7 +69,7 @@ def _compare(repo: Reader, old: Snapshot, new: Snapshot) -> MergePreview:
     texts = [
         {path: text for path in differing if (text := read(path)) is not None} for read, _ in sides
     ]
-    releases = [planned_releases(state.ledger, state.config) for _, state in sides]
+    releases = [planned_releases(state) for _, state in sides]
     return preview(releases[0], releases[1], texts[0], texts[1])
 
 

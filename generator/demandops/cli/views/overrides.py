@@ -33,7 +33,7 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(at, report)
     state = snapshot.state
-    entries = override_report(state.ledger, state.config, datetime.now(timezone.utc))
+    entries = override_report(state, datetime.now(timezone.utc))
     if output == "json":
         print_json(
             [

@@ -103,29 +103,29 @@ def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Ma
         raise StateRepoError(f"{quoted(name)} can mean several: {kinds}; choose one with --kind")
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
-    ledger, config = snapshot.state.ledger, snapshot.state.config
+    world = snapshot.state
     known = {
-        *(release.name for release in explanation.releases(ledger, config)),
+        *(release.name for release in explanation.releases(world)),
         *repo.stopped_release_names(str(snapshot.commit)),
     }
-    known |= {id for each in SubjectKind for id in ledger.subjects(each)}
+    known |= {id for each in SubjectKind for id in world.ledger.subjects(each)}
     raise StateRepoError(f"nothing called {quoted(name)} runs or ever ran{suggestion(name, known)}")
 
 
 def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Match]:
-    ledger, config = snapshot.state.ledger, snapshot.state.config
+    world = snapshot.state
     matches = []
-    release = explanation.release_named(ledger, config, name)
+    release = explanation.release_named(world, name)
     path = path_of(release) if release else repo.release_path(name, str(snapshot.commit))
     if path is None:  # a release that an override denies may never have run
-        stopped = explanation.denied_release_named(ledger, config, name)
+        stopped = explanation.denied_release_named(world, name)
         path = path_of(stopped[0]) if stopped else None
     if path is not None:
         matches.append(_Match("release", name, path, release))
     for kind in SubjectKind:
         subject = Subject(kind, name)
         folder = claim_file.folder_of(subject)
-        if ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
+        if world.ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
             matches.append(_Match(kind.value[:-1], name, folder, subject=subject))
     return matches
 
@@ -137,7 +137,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Match:
     if key is not None:
         return _Match("claim", key.demand, path, subject=key.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    release = explanation.release_named(snapshot.state.ledger, snapshot.state.config, name)
+    release = explanation.release_named(snapshot.state, name)
     if release is not None and path_of(release) == path:
         return _Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
@@ -152,7 +152,7 @@ def _denied(snapshot: Snapshot, match: _Match) -> dict[str, Any]:
     if match.kind != "release":
         return {}
     name = match.path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    stopped = explanation.denied_release_named(snapshot.state.ledger, snapshot.state.config, name)
+    stopped = explanation.denied_release_named(snapshot.state, name)
     return why_answer.denied(*stopped) if stopped else {}
 
 

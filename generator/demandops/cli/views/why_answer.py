@@ -14,9 +14,9 @@ from demandops.cli.json_output import (
     subject_data,
     time_text,
 )
-from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import Claim
+from demandops.ledger.world import World
 from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
@@ -30,16 +30,16 @@ _MOST_CARRIED_OUT = 5
 
 def release(snapshot: Snapshot, running: Release) -> dict[str, Any]:
     """Return why a release runs."""
-    ledger, config = snapshot.state.ledger, snapshot.state.config
-    claims = explanation.claims_behind(without_suspended(ledger, config), running)
+    world = snapshot.state
+    claims = explanation.claims_behind(without_suspended(world).ledger, running)
     return {
         "runs": True,
         **place_data(running),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
-        "claims": [_claim(claim, config) for claim in claims],
+        "claims": [_claim(claim, world) for claim in claims],
         "shaped_by": [
             {"file": each.file, "entry": each.entry or None, "what": each.what}
-            for each in explanation.shaping_files(running, config)
+            for each in explanation.shaping_files(running, world.config)
         ],
         "overrides": [override_data(*each) for each in running.shaping.by],
     }
@@ -56,15 +56,15 @@ def denied(stopped: Release, by: Override) -> dict[str, Any]:
 
 def subject(snapshot: Snapshot, claimed: Subject) -> dict[str, Any]:
     """Return the claims on an application or a connection, and the releases that it needs."""
-    ledger, config = snapshot.state.ledger, snapshot.state.config
-    claims = sorted(ledger.claims_on(claimed), key=lambda claim: claim.booked)
+    world = snapshot.state
+    claims = sorted(world.ledger.claims_on(claimed), key=lambda claim: claim.booked)
     return {
-        "runs": any(suspended_by(claim, config) is None for claim in claims),
+        "runs": any(suspended_by(claim, world) is None for claim in claims),
         "what": str(claimed),
         "subject": subject_data(claimed),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
-        "claims": [_claim(claim, config) for claim in claims],
-        "releases": [release_data(each) for each in explanation.releases(ledger, config, claimed)],
+        "claims": [_claim(claim, world) for claim in claims],
+        "releases": [release_data(each) for each in explanation.releases(world, claimed)],
     }
 
 
@@ -79,8 +79,9 @@ def commits(repo: Reader, path: str, commit: str, most: int) -> dict[str, Any]:
     }
 
 
-def _claim(claim: Claim, config: Config) -> dict[str, Any]:
-    suspended, kept = suspended_by(claim, config), explanation.keeping_override(claim, config)
+def _claim(claim: Claim, world: World) -> dict[str, Any]:
+    suspended = suspended_by(claim, world)
+    kept = explanation.keeping_override(claim, world.config)
     return claim_data(claim) | {
         "release_by": explanation.how_to_release(claim),
         "kept_by": override_data(kept, ("keep",)) if kept else None,

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from demandops.config.config import Config
 from demandops.demand import admission, permission
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Demanded, DemandRequest, Place, Put
@@ -19,6 +18,7 @@ from demandops.demand.lease import Lease, Term
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.claim_file import path_of
 from demandops.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
+from demandops.ledger.world import World
 
 _SHOWN = 20
 
@@ -101,15 +101,17 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
     yield fault("", message, code="newer")
 
 
-def faults(request: Restoration, ledger: Ledger, config: Config) -> Iterator[Fault]:
+def faults(request: Restoration, world: World) -> Iterator[Fault]:
     """Yield why restored claims are not valid in the current configuration."""
-    for change in _changes(ledger, request):
-        if (
-            change.after is None or change.after.keeping_override is not None
-        ):  # overrides decide about these
+    for change in _changes(world.ledger, request):
+        after = change.after
+        if after is None or after.keeping_override is not None:  # overrides decide about these
             continue
-        booking = _request_for(change.after)
-        for found in (*admission.faults(booking, config), *permission.faults(booking, config)):
+        booking = _request_for(after)
+        for found in (
+            *admission.faults(booking, world.config),
+            *permission.faults(booking, world.config),
+        ):
             yield found.within(path_of(change.key))
 
 

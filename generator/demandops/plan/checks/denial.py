@@ -15,18 +15,17 @@ from demandops.config.policy import matches
 from demandops.demand.application import Application
 from demandops.demand.demand_request import Demanded, DemandRequest
 from demandops.errors import Fault
-from demandops.ledger.ledger import Changes, Ledger
+from demandops.ledger.ledger import Changes
+from demandops.ledger.world import World
 from demandops.plan.overrides.selectors import Traits, fits, has_labels, traits_of
 from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import keys_of_claims
 
 
-def faults(
-    request: DemandRequest, after: Ledger, changes: Changes, config: Config
-) -> Iterator[Fault]:
+def faults(request: DemandRequest, after: World, changes: Changes) -> Iterator[Fault]:
     """Yield every new application and connection of a request that an override denies."""
-    denying = [one for one in reversed(config.active_overrides) if one.deny]
+    denying = [one for one in reversed(after.overrides) if one.deny]
     if not denying or not request.adds_claims:
         return
     renewed = {
@@ -38,20 +37,20 @@ def faults(
     for one in request.demanded:
         if renewed.get(one.held.subject, True):
             continue
-        services = list(_service_traits(one, after, config))
+        services = list(_service_traits(one, after))
         for override in denying:
-            field = _denied_field(override, one, services, config)
+            field = _denied_field(override, one, services, after.config)
             if field:
                 yield one.fault(field, _message(override), code="denied")
                 break
 
 
-def _service_traits(one: Demanded, after: Ledger, config: Config) -> Iterator[Traits]:
+def _service_traits(one: Demanded, after: World) -> Iterator[Traits]:
     """Yield the traits of the services that an application needs."""
     if not isinstance(one.held, Application):
         return
     app = traits_of(one)
-    for key in keys_of_claims(after, config, after.claims_on(one.held.subject)):
+    for key in keys_of_claims(after, after.ledger.claims_on(one.held.subject)):
         if isinstance(key, ServiceKey):
             yield replace(app, nodes=(key.node,), service=key.service)
 
@@ -90,18 +89,18 @@ def _message(override: Override) -> str:
     )
 
 
-def warnings(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[str]:
+def warnings(request: DemandRequest, world: World) -> Iterator[str]:
     """Yield a warning for each claim of a demand that an override suspends."""
-    if not any(override.deny for override in config.active_overrides):
+    if not any(override.deny for override in world.overrides):
         return
     claims = [
-        *ledger.claims_of_demand(request.demand),
-        *(claim for subject in request.subjects() for claim in ledger.claims_on(subject)),
+        *world.ledger.claims_of_demand(request.demand),
+        *(claim for subject in request.subjects() for claim in world.ledger.claims_on(subject)),
     ]
     seen = set()
     requesters = set(request.requesters())
     for claim in claims:
-        override = suspended_by(claim, config)
+        override = suspended_by(claim, world)
         if override is None or claim.key in seen or not requesters & set(claim.requesters):
             continue
         seen.add(claim.key)

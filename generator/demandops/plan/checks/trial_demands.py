@@ -16,6 +16,7 @@ from demandops.demand.application import Application, InputTopic
 from demandops.demand.demand_request import Demanded, Join, Place
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.overrides.release_overrides import apply_effects, effects_on
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
@@ -44,8 +45,9 @@ def _services(appdef: ApplicationDefinition, node: str, config: Config) -> Itera
     app = Application(f"rehearsal/{appdef.name}", appdef.name, node, inputs)
     request = Join("rehearsal", (Demanded(app, ("rehearsal",), Place("")),))
     ledger, changes = apply(Ledger(), request, _NEVER)
-    for key in affected_keys(Ledger(), ledger, config, changes.claims):
-        release = plan(ledger, config, key)
+    before, after = World(config, Ledger()), World(config, ledger)
+    for key in affected_keys(before, after, changes.claims):
+        release = plan(after, key)
         if isinstance(release, ServiceRelease):
             yield release
 

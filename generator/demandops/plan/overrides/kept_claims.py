@@ -11,10 +11,10 @@ from collections.abc import Iterable
 from dataclasses import replace
 from datetime import datetime
 
-from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.world import World
 from demandops.plan.overrides.selectors import selects, traits_of
 from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.subject import Subject
@@ -28,43 +28,38 @@ def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
 
 
 def with_kept_claims(
-    before: Ledger,
-    after: Ledger,
-    changes: Changes,
-    subjects: Iterable[Subject],
-    config: Config,
-    now: datetime,
+    before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, Changes]:
     """Return a booking with the kept claims updated on everything that it touched."""
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
-    after, more = update_kept_claims(before, after, touched, config, now)
-    return after, replace(changes, claims=claim_changes(before, after, [*keys, *more]))
+    ledger, more = update_kept_claims(before, after, touched, now)
+    return ledger, replace(changes, claims=claim_changes(before, ledger, [*keys, *more]))
 
 
 def update_kept_claims(
-    before: Ledger, after: Ledger, subjects: Iterable[Subject], config: Config, now: datetime
+    before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, list[ClaimKey]]:
-    """Return ``after`` with exactly the kept claims that its overrides ask for, and their keys.
+    """Return the ledger with exactly the kept claims that overrides ask for, and their keys.
 
     Args:
-        before, after: the ledger before and after a change.
+        before: the ledger before a change.
+        after: the world after it.
         subjects: the subjects that changed.
-        config: the configuration after the change.
         now: the booking time of new kept claims.
     """
-    keys: list[ClaimKey] = []
+    keys, ledger = list[ClaimKey](), after.ledger
     for subject in subjects:
-        existing = [*after.kept_claims(subject), *before.kept_claims(subject)]
+        existing = [*ledger.kept_claims(subject), *before.kept_claims(subject)]
         needed = None
-        if after.is_only_kept(subject):
-            needed = _needed(existing, before.claims_on(subject), config, now)
+        if ledger.is_only_kept(subject):
+            needed = _needed(existing, before.claims_on(subject), after, now)
         keys += [claim.key for claim in existing]
-        after = after.without(existing)
+        ledger = ledger.without(existing)
         if needed is not None:
             keys.append(needed.key)
-            after = after.replace(needed.key, needed)
-    return after, keys
+            ledger = ledger.replace(needed.key, needed)
+    return ledger, keys
 
 
 def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
@@ -73,18 +68,18 @@ def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
 
 
 def _needed(
-    existing: list[Claim], before: tuple[Claim, ...], config: Config, now: datetime
+    existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
     """Return the kept claim that a subject without demands needs, or ``None``."""
     for claim in existing:
-        if any(one.name == claim.keeping_override for one in keeping_overrides(claim, config)):
+        if any(one.name == claim.keeping_override for one in keeping_overrides(claim, world)):
             return claim
     if not before:
         return None
     last = max(before, key=lambda claim: (claim.booked, claim.demand))
-    if suspended_by(last, config) is not None:
+    if suspended_by(last, world) is not None:
         return None
-    for override in keeping_overrides(last, config):
+    for override in keeping_overrides(last, world):
         name = OVERRIDE_PREFIX + override.name
         return replace(
             last, demand=name, request=name, requesters=(override.owner,), booked=now, lease=None
@@ -92,7 +87,7 @@ def _needed(
     return None
 
 
-def keeping_overrides(claim: Claim, config: Config) -> list[Override]:
+def keeping_overrides(claim: Claim, world: World) -> list[Override]:
     """Return the overrides that keep the subject of a claim, the highest first.
 
     A kept claim names the owner as its requester, so ``requesters`` of the selector is ignored: it
@@ -101,6 +96,6 @@ def keeping_overrides(claim: Claim, config: Config) -> list[Override]:
     traits, any_requester = traits_of(claim), claim.keeping_override is not None
     return [
         one
-        for one in reversed(config.active_overrides)
-        if one.keep and selects(one, traits, config, any_requester=any_requester)
+        for one in reversed(world.overrides)
+        if one.keep and selects(one, traits, world.config, any_requester=any_requester)
     ]

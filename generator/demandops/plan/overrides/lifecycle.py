@@ -7,47 +7,33 @@ that was in effect with a commit of its own.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import Protocol
 
-from demandops.config.config import Config
 from demandops.config.override import Override, format_time
 from demandops.demand.claim import ClaimKey
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.overrides import kept_claims
 from demandops.subject import Subject
 
 
-class LedgerAndConfig(Protocol):
-    """Ledger and configuration at one time, for example :class:`demandops.decision.State`."""
-
-    @property
-    def ledger(self) -> Ledger:
-        """What is booked."""
-
-    @property
-    def config(self) -> Config:
-        """What people wrote."""
-
-
 @dataclass(frozen=True, slots=True)
 class LedgerUpdate:
-    """Ledger and configuration after overrides changed, with the ledger files to write.
+    """The ledger after overrides changed, and its files to write.
 
     ``keys`` are the claims that may have changed.
     """
 
     ledger: Ledger
-    config: Config
-    keys: tuple[ClaimKey, ...] = ()
-    files: Mapping[str, str | None] = field(default_factory=dict)
+    keys: tuple[ClaimKey, ...]
+    files: Mapping[str, str | None]
 
 
 def update_ledger(
-    before: LedgerAndConfig,
-    after: LedgerAndConfig,
+    before: World,
+    after: World,
     subjects: Iterable[Subject],
     markers: Mapping[str, str],
     now: datetime,
@@ -55,44 +41,43 @@ def update_ledger(
     """Return the update that a change of the configuration requires.
 
     Args:
-        before, after: ledger and configuration before and after the change.
+        before, after: the world before and after the change.
         subjects: those whose claims a person changed.
         markers: the current markers, path → text.
         now: new overrides that end by then do not apply.
     """
-    config = after.config
-    known = {one.name: one for one in before.config.active_overrides}
+    known = {one.name: one for one in before.overrides}
     expired = [
         one
-        for one in expired_overrides(config, now)
+        for one in expired_overrides(after, now)
         if one.name not in known or known[one.name].end != one.end
     ]
-    stale = ended_override_file.stale_markers(markers, config.overrides)
+    stale = ended_override_file.stale_markers(markers, after.config.overrides)
     ended = {
         name: end
-        for name, end in config.ended_overrides.items()
+        for name, end in after.ledger.ended.items()
         if ended_override_file.path_of(name) not in stale
     }
     ended |= {one.name: format_time(one.end) for one in expired if one.end}
-    config = config.with_ended_overrides(ended)
     files: dict[str, str | None] = dict.fromkeys(stale)
     for override in expired:
         files |= _marker(override)
+    after = replace(after, ledger=replace(after.ledger, ended=ended))
     kept = (*kept_claims.kept_subjects(before.ledger), *kept_claims.kept_subjects(after.ledger))
-    updated, keys = kept_claims.update_kept_claims(
-        before.ledger, after.ledger, dict.fromkeys((*subjects, *kept)), config, now
+    ledger, keys = kept_claims.update_kept_claims(
+        before.ledger, after, dict.fromkeys((*subjects, *kept)), now
     )
-    files |= changed_claim_files(after.ledger, updated, keys)
-    return LedgerUpdate(updated, config, tuple(keys), files)
+    files |= changed_claim_files(after.ledger, ledger, keys)
+    return LedgerUpdate(ledger, tuple(keys), files)
 
 
-def end_override(state: LedgerAndConfig, override: Override, now: datetime) -> LedgerUpdate:
+def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
     """Return the update that ends an override."""
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
-    ended = {**state.config.ended_overrides, override.name: format_time(override.end)}
-    after = LedgerUpdate(state.ledger, state.config.with_ended_overrides(ended))
-    update = update_ledger(state, after, (), {}, now)
+    ended = {**world.ledger.ended, override.name: format_time(override.end)}
+    after = replace(world, ledger=replace(world.ledger, ended=ended))
+    update = update_ledger(world, after, (), {}, now)
     return replace(update, files={**update.files, **_marker(override)})
 
 
@@ -112,17 +97,15 @@ def changed_claim_files(
     return files
 
 
-def expired_overrides(config: Config, now: datetime) -> list[Override]:
+def expired_overrides(world: World, now: datetime) -> list[Override]:
     """Return the overrides in effect whose end has passed, sorted by their end."""
-    expired = [
-        (one.end, one.name, one) for one in config.active_overrides if one.end and one.end <= now
-    ]
+    expired = [(one.end, one.name, one) for one in world.overrides if one.end and one.end <= now]
     return [one for _, _, one in sorted(expired, key=lambda item: item[:2])]
 
 
-def changed_override_files(before: Config, after: Config) -> list[str]:
+def changed_override_files(before: World, after: World) -> list[str]:
     """Return the files of the overrides that took effect, changed or stopped applying."""
-    old = {one.name: one for one in before.active_overrides}
-    new = {one.name: one for one in after.active_overrides}
+    old = {one.name: one for one in before.overrides}
+    new = {one.name: one for one in after.overrides}
     names = [name for name in {*old, *new} if old.get(name) != new.get(name)]
     return sorted((new.get(name) or old[name]).path for name in names)

@@ -11,27 +11,27 @@ from dataclasses import replace
 from demandops.config.config import Config
 from demandops.config.override import Override, Shaping
 from demandops.demand.claim import Claim
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.overrides.selectors import Traits, selects
 from demandops.plan.overrides.suspended_claims import denied_by
 from demandops.plan.release import Release, ServiceRelease, claims_of
 
 
-def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release | None:
+def apply_overrides(release: Release, world: World) -> Release | None:
     """Return a release with the effects of all overrides, or ``None`` if one denies it.
 
     Raises:
         Refused: if an override moves it to a node that is gone.
     """
-    if not config.active_overrides:
+    if not world.overrides:
         return release
-    claims = claims_of(release, ledger)
+    config, claims = world.config, claims_of(release, world.ledger)
     traits = _traits(release, claims)
-    if service_denied_by(release, ledger, config) is not None:
+    if service_denied_by(release, world) is not None:
         return None
     kept = {claim.keeping_override for claim in claims}
     by = []
-    for override in config.active_overrides:
+    for override in world.overrides:
         effects = effects_on(release, override, config) if selects(override, traits, config) else ()
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
@@ -40,13 +40,11 @@ def apply_overrides(release: Release, ledger: Ledger, config: Config) -> Release
     return apply_effects(release, by, config)
 
 
-def service_denied_by(release: Release, ledger: Ledger, config: Config) -> Override | None:
+def service_denied_by(release: Release, world: World) -> Override | None:
     """Return the override that denies a service, or ``None``."""
-    if not isinstance(release, ServiceRelease) or not any(
-        one.deny for one in config.active_overrides
-    ):
+    if not isinstance(release, ServiceRelease) or not any(one.deny for one in world.overrides):
         return None
-    return denied_by(_traits(release, claims_of(release, ledger)), config)
+    return denied_by(_traits(release, claims_of(release, world.ledger)), world)
 
 
 def apply_effects(

@@ -7,24 +7,21 @@ claim when it is read. So there is no second ledger to keep up to date.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.overrides.selectors import Traits, fits, traits_of
 from demandops.subject import Subject
-
-_MOST_CACHED = 100_000
-"""How many results are cached. The claims of a shared service are read often."""
 
 
 @dataclass(frozen=True, slots=True)
 class UnsuspendedClaims(Ledger):
     """A read-only view of a ledger without suspended claims."""
 
-    config: Config | None = field(default=None, compare=False)
+    world: World | None = field(default=None, compare=False)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject`` that are not suspended, sorted by demand id."""
@@ -51,52 +48,42 @@ class UnsuspendedClaims(Ledger):
         return tuple(sorted({key.subject.id for key in keys if self.get(key)}))
 
     def _is_active(self, claim: Claim) -> bool:
-        return self.config is None or suspended_by(claim, self.config) is None
+        return self.world is None or suspended_by(claim, self.world) is None
 
 
-def without_suspended(ledger: Ledger, config: Config) -> Ledger:
-    """Return a view of the ledger without suspended claims."""
-    if isinstance(ledger, UnsuspendedClaims) or not any(
-        one.deny for one in config.active_overrides
-    ):
-        return ledger
-    return UnsuspendedClaims(ledger.claims, ledger.index, ledger.minutes, config)
+def without_suspended(world: World) -> World:
+    """Return the world with a view of its ledger without suspended claims."""
+    ledger = world.ledger
+    if isinstance(ledger, UnsuspendedClaims) or not any(one.deny for one in world.overrides):
+        return world
+    view = UnsuspendedClaims(ledger.claims, ledger.index, ledger.minutes, ledger.ended, world)
+    return replace(world, ledger=view)
 
 
-def suspended_by(claim: Claim, config: Config) -> Override | None:
+def suspended_by(claim: Claim, world: World) -> Override | None:
     """Return the highest override that suspends a claim, or ``None``."""
-    if not config.active_overrides:
-        return None
-    traits = traits_of(claim)
-    try:
-        return config.denial_cache[traits]
-    except KeyError:
-        pass
-    if len(config.denial_cache) >= _MOST_CACHED:
-        config.denial_cache.clear()
-    found = config.denial_cache[traits] = denied_by(traits, config)
-    return found
+    return denied_by(traits_of(claim), world) if world.overrides else None
 
 
-def denied_by(traits: Traits, config: Config) -> Override | None:
+def denied_by(traits: Traits, world: World) -> Override | None:
     """Return the highest override that denies something with these traits, or ``None``.
 
     A selector that names services denies the releases of these services, never a claim or demand.
     """
-    for override in reversed(config.active_overrides):
+    for override in reversed(world.overrides):
         if override.deny and any(
-            bool(selector.services) is bool(traits.service) and fits(selector, traits, config)
+            bool(selector.services) is bool(traits.service) and fits(selector, traits, world.config)
             for selector in override.select
         ):
             return override
     return None
 
 
-def suspended_claims(ledger: Ledger, config: Config) -> Iterator[tuple[Claim, Override]]:
+def suspended_claims(world: World) -> Iterator[tuple[Claim, Override]]:
     """Yield every suspended claim and the override that suspends it, sorted by subject."""
-    if not any(one.deny for one in config.active_overrides):
+    if not any(one.deny for one in world.overrides):
         return
-    for claim in sorted(ledger, key=lambda one: (str(one.subject), one.demand)):
-        override = suspended_by(claim, config)
+    for claim in sorted(world.ledger, key=lambda one: (str(one.subject), one.demand)):
+        override = suspended_by(claim, world)
         if override is not None:
             yield claim, override

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from demandops.config.config import Config
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.connection_clients import connection_topics
 from demandops.plan.overrides.suspended_claims import suspended_claims, without_suspended
 from demandops.plan.planner import plan
@@ -66,11 +65,11 @@ class Bookkeeping:
     suspended: tuple[SuspendedEntry, ...] = ()
 
 
-def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
+def bookkeeping(world: World) -> Bookkeeping:
     """Return who requests what."""
     services = {}
-    for key in all_keys(ledger, config):
-        release = plan(ledger, config, key)
+    for key in all_keys(world):
+        release = plan(world, key)
         if isinstance(release, ServiceRelease):
             services[release.name] = ServiceEntry(
                 applications=release.applications,
@@ -85,8 +84,8 @@ def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
                 requesters=release.requesters,
             )
     connections = {}
-    active = without_suspended(ledger, config)
-    for id in ledger.subjects(SubjectKind.CONNECTION):
+    active = without_suspended(world).ledger
+    for id in world.ledger.subjects(SubjectKind.CONNECTION):
         claims = active.connection_claims(id)
         if not claims:
             continue
@@ -99,12 +98,12 @@ def bookkeeping(ledger: Ledger, config: Config) -> Bookkeeping:
     return Bookkeeping(
         services=dict(sorted(services.items())),
         connections=connections,
-        suspended=tuple(_suspended(ledger, config)),
+        suspended=tuple(_suspended(world)),
     )
 
 
-def _suspended(ledger: Ledger, config: Config) -> Iterator[SuspendedEntry]:
-    for claim, override in suspended_claims(ledger, config):
+def _suspended(world: World) -> Iterator[SuspendedEntry]:
+    for claim, override in suspended_claims(world):
         kind = claim.subject.kind.value[:-1]
         yield SuspendedEntry(
             kind,

@@ -15,6 +15,7 @@ from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.demand.claim import Claim, demand_id
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Release, ServiceRelease, claims_of
 from demandops.plan.release_keys import all_keys, keys_of
@@ -30,15 +31,15 @@ class ShapingFile:
     what: str
 
 
-def releases(ledger: Ledger, config: Config, subject: Subject | None = None) -> Iterator[Release]:
+def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
     """Yield the releases that run, all or those that claims on ``subject`` need."""
-    keys = keys_of(ledger, config, subject) if subject else all_keys(ledger, config)
-    yield from filter(None, (plan(ledger, config, key) for key in dict.fromkeys(keys)))
+    keys = keys_of(world, subject) if subject else all_keys(world)
+    yield from filter(None, (plan(world, key) for key in dict.fromkeys(keys)))
 
 
-def release_named(ledger: Ledger, config: Config, name: str) -> Release | None:
+def release_named(world: World, name: str) -> Release | None:
     """Return the release with a name, or ``None`` if none runs."""
-    return next((one for one in releases(ledger, config) if one.name == name), None)
+    return next((one for one in releases(world) if one.name == name), None)
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
@@ -83,11 +84,9 @@ def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
     return [ShapingFile(*entry) for entry in entries]
 
 
-def denied_release_named(
-    ledger: Ledger, config: Config, name: str
-) -> tuple[Release, Override] | None:
+def denied_release_named(world: World, name: str) -> tuple[Release, Override] | None:
     """Return the denied release with a name and the override that denies it, or ``None``."""
-    denied = (denied_release(ledger, config, key) for key in all_keys(ledger, config))
+    denied = (denied_release(world, key) for key in all_keys(world))
     return next((found for found in denied if found and found[0].name == name), None)
 
 

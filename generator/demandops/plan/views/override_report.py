@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from demandops.config.config import Config
 from demandops.config.override import Override, format_time
 from demandops.demand.claim import Claim
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.plan.planner import denied_release, plan
@@ -31,16 +30,16 @@ class Entry:
     claims: tuple[Claim, ...]
 
 
-def override_report(ledger: Ledger, config: Config, now: datetime) -> list[Entry]:
+def override_report(world: World, now: datetime) -> list[Entry]:
     """Return every override, sorted by name, with what it does."""
-    releases = _releases(ledger, config)
-    claims = _claims(ledger, config)
+    releases = _releases(world)
+    claims = _claims(world)
     found = []
-    for name, override in sorted(config.overrides.items()):
+    for name, override in sorted(world.config.overrides.items()):
         applied = sorted(releases[name], key=lambda one: one.name), claims[name]
         state: State = "in force" if any(applied) else "matches nothing"
         expired = override.end is not None and override.end <= now
-        if expired or override not in config.active_overrides:
+        if expired or override not in world.overrides:
             state, applied = "expired", ([], [])
         found.append(Entry(override, state, tuple(applied[0]), tuple(applied[1])))
     return found
@@ -60,26 +59,26 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
             yield override.path, "matches nothing now; if it should, correct select"
 
 
-def _releases(ledger: Ledger, config: Config) -> dict[str, list[Release]]:
+def _releases(world: World) -> dict[str, list[Release]]:
     """Return override → the releases that it changes or denies."""
     found = defaultdict[str, list[Release]](list)
-    for key in all_keys(ledger, config):
-        release = plan(ledger, config, key)
+    for key in all_keys(world):
+        release = plan(world, key)
         if release is not None:
             for override, _ in release.shaping.by:
                 found[override.name].append(release)
             continue
-        stopped = denied_release(ledger, config, key)
+        stopped = denied_release(world, key)
         if stopped is not None:
             found[stopped[1].name].append(stopped[0])
     return found
 
 
-def _claims(ledger: Ledger, config: Config) -> dict[str, list[Claim]]:
+def _claims(world: World) -> dict[str, list[Claim]]:
     """Return override → the claims that it suspends or would keep."""
     found = defaultdict[str, list[Claim]](list)
-    for claim in sorted(ledger, key=lambda one: (str(one.subject), one.demand)):
-        by = [suspended_by(claim, config), *kept_claims.keeping_overrides(claim, config)]
+    for claim in sorted(world.ledger, key=lambda one: (str(one.subject), one.demand)):
+        by = [suspended_by(claim, world), *kept_claims.keeping_overrides(claim, world)]
         for name in {override.name for override in by if override is not None}:
             found[name].append(claim)
     return found

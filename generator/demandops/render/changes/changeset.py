@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from demandops.config.config import Config
 from demandops.errors import Refused
 from demandops.ledger import claim_file
-from demandops.ledger.ledger import ClaimChange, Ledger
+from demandops.ledger.ledger import ClaimChange
+from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
@@ -60,24 +60,25 @@ class Changeset:
 
 
 def build_changeset(
-    before: Ledger,
-    after: Ledger,
+    before: World,
+    after: World,
     claims: Iterable[ClaimChange],
     keys: Iterable[ReleaseKey],
-    context: tuple[Config, Engine, FileReader],
+    engine: Engine,
+    read: FileReader,
 ) -> Changeset:
     """Return the changes in the state repo that follow from a change of the ledger.
 
     Args:
-        before, after: the ledgers.
+        before, after: the world before and after; the configuration is the same.
         claims: the claims that differ.
         keys: the releases that may differ (:func:`demandops.plan.release_keys.affected`).
-        context: the configuration, its engine, and a reader of the current files.
+        engine: the engine of the configuration.
+        read: returns a current file.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.
     """
-    config, engine, read = context
     files: dict[str, str | None] = {
         claim_file.path_of(change.key): claim_file.text_of(change.after) if change.after else None
         for change in claims
@@ -86,14 +87,14 @@ def build_changeset(
     shaped: set[str] = set()
     blocked: list[str] = []
     for key in keys:
-        old, new = _plan_leniently(before, config, key), plan(after, config, key)
+        old, new = _plan_leniently(before, key), plan(after, key)
         old_path = path_of(old) if old else None
         new_path = path_of(new) if new else None
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
         current = read(new_path) if new_path else None
         blocked += _blocked(old, new) if current is not None else ()
-        text = release_file.release_text(new, config, engine, current) if new else None
+        text = release_file.release_text(new, after.config, engine, current) if new else None
         if new_path and text != current:
             files[new_path] = text
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
@@ -107,37 +108,33 @@ def build_changeset(
 
 
 def render_all(
-    ledger: Ledger,
-    config: Config,
-    engine: Engine,
-    keys: Iterable[ReleaseKey],
-    current: Mapping[str, str],
+    world: World, engine: Engine, keys: Iterable[ReleaseKey], current: Mapping[str, str]
 ) -> dict[str, str]:
     """Return all generated files, by path.
 
     Args:
-        ledger: the claims.
-        config: the configuration.
-        engine: its engine.
+        world: the configuration and the claims.
+        engine: the configuration's engine.
         keys: all releases (:func:`demandops.plan.release_keys.all_keys`).
         current: the generated files in the state repo; overrides may hold some of them.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.
     """
+    config = world.config
     files = manifests.base_files(config, engine)
     for key in keys:
-        release = plan(ledger, config, key)
+        release = plan(world, key)
         if release is not None:
             path = path_of(release)
             files[path] = release_file.release_text(release, config, engine, current.get(path))
-    return files | release_file.kept_charts(files, current, config)
+    return files | release_file.kept_charts(files, current, world)
 
 
-def _plan_leniently(ledger: Ledger, config: Config, key: ReleaseKey) -> Release | None:
+def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:
     """Return the former release, or ``None`` if it can no longer be planned."""
     try:
-        return plan(ledger, config, key)
+        return plan(world, key)
     except Refused:
         return None
 

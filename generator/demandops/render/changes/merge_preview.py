@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from demandops import strict_yaml
-from demandops.config.config import Config
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of
@@ -68,12 +67,12 @@ class MergePreview:
     other_files: tuple[str, ...]
 
 
-def planned_releases(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release]:
+def planned_releases(world: World) -> dict[ReleaseKey, Release]:
     """Return all releases that can be planned."""
     releases: dict[ReleaseKey, Release] = {}
-    for key in all_keys(ledger, config):
+    for key in all_keys(world):
         try:
-            release = plan(ledger, config, key)
+            release = plan(world, key)
         except InvalidInput:
             continue
         if release is not None:
@@ -81,39 +80,38 @@ def planned_releases(ledger: Ledger, config: Config) -> dict[ReleaseKey, Release
     return releases
 
 
-def render_faults(
-    ledger: Ledger, config: Config, engine: Engine, edited: Collection[str] = ()
-) -> list[Fault]:
+def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) -> list[Fault]:
     """Return the faults that keep releases from being planned or rendered.
 
     A fault's file is the first that exists: a claim of the release that is in ``edited``, the
     fault's own file, any claim of the release.
 
     Args:
-        ledger: the claims.
-        config: the configuration.
-        engine: its engine.
+        world: the configuration and the claims.
+        engine: the configuration's engine.
         edited: the files that a person changed.
     """
     faults: list[Fault] = []
     claim_files: dict[ReleaseKey, list[str]] = {}
-    for key in all_keys(ledger, config):
+    for key in all_keys(world):
         try:
-            release = plan(ledger, config, key)
+            release = plan(world, key)
             if release is not None:
-                manifests.render(release, config, engine)
+                manifests.render(release, world.config, engine)
         except InvalidInput as error:
-            claim_files = claim_files or _claim_files(ledger, config)
+            claim_files = claim_files or _claim_files(world)
             faults += _located(error.faults, claim_files.get(key, []), edited)
     return list(dict.fromkeys(faults))
 
 
-def _claim_files(ledger: Ledger, config: Config) -> dict[ReleaseKey, list[str]]:
+def _claim_files(world: World) -> dict[ReleaseKey, list[str]]:
     """Return the files of the claims that need a release, by release."""
     by_release: dict[ReleaseKey, list[str]] = {}
-    for subject in (Subject(kind, id) for kind in SubjectKind for id in ledger.subjects(kind)):
-        files = [claim_file.path_of(claim.key) for claim in ledger.claims_on(subject)]
-        for key in keys_of(ledger, config, subject):
+    for subject in (
+        Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)
+    ):
+        files = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
+        for key in keys_of(world, subject):
             by_release.setdefault(key, []).extend(files)
     return by_release
 

@@ -302,7 +302,7 @@ class Approvals:
             commit=commit,
             warnings=decision.warnings,
             lease_s=decision.lease_s,
-            targets=targets_of_decision(state.ledger, decision) if self._with_targets else (),
+            targets=targets_of_decision(state, decision) if self._with_targets else (),
         )
 
     def _forget(self, proposal: Proposal, *, close: bool) -> None:

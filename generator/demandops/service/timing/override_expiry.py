@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from datetime import datetime, timedelta
 
-from demandops.config.config import Config
 from demandops.errors import InvalidInput
+from demandops.ledger.world import World
 from demandops.plan.overrides.lifecycle import expired_overrides
 from demandops.staterepo.write.commit_batch import CommitBatch
 
@@ -25,7 +25,7 @@ class OverrideExpiry:
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
         """Commit the end of each expired override; one whose end fails is tried again later."""
-        for override in expired_overrides(commits.head.state.config, now):
+        for override in expired_overrides(commits.head.state, now):
             tried = self._failed.get((override.name, override.end or now))
             if tried is not None and now < tried + _RETRY:
                 continue
@@ -41,20 +41,20 @@ class OverrideExpiry:
         """End no override for a while, because the commits could not be published."""
         self._not_before = now + _RETRY
 
-    def is_due(self, config: Config, now: datetime) -> bool:
+    def is_due(self, world: World, now: datetime) -> bool:
         """Return whether to end an override now."""
-        return any(time <= now for time in self._due_times(config))
+        return any(time <= now for time in self._due_times(world))
 
-    def seconds_until_due(self, config: Config, now: datetime, longest: float) -> float:
+    def seconds_until_due(self, world: World, now: datetime, longest: float) -> float:
         """Return the seconds until the next check: at least one, at most ``longest``."""
-        times = self._due_times(config)
+        times = self._due_times(world)
         wait = (min(times) - now).total_seconds() + 0.01 if times else longest
         return min(max(wait, _SHORTEST_S), longest)
 
-    def _due_times(self, config: Config) -> list[datetime]:
+    def _due_times(self, world: World) -> list[datetime]:
         return [
             self._due_time(override.name, override.end)
-            for override in config.active_overrides
+            for override in world.overrides
             if override.end
         ]
 

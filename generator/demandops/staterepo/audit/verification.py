@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 
-from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.config import CONFIG_ROOTS
 from demandops.decision import State, rendered_files
 from demandops.errors import InvalidInput
 from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import ClaimChange
+from demandops.ledger.world import World
 from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
@@ -121,13 +122,13 @@ class _Proof:
         """Return the files that differ from what was rendered."""
         wanted = self._undemanded | dict(self._planned.values())
         before = trees.parent_tree(self._commit)
-        if before is not None and _holds(self.state.config):
+        if before is not None and _holds(self.state):
             charts = {
                 path: trees.text_of(blob)
                 for path, blob in trees.blobs(before, GENERATED_ROOTS)
                 if _CHARTS in path and path not in wanted
             }
-            kept = release_file.kept_charts({}, charts, self.state.config)
+            kept = release_file.kept_charts({}, charts, self.state)
             wanted |= {path: _blob(text) for path, text in kept.items()}
         return _differing(wanted, self._committed)
 
@@ -183,7 +184,7 @@ class _Proofs:
         proof, self._proof = self._proof, None
         if whole:
             state = self._loaded(entry)
-            before = trees.parent_tree(commit) if _holds(state.config) else None
+            before = trees.parent_tree(commit) if _holds(state) else None
             held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
             files = rendered_files(state, held)
             wanted = {path: _blob(text) for path, text in files.items()}
@@ -219,8 +220,8 @@ def _skip_reason(entry: LogEntry) -> str:
     return ""
 
 
-def _holds(config: Config) -> bool:
-    return any(override.hold for override in config.active_overrides)
+def _holds(world: World) -> bool:
+    return any(override.hold for override in world.overrides)
 
 
 def _generated_files(tree: Tree) -> dict[str, Oid]:

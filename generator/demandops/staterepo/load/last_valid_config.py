@@ -72,7 +72,7 @@ def config_at(tree: Tree) -> Config:
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
-    return load_config(files).with_ended_overrides(ended_overrides_at(tree))
+    return load_config(files)
 
 
 def end_markers_at(tree: Tree) -> dict[str, str]:

@@ -98,9 +98,7 @@ def judge(repo: Repository, advance: Advance, before: Snapshot, tree: Tree) -> J
         tree: the generated files, some of which overrides may hold.
     """
     state, ledger = advance.snapshot.state, before.state.ledger
-    ended = state.config.ended_overrides
-    config = before.state.config.with_ended_overrides(ended)
-    old = replace(before.state, ledger=state.ledger, config=config)
+    old = replace(before.state, ledger=state.ledger)
 
     def faults_in(state: State) -> Faults:
         found = {}
@@ -114,7 +112,7 @@ def judge(repo: Repository, advance: Advance, before: Snapshot, tree: Tree) -> J
         return found
 
     with_new = faults_in(state)
-    with_old = faults_in(old) if state.config != config else with_new
+    with_old = faults_in(old) if state.config != old.config else with_new
     return Judgement(repo, before, advance, with_new, with_old, old)
 
 

@@ -91,7 +91,9 @@ def load(
     found = ledger_files.read(_claim_texts(commit.tree, progress))
     if found.faults:
         raise InvalidInput(found.faults)
-    return Snapshot(commit.id, State.of(config, found.ledger()), commit.id)
+    ended = last_valid_config.ended_overrides_at(commit.tree)
+    ledger = replace(found.ledger(), ended=ended)
+    return Snapshot(commit.id, State.of(config, ledger), commit.id)
 
 
 def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
@@ -123,11 +125,11 @@ def advance(
         known = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
     elif before.problems or trees.differ(old, new, CONFIG_ROOTS):
         known = _last_valid_config(repo, before, to)
-    config = (known.config or state.config).with_ended_overrides(
-        last_valid_config.ended_overrides_at(new)
-    )
-    config_changed = config != state.config or _has_manual_edit(repo, before.commit, to)
-    state = State.of(config, state.ledger) if known.config else replace(state, config=config)
+    config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
+    world_changed = config != state.config or ended != state.ledger.ended
+    config_changed = world_changed or _has_manual_edit(repo, before.commit, to)
+    ledger = replace(state.ledger, ended=ended)
+    state = State.of(config, ledger) if known.config else replace(state, ledger=ledger)
     problems, claims, invalid = list(known.faults), dict[str, Claim | None](), list[str]()
     for path in sorted({*ledger_files.changed_files(old, new), *before.quarantined_files}):
         try:
@@ -179,8 +181,8 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config = load_config(files)
-    if config.with_ended_overrides(state.config.ended_overrides) != state.config:
-        try_configuration(State.of(config, Ledger()))
+    if config != state.config:
+        try_configuration(State.of(config, Ledger(ended=state.ledger.ended)))
     return config
 
 

@@ -21,6 +21,7 @@ from demandops.decision import State, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
 from demandops.plan.overrides.lifecycle import expired_overrides, update_ledger
 from demandops.plan.views.bookkeeping import bookkeeping
 from demandops.plan.views.bookkeeping_diff import EntryChange, bookkeeping_changes
@@ -97,9 +98,9 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
     edited = [
         path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
     ]
-    new = merge_preview.planned_releases(state.ledger, state.config)
+    new = merge_preview.planned_releases(state)
     old = new if start is None else start.releases()
-    idle = warnings(override_report(state.ledger, state.config, edit.now))
+    idle = warnings(override_report(state, edit.now))
     return replace(
         with_faults(edited),
         preview=merge_preview.preview(old, new, edit.generated, wanted),
@@ -141,7 +142,7 @@ class _Edit:
         }
 
     def config(self) -> Config:
-        """Return the configuration, without overrides that have ended or expired."""
+        """Return the configuration."""
         files = {p: text for p, text in self.files.items() if p.split("/")[0] in CONFIG_ROOTS}
         config = load(files)
         version = config.repo_settings.render_version
@@ -152,10 +153,7 @@ class _Edit:
                 "everything again"
             )
             raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
-        config = config.with_ended_overrides(ended_override_file.read(self._markers()))
-        ended = expired_overrides(config, self.now)
-        expired = {one.name: format_time(one.end) for one in ended if one.end}
-        return config.with_ended_overrides({**config.ended_overrides, **expired})
+        return config
 
     def _markers(self) -> dict[str, str]:
         root = f"{ended_override_file.MARKERS_ROOT}/"
@@ -163,23 +161,24 @@ class _Edit:
 
     def merged_state(self, config: Config, ledger: Ledger) -> State:
         """Return the state after the generator has applied the edit."""
-        state = State.of(config, ledger)
+        ended = ended_override_file.read(self._markers())
+        expired = expired_overrides(World(config, replace(ledger, ended=ended)), self.now)
+        ended |= {one.name: format_time(one.end) for one in expired if one.end}
+        state = State.of(config, replace(ledger, ended=ended))
         try_configuration(state)
         if self.start is None or self.start.state is None:
             return state
         old = self.start.state
         subjects = ledger_files.changed_subjects(old.ledger, ledger)
         applied = update_ledger(old, state, subjects, self._markers(), self.now)
-        return replace(state, ledger=applied.ledger, config=applied.config)
+        return replace(state, ledger=applied.ledger)
 
     def rendered(self, state: State) -> dict[str, str]:
         """Return every generated file, or raise the faults of every release."""
         try:
             return rendered_files(state, self.generated)
         except InvalidInput as error:
-            found = merge_preview.render_faults(
-                state.ledger, state.config, state.engine, self.changed
-            )
+            found = merge_preview.render_faults(state, state.engine, self.changed)
             raise InvalidInput(found or error.faults) from None
 
     def unversioned_charts(self, config: Config) -> Iterator[Fault]:
@@ -211,10 +210,10 @@ def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange,
     if start.state is None:
         return None
     try:
-        old = bookkeeping(start.state.ledger, start.state.config)
+        old = bookkeeping(start.state)
     except InvalidInput:
         return None
-    return bookkeeping_changes(old, bookkeeping(state.ledger, state.config))
+    return bookkeeping_changes(old, bookkeeping(state))
 
 
 def _version(text: str) -> object:

@@ -42,7 +42,7 @@ class Base:
         """Return the releases of its state."""
         if self.state is None:
             return {}
-        return merge_preview.planned_releases(self.state.ledger, self.state.config)
+        return merge_preview.planned_releases(self.state)
 
 
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:

@@ -129,7 +129,7 @@ class CommitBatch:
         if not files:
             return
         overrides = [
-            *changed_override_files(before.state.config, followed.snapshot.state.config),
+            *changed_override_files(before.state, followed.snapshot.state),
             *followed.change.overrides,
             *commit_message.keep_override_paths(followed.keys),
         ]
@@ -173,9 +173,7 @@ class CommitBatch:
     def _rendered_subjects(self, accepted: Accepted, before: Snapshot, now: datetime) -> _Followed:
         """Render the subjects that people changed."""
         state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
-        ledger, keys = kept_claims.update_kept_claims(
-            old, state.ledger, subjects, state.config, now
-        )
+        ledger, keys = kept_claims.update_kept_claims(old, state, subjects, now)
         files = changed_claim_files(state.ledger, ledger, keys)
         state = replace(state, ledger=ledger)
         change = changeset_of_edit(state, old, subjects, self.read)
@@ -285,4 +283,4 @@ def _with_started_leases(
 
 
 def _updated(state: State, update: LedgerUpdate) -> State:
-    return replace(state, ledger=update.ledger, config=update.config)
+    return replace(state, ledger=update.ledger)

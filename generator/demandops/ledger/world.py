@@ -1,0 +1,26 @@
+"""The world: the configuration and the ledger in effect at one time, as one value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from demandops.config.config import Config
+from demandops.config.override import Override, by_rank, still_active
+from demandops.ledger.ledger import Ledger
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """What people wrote, and what is booked.
+
+    ``overrides`` are those that have not ended, in the order in which they apply.
+    """
+
+    config: Config
+    ledger: Ledger
+    overrides: tuple[Override, ...] = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Find the overrides that apply."""
+        active = by_rank(still_active(self.config.overrides, self.ledger.ended))
+        object.__setattr__(self, "overrides", active)
