@@ -67,10 +67,7 @@ def demand(
 
 def _read_document(file: str) -> dict[str, Any]:
     name, text = read_input(file)
-    try:
-        data = strict_yaml.load(text)
-    except InvalidInput as error:
-        raise InvalidInput(strict_yaml.faults_in(error, name)) from None
+    data = strict_yaml.load(text, name)
     if not isinstance(data, dict) or data.get("kind") != "Demand":
         message = "must be a mapping with kind: Demand"
         raise InvalidInput([fault("kind", message).within(name)])

@@ -176,10 +176,7 @@ def parse_file(model: type[Model], text: str, file: str) -> Model:
     Raises:
         InvalidInput: with every fault.
     """
-    try:
-        data = strict_yaml.load(text)
-    except InvalidInput as error:
-        raise InvalidInput(strict_yaml.faults_in(error, file)) from None
+    data = strict_yaml.load(text, file)
     if not isinstance(data, dict):
         message = f"must be a mapping that starts with apiVersion: {API_VERSION}"
         raise InvalidInput([fault("", message).within(file)])

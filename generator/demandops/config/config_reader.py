@@ -114,9 +114,9 @@ class ConfigReader:
             self.read_file(file, whole)
             return None
         try:
-            data = strict_yaml.load(text)
+            data = strict_yaml.load(text, file)
         except InvalidInput as error:
-            self.faults += strict_yaml.faults_in(error, file)
+            self.faults += error.faults
             return None
         raw = data.get(field) if isinstance(data, dict) else None
         if not isinstance(data, dict) or not isinstance(raw, kind):

@@ -94,9 +94,9 @@ def _check_chart(where: str, chart: ChartSource, config: Config, reader: ConfigR
         reader.add_fault(CHARTS_FILE, f"{where}.folder", message)
         return
     try:
-        metadata = strict_yaml.load(text)
+        metadata = strict_yaml.load(text, path)
     except InvalidInput as error:
-        reader.faults += strict_yaml.faults_in(error, path)
+        reader.faults += error.faults
         return
     version = metadata.get("version") if isinstance(metadata, dict) else None
     if version != chart.version:

@@ -84,10 +84,7 @@ def request(
 
 def _documents(file: str) -> Iterable[_Document]:
     name, text = read_input(file)
-    try:
-        return [_Document(name, goal) for goal in strict_yaml.load_all(text) if goal is not None]
-    except InvalidInput as error:
-        raise InvalidInput(strict_yaml.faults_in(error, name)) from None
+    return [_Document(name, goal) for goal in strict_yaml.load_all(text, name) if goal is not None]
 
 
 def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str, Any]:
