@@ -76,7 +76,7 @@ class State(World):
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What a demand does. ``files`` is empty if it changes nothing.
+    """The effect of a demand. ``files`` is empty if it changes nothing.
 
     ``approval`` names the access domains, rules and appdefs that require a person's approval first.
     """
@@ -161,7 +161,7 @@ def decide(
 
 
 def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Book a request. It replaces kept claims; overrides may keep what it releases.
+    """Book a request. Its claims replace kept ones; overrides may keep claims that it releases.
 
     Raises:
         Refused: if existing claims, an override or a quota forbid it.

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import logging
 import ssl
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from demandops import __version__
 from demandops.errors import DemandOpsError, quoted
+from demandops.runtime import REAL
 
 if TYPE_CHECKING:
     import httpx
@@ -64,7 +64,7 @@ def call(
     import httpx  # noqa: PLC0415 - a tenth of a second; only when used
 
     headers = {"User-Agent": f"demandops/{__version__}", "Accept-Encoding": "identity", **headers}
-    end = time.monotonic() + 2 * timeout
+    end = REAL.monotonic() + 2 * timeout
     try:
         with (
             httpx.Client(verify=ssl.create_default_context(), timeout=timeout) as client,
@@ -75,7 +75,7 @@ def call(
                 content += chunk
                 if len(content) > _MOST_BYTES:
                     raise NoAnswer(f"the answer is longer than {_MOST_BYTES} bytes; check the URL")
-                if time.monotonic() > end:
+                if REAL.monotonic() > end:
                     raise NoAnswer(_too_slow(timeout))
             return HttpAnswer(answer.status_code, answer.reason_phrase, content)
     except httpx.TimeoutException:
@@ -91,7 +91,7 @@ def _too_slow(timeout: float) -> str:
 
 
 def _cause(error: httpx.TransportError) -> str:
-    """Return why there is no answer, without what was sent."""
+    """Return why there is no answer; the text holds nothing that was sent."""
     if type(error).__name__ in ("LocalProtocolError", "UnsupportedProtocol"):
         return "the URL or a header is not valid; check them"
     text = str(error) or type(error).__name__

@@ -33,7 +33,7 @@ def control_character(text: str) -> str:
 
 
 def id_problem(value: str) -> str:
-    """Return what is wrong with an id, or an empty string.
+    """Return the problem of an id, or an empty string.
 
     Nearly all text is valid. Invisible characters and paths out of a folder are not.
     """

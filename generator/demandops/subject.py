@@ -1,4 +1,4 @@
-"""Subjects: what claims are on, an application or a connection by its exact id."""
+"""Subjects: the application or connection, by its exact id, that a claim holds."""
 
 from __future__ import annotations
 

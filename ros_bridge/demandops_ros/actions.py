@@ -29,7 +29,7 @@ ANSWER_LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
 
 
 class ActionAdapter(Protocol):
-    """What the node needs to know of one action."""
+    """The part of the node that is specific to one action."""
 
     action: Any
 

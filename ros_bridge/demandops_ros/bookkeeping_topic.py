@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
 from functools import partial
-from threading import Event, Thread
 from typing import Any
 
 from demandops.errors import DemandOpsError
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.runtime import REAL
 from demandops.service import Generator
 from demandops.staterepo import reader
 from demandops_interfaces.msg import Bookkeeping as BookkeepingMessage
@@ -58,10 +57,10 @@ class BookkeepingTopic:
         self._generator = generator
         self._in_executor = in_executor
         self._publisher = node.create_publisher(BookkeepingMessage, "~/bookkeeping", _LATCHED)
-        self._changed, self._closed = Event(), Event()
+        self._changed, self._closed = REAL.event(), REAL.event()
         self._changed.set()
         generator.on_publish(lambda config: self._changed.set())
-        Thread(target=self._run, name="demandops-bookkeeping-topic", daemon=True).start()
+        REAL.start_thread("bookkeeping-topic", self._run)
 
     def close(self) -> None:
         """Stop publishing."""
@@ -71,14 +70,14 @@ class BookkeepingTopic:
     def _run(self) -> None:
         while self._changed.wait() and not self._closed.is_set():
             self._changed.clear()
-            began = time.monotonic()
+            began = REAL.monotonic()
             snapshot = self._generator.snapshot
             books = bookkeeping(snapshot.state)
             commit = str(snapshot.commit)
             text = json.dumps(as_data(books, commit), ensure_ascii=False)
             message = BookkeepingMessage(commit=commit, bookkeeping_json=text)
             self._in_executor(partial(self._publish, message))
-            took = time.monotonic() - began
+            took = REAL.monotonic() - began
             self._closed.wait(max(_SHORTEST_PAUSE_S, took * _PAUSE_FACTOR))
 
     def _publish(self, message: Any) -> None:  # noqa: ANN401

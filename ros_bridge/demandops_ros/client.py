@@ -14,14 +14,14 @@ Applications and connections have the fields of a YAML document of the kind ``De
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from threading import Event, Thread
+from functools import partial
 from typing import Any
 
 import rclpy
 from action_msgs.msg import GoalStatus
+from demandops.runtime import REAL, Thread
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops_interfaces.action import Demand
 from rclpy.action import ActionClient
@@ -108,11 +108,10 @@ class DemandClient:
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._spinner = Thread(target=self._executor.spin, name="demandops-client", daemon=True)
-        self._spinner.start()
+        self._spinner = REAL.start_thread("client", self._executor.spin)
 
     def __enter__(self) -> DemandClient:
-        """Return itself."""
+        """Return the client itself."""
         return self
 
     def __exit__(self, *reason: object) -> None:
@@ -137,7 +136,7 @@ class DemandClient:
         request: str = "",
         on_stage: StageListener = lambda stage, text: None,
     ) -> Answer:
-        """Set what a demand consists of, and return once that is published.
+        """Replace the content of a demand; return when that is published.
 
         Args:
             demand: the demand's id.
@@ -185,7 +184,7 @@ class DemandClient:
     ) -> Answer:
         """Send a document of the kind ``Demand`` and wait for the answer; see :meth:`put`."""
         goal = demand_goal_from_data({"requesters": list(self.requesters), **data})
-        deadline = time.monotonic() + self.timeout_s
+        deadline = REAL.monotonic() + self.timeout_s
         if not self._client.wait_for_server(timeout_sec=self.timeout_s):
             raise DemandError(
                 "no-server", f"no node serves {self._action_name}; start one with demandops serve"
@@ -222,16 +221,16 @@ class DemandClient:
                 goal, feedback_callback=lambda fb: on_stage(fb.feedback.stage, fb.feedback.message)
             )
             try:
-                return self._await(sent, min(deadline, time.monotonic() + _UNHEARD_S)), lost
+                return self._await(sent, min(deadline, REAL.monotonic() + _UNHEARD_S)), lost
             except DemandError:
-                if time.monotonic() >= deadline:
+                if REAL.monotonic() >= deadline:
                     raise
                 lost = True
 
     def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
-        done = Event()
+        done = REAL.event()
         future.add_done_callback(lambda _: done.set())
-        if not done.wait(max(0.0, deadline - time.monotonic())):
+        if not done.wait(max(0.0, deadline - REAL.monotonic())):
             raise DemandError(
                 "timeout", f"no answer on {self._action_name} within {self.timeout_s:g} s"
             )
@@ -247,7 +246,7 @@ class HeldDemand:
         self.answer: Answer | None = None
         self._client = client
         self._put = put
-        self._over = Event()
+        self._over = REAL.event()
         self._renewer: Thread | None = None
 
     def __enter__(self) -> HeldDemand:
@@ -255,13 +254,8 @@ class HeldDemand:
         self.answer = self._put()
         self.commit = self.answer.commit
         if self.answer.lease_s:
-            self._renewer = Thread(
-                target=self._renew_until_over,
-                args=(self.answer.lease_s,),
-                name="demandops-lease",
-                daemon=True,
-            )
-            self._renewer.start()
+            renew = partial(self._renew_until_over, self.answer.lease_s)
+            self._renewer = REAL.start_thread("lease", renew)
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:

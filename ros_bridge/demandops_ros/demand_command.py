@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-from threading import Event
 from typing import Any
 
 import click
@@ -12,6 +11,7 @@ from demandops.cli.json_output import output_option, print_json
 from demandops.cli.output import console, errors
 from demandops.errors import InvalidInput, fault
 from demandops.input_file import read_input
+from demandops.runtime import REAL
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 
 from demandops_ros.client import Answer, DemandClient, DemandError
@@ -99,7 +99,7 @@ def _print_answer(answer: Answer, output: str) -> None:
 
 
 def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
-    over = Event()
+    over = REAL.event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.set())
     client.requesters = tuple(data.get("requesters", ()))

@@ -38,7 +38,7 @@ _ANSWERS = ("pushed", "reconciled", "healthy")
 
 
 def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return a ``Demand.Goal`` as what :func:`demandops.demand.demand_goal.parse` takes.
+    """Return a ``Demand.Goal`` as plain data for :func:`demandops.demand.demand_goal.parse`.
 
     A number that the message does not define becomes text, which the parser refuses by field.
     """

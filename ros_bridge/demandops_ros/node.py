@@ -12,12 +12,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from threading import Thread
 from typing import Any
 
 from demandops.cluster.health import Level
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.errors import NotReached, QueueFull, ShuttingDown, Withdrawn
+from demandops.runtime import REAL
 from demandops.service import Generator, Receipt
 from demandops_interfaces.srv import GetBookkeeping
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -122,7 +122,7 @@ class DemandNode(Node):  # type: ignore[misc]
             filled = fill_response(self._generator, request, response)
             self._from_worker(partial(done.set_result, filled))
 
-        Thread(target=work, name="demandops-bookkeeping", daemon=True).start()
+        REAL.start_thread("bookkeeping", work)
         return await done
 
     # ---- callbacks of the action server, in the executor's thread ----

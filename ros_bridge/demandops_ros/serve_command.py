@@ -6,9 +6,7 @@ import logging
 import os
 import signal
 import tempfile
-import time
 from pathlib import Path
-from threading import Event, Thread
 from types import FrameType
 from typing import Any
 
@@ -17,6 +15,7 @@ import rclpy
 from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_watcher import RolloutWatcher
+from demandops.runtime import REAL
 from demandops.service import Generator, push_webhook
 from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
 from demandops.service.web_app import WebApp
@@ -216,8 +215,7 @@ def _run(
     executor.add_node(node)
     signals = _Signals()
     # the executor spins in a thread, so that the main thread notices a signal at once
-    spinner = Thread(target=executor.spin, name="demandops-executor")
-    spinner.start()
+    spinner = REAL.start_thread("executor", executor.spin)
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
     if web_app is not None:
@@ -246,12 +244,12 @@ def _drain(
     if status is not None:
         status.close()  # answers the goals that wait for a rollout
     while node.open_goals:
-        time.sleep(_POLL_S)
+        REAL.sleep(_POLL_S)
     for _ in range(2):  # results are sent by tasks of the executor: wait until they have run
-        done = Event()
+        done = REAL.event()
         executor.create_task(done.set)
         done.wait(_TASK_S)
-    time.sleep(_FLUSH_S)  # time for clients to request them
+    REAL.sleep(_FLUSH_S)  # time for clients to request them
     if not published:
         node.get_logger().warning(
             "the journal is not empty; its demands are resumed at the next start"

@@ -631,7 +631,7 @@ class TestYamlAttacks:
             taken_s, shown = time.monotonic() - start, repr(content[:24])
             assert (ran.code, ran.out) == (1, ""), (shown, ran.err)
             assert str(file) in ran.err, shown
-            assert "fault of" not in ran.err, f"{shown} is the user's to mend"
+            assert "fault of" not in ran.err, f"{shown} is the user's to fix"
             assert len(ran.err) < 5000, f"{shown}: a message that nobody reads"
             assert state.tip == before, shown
             assert taken_s < 5, shown

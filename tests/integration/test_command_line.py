@@ -1,6 +1,6 @@
 """The command line of design §7: text, JSON and exit codes of every command.
 
-Exit codes: 0 done, 1 the user's to mend, 2 wrong usage, 3 a fault of the program.
+Exit codes: 0 done, 1 the user's to fix, 2 wrong usage, 3 a fault of the program.
 """
 
 from __future__ import annotations

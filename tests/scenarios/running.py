@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from datetime import datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +25,7 @@ from demandops.service.timing.lease_expiry import LeaseClock
 from demandops.service.timing.rate_limit import RateLimit
 from pydantic import Field, model_validator
 
+from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
 from tests.kit.config import skeleton
 from tests.kit.memory import NOW as START
@@ -162,33 +163,12 @@ def configuration(
 # ---- the state repo ----
 
 
-class Clocks:
-    """A wall clock that can be set, and a steady one."""
-
-    def __init__(self) -> None:
-        self.now = START
-        self._steady = 0.0
-
-    def wall(self) -> datetime:
-        return self.now
-
-    def steady(self) -> float:
-        return self._steady
-
-    def pass_(self, seconds: float) -> None:
-        self.now += timedelta(seconds=seconds)
-        self._steady += seconds
-
-    def set_by(self, seconds: float) -> None:
-        self.now += timedelta(seconds=seconds)
-
-
 class World(MemoryRepo):
     """A state repo in memory, and one generator at it."""
 
     def __init__(self, state: State, config: Mapping[str, str]) -> None:
         super().__init__(state=state)
-        self.clocks = Clocks()
+        self.clock = Clock(START)
         self.configure(state, config)
         self._sent = 0
         self.restart()
@@ -203,13 +183,13 @@ class World(MemoryRepo):
 
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
-        self._lease_clock = LeaseClock(self.clocks.wall, self.clocks.steady)
+        self._lease_clock = LeaseClock(self.clock)
         self._throttle = RateLimit()
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
         """Decide a goal; nothing changes."""
         self._sent += 1
-        operation, now = f"hand-in-{self._sent}", now or self.clocks.now
+        operation, now = f"hand-in-{self._sent}", now or self.clock.now()
         return decide(
             self.state,
             goal,
@@ -296,10 +276,10 @@ def run(scenario: Scenario) -> None:
 
 
 def _take(step: Step, world: World, place: str) -> None:
-    world.clocks.pass_(seconds_of(step.after))
+    world.clock.pass_(seconds_of(step.after))
     if step.clock:
         sign = -1 if step.clock.startswith("-") else 1
-        world.clocks.set_by(sign * seconds_of(step.clock.removeprefix("-")))
+        world.clock.set_by(sign * seconds_of(step.clock.removeprefix("-")))
     if step.restart:
         world.restart()
     assert world.look() == (step.expires or []), f"{place}: these must expire, and no others"

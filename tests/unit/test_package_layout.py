@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -69,6 +70,14 @@ def test_a_module_name_occurs_once() -> None:
 @pytest.mark.parametrize("name", sorted(SAME_NAME))
 def test_an_allowed_name_still_occurs_more_than_once(name: str) -> None:
     assert sum(path.stem == name for path in MODULES) > 1
+
+
+def test_only_the_runtime_reads_a_clock_or_starts_threads() -> None:
+    """What the contract `door-runtime` does not see, because `datetime` may be imported."""
+    uses = re.compile(r"\b(datetime|date)\.(now|utcnow|today)\(|PoolExecutor\b|\burandom\(")
+    assert [dotted(path) for path in MODULES if uses.search(path.read_text())] == [
+        "demandops.runtime.py"
+    ]
 
 
 def test_a_folder_has_at_most_twelve_modules() -> None:

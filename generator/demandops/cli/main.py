@@ -75,7 +75,7 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command that the arguments name, imported, and its arguments."""
+        """Import the command that the arguments name; return its name, it and its arguments."""
         name, command, rest = super().resolve_command(ctx, args)
         return name, load(name) if name else command, rest
 

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from demandops.runtime import REAL
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -101,15 +102,15 @@ at_option = click.option(
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Yield a function that shows progress on a terminal, unless the work is short."""
-    start = time.monotonic()
+    """Yield a function that shows a progress bar, on a terminal and if the work takes long."""
+    start = REAL.monotonic()
     bar: Bar | None = None
     task: Any = None
 
     def show(done: int, total: int) -> None:
         nonlocal bar, task
         if bar is None:
-            if not sys.stderr.isatty() or time.monotonic() - start < _PATIENCE_S or done >= total:
+            if not sys.stderr.isatty() or REAL.monotonic() - start < _PATIENCE_S or done >= total:
                 return
             from rich.progress import Progress as Bar  # noqa: PLC0415
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 from demandops.cluster.access import ClusterAccess
 from demandops.cluster.health import Key, ObjectSelector
+from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
 
@@ -27,16 +28,22 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 class ObjectCache:
     """The objects of one cluster that callers asked for."""
 
-    def __init__(self, name: str, access: ClusterAccess, on_change: Callable[[], None]) -> None:
-        self.name = name
+    def __init__(
+        self,
+        name: str,
+        access: ClusterAccess,
+        on_change: Callable[[], None],
+        runtime: Runtime = REAL,
+    ) -> None:
+        self.name, self._runtime = name, runtime
         self._access = access
         self._on_change = on_change
-        self._lock = threading.Lock()
+        self._lock = runtime.lock()
         self._objects: dict[Key, dict[str, Any]] = {}
         self._watched: set[ObjectSelector] = set()
         self._known: set[ObjectSelector] = set()
         self._errors: dict[ObjectSelector, str] = {}
-        self._closed = threading.Event()
+        self._closed = runtime.event()
         self._client: Any = None
 
     @property
@@ -52,12 +59,8 @@ class ObjectCache:
                 if selector in self._watched or self._closed.is_set():
                     continue
                 self._watched.add(selector)
-            threading.Thread(
-                target=self._keep_watching,
-                args=(selector,),
-                name=f"demandops-watch-{self.name}-{selector.kind}",
-                daemon=True,
-            ).start()
+            name = f"watch-{self.name}-{selector.kind}"
+            self._runtime.start_thread(name, partial(self._keep_watching, selector))
 
     def objects(self) -> dict[Key, dict[str, Any]]:
         """Return the objects that are known now."""

@@ -7,10 +7,7 @@ controller fetches at its next interval.
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Callable, Iterable, Mapping
-from datetime import datetime, timezone
 from typing import Any
 
 from demandops.cluster import controller_webhook
@@ -21,6 +18,7 @@ from demandops.config.repo_settings import RepoSettings
 from demandops.http_call import NoAnswer
 from demandops.render.gitops.argocd import project_of
 from demandops.render.gitops.paths import domain_folder, domains_in_use
+from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
 
@@ -39,18 +37,23 @@ ChangesSince = Callable[[str], tuple[str, list[str] | None]]
 class ReconcileTrigger:
     """Wakes clusters from its own thread, once for several pushes in a short time."""
 
-    def __init__(self, clusters: Mapping[str, ClusterAccess], changes_since: ChangesSince) -> None:
+    def __init__(
+        self,
+        clusters: Mapping[str, ClusterAccess],
+        changes_since: ChangesSince,
+        runtime: Runtime = REAL,
+    ) -> None:
+        self._runtime = runtime
         self._changes_since = changes_since
         self._reported: dict[str, str] = {}
         self._clusters = {name: access for name, access in clusters.items() if access.wake}
         self._config: Config | None = None
         self._apis: dict[str, Any] = {}
-        self._due = threading.Event()
+        self._due = runtime.event()
         self._stopping = False
-        self._stop = threading.Event()
+        self._stop = runtime.event()
         self._woken_at = -_SPACING_S
-        self._thread = threading.Thread(target=self._run, name="demandops-wake", daemon=True)
-        self._thread.start()
+        self._thread = runtime.start_thread("wake", self._run)
 
     def __call__(self, config: Config) -> None:
         """Request a wake after a push; returns at once."""
@@ -72,7 +75,7 @@ class ReconcileTrigger:
             self._due.clear()
             if not self._stopping:
                 self._stop.wait(self._seconds_until_next())
-            self._woken_at = time.monotonic()
+            self._woken_at = self._runtime.monotonic()
             stopping = self._stopping
             if fresh:
                 missed, pause = set(self._clusters), _FIRST_RETRY_S
@@ -106,7 +109,7 @@ class ReconcileTrigger:
 
     def _seconds_until_next(self) -> float:
         """Return how long to wait before the next wake, because pushes come in bursts."""
-        return max(0.0, self._woken_at + _SPACING_S - time.monotonic())
+        return max(0.0, self._woken_at + _SPACING_S - self._runtime.monotonic())
 
     def _wake(self, name: str, access: ClusterAccess, config: Config) -> None:
         argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
@@ -142,7 +145,7 @@ class ReconcileTrigger:
         self._reported[name] = commit
 
     def _annotate_sources(self, name: str, access: ClusterAccess, config: Config) -> None:
-        now = datetime.now(timezone.utc).isoformat()
+        now = self._runtime.now().isoformat()
         for domain in _domains(name, config):
             self._api(name, access).patch_namespaced_custom_object(
                 *_refresh_patch(domain, config.repo_settings, now), _request_timeout=_TIMEOUT_S

@@ -7,8 +7,6 @@ only the rollouts on it.
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
@@ -27,6 +25,7 @@ from demandops.cluster.health import (
     worst,
 )
 from demandops.cluster.object_cache import ObjectCache
+from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
 
@@ -55,25 +54,30 @@ class _Rollout:
 class RolloutWatcher:
     """Follows releases on the clusters that the operator's file names."""
 
-    def __init__(self, clusters: Mapping[str, ClusterAccess], history: History) -> None:
+    def __init__(
+        self,
+        clusters: Mapping[str, ClusterAccess],
+        history: History,
+        runtime: Runtime = REAL,
+    ) -> None:
         """Start without watches; the watches of a domain start with its first rollout.
 
         Args:
             clusters: the access to each cluster; clusters without a kubeconfig are ignored.
             history: the commits of the state repo; called from the status thread.
+            runtime: tells the time and runs the threads.
         """
-        self._history = history
-        self._changed = threading.Event()
+        self._history, self._runtime = history, runtime
+        self._changed = runtime.event()
         self._closed = False
-        self._lock = threading.Lock()
+        self._lock = runtime.lock()
         self._open: list[_Rollout] = []
         self._caches = {
-            name: ObjectCache(name, access, self._changed.set)
+            name: ObjectCache(name, access, self._changed.set, runtime)
             for name, access in clusters.items()
             if access.kubeconfig
         }
-        self._thread = threading.Thread(target=self._run, name="demandops-status", daemon=True)
-        self._thread.start()
+        self._thread = runtime.start_thread("status", self._run)
 
     def why_unreachable(self, domains: Iterable[ClusterDomain]) -> str:
         """Return why releases in these domains cannot be followed; empty if they can."""
@@ -103,7 +107,7 @@ class RolloutWatcher:
         """
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))
-        deadline = time.monotonic() + timeout
+        deadline = self._runtime.monotonic() + timeout
         rollout = _Rollout(commit, domains, targets, level, deadline, on_progress)
         for domain in domains:
             self._caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
@@ -125,7 +129,7 @@ class RolloutWatcher:
             self._changed.wait(_LONGEST_WAIT_S)
             self._changed.clear()
             self._evaluate()
-            time.sleep(_PAUSE_S)  # changes come in bursts
+            self._runtime.sleep(_PAUSE_S)  # changes come in bursts
         self._evaluate(last=True)
 
     def _evaluate(self, last: bool = False) -> None:
@@ -145,7 +149,7 @@ class RolloutWatcher:
             rollout.failed = health if health.failing else rollout.failed
             if health.reaches(rollout.level) or last:
                 self._resolve(rollout, health)
-            elif time.monotonic() > rollout.deadline:
+            elif self._runtime.monotonic() > rollout.deadline:
                 self._in_background(rollout, partial(self._time_out, health=health))
 
     def _in_background(self, rollout: _Rollout, work: Callable[[_Rollout], None]) -> None:
@@ -160,7 +164,7 @@ class RolloutWatcher:
             rollout.busy = False
             self._changed.set()
 
-        threading.Thread(target=run, name="demandops-status-ask", daemon=True).start()
+        self._runtime.start_thread("status-ask", run)
 
     def _confirm(self, rollout: _Rollout) -> None:
         for domain in rollout.domains:

@@ -139,7 +139,7 @@ class ApplicationDefinition(FileModel):
         return self
 
     def sources(self) -> list[str]:
-        """Return what a service's input may name: roles, and outputs of per-topic services."""
+        """Return the sources that a service may name: roles, and outputs of per-topic services."""
         outputs = [
             f"{name}.{output}"
             for name, service in self.services.items()

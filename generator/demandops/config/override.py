@@ -128,7 +128,7 @@ class Selector(FrozenModel):
         others = [name for name in ("applications", "appdefs", "services") if getattr(self, name)]
         if self.connections and others:
             raise ValueError(
-                f"connections and {others[0]} never match the same thing; write two selectors"
+                f"nothing matches both connections and {others[0]}; write two selectors"
             )
         return self
 
@@ -147,7 +147,7 @@ class ImagePin(FrozenModel):
         return self
 
     def over(self, image: Image) -> Image:
-        """Return the pinned image; a tag or a digest replaces both."""
+        """Return the pinned image. A pinned tag removes the image's digest, and the reverse."""
         anew = self.tag or self.digest
         return Image(
             repository=self.repository or image.repository,
@@ -185,7 +185,7 @@ class OverrideFile(FileModel):
         return self
 
     def _misplaced(self) -> Iterable[str]:
-        """Yield a problem for each effect that the selected things cannot have."""
+        """Yield a problem for each effect that the selected releases and claims cannot have."""
         effects = self.effects()
         for index, selector in enumerate(self.select):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]

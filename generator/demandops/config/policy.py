@@ -54,7 +54,7 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
 
 
 class Rule(CamelModel):
-    """What some requesters may demand; a demand needs a rule for each of its requesters.
+    """The demands that some requesters may make; each requester of a demand needs such a rule.
 
     ``nodes`` are the nodes of applications and the ends of connections, ``brokers`` the nodes of
     brokers. ``approval`` defaults to the access domain's.

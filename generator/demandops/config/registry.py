@@ -64,8 +64,8 @@ class Chart(ChartSource):
             other = seen.setdefault(source.version, f"channel '{name}'")
             if other != f"channel '{name}'":
                 raise ValueError(
-                    f"channels.{name} has version {source.version}, as {other} has; one version "
-                    "is one chart, so give each its own"
+                    f"channels.{name} and {other} have the same version, {source.version}; give "
+                    "each its own, because a version names one chart"
                 )
         return self
 

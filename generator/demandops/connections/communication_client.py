@@ -58,11 +58,11 @@ class Client(ABC):
     @property
     @abstractmethod
     def description(self) -> str:
-        """What it is, for commit messages."""
+        """Its description in commit messages."""
 
     @abstractmethod
     def facts(self) -> list[str]:
-        """Return what people should know of it, one line each; commit messages list changes."""
+        """Return one line for each fact about it; commit messages show the changed lines."""
 
     @abstractmethod
     def configuration(self) -> dict[str, Any]:
@@ -100,5 +100,5 @@ class End(Client):
         return [route.fact for route in self.topics]
 
     def reads(self, route: Route) -> bool:
-        """Return whether this end reads the topic from ROS, and the other end publishes it."""
+        """Return whether this end reads the topic from ROS; the other end then publishes it."""
         return route.reverse is (self.side == "target")

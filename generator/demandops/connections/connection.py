@@ -1,4 +1,4 @@
-"""Connections: what a demand asks for, a claim holds, and clients are planned for."""
+"""Connections: demands list them, claims hold them, and clients are planned from them."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ class Connection:
         )
 
     def without(self, listed: Connection) -> tuple[Connection | None, list[str]]:
-        """Return what remains without the listed topics, if anything, and those it did not have.
+        """Return the connection without the listed topics, and the listed topics that it lacks.
 
-        If none is listed, nothing remains.
+        Without a topic it is ``None``. If no topic is listed, all are removed.
         """
         if not listed.topics:
             return None, []
@@ -94,11 +94,11 @@ class Connection:
         return remaining, [f"topic {topic}" for topic in missing]
 
     def without_node(self, node: str) -> Connection | None:
-        """Return what remains of it without a node, if anything: another broker may do."""
+        """Return it without a node; ``None`` if an end is lost. Another broker may replace one."""
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield what the ledger finds it by."""
+        """Yield the entries by which the ledger's index finds it."""
         for end in self.nodes:
             yield ("link", str(self.type), end)
         if self.broker:

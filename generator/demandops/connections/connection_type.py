@@ -71,7 +71,7 @@ class ConnectionType(ABC):
         return f"{self.number} ({self.name})"
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield the faults of a configuration that this type cannot work with."""
+        """Yield the faults of a configuration that prevent this type from working."""
         return iter(())
 
     def shares_clients(self, config: Config) -> bool:
@@ -88,7 +88,7 @@ class ConnectionType(ABC):
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield what else it does not support in a route from ``sender``."""
+        """Yield the other faults of a route from ``sender``, for example of its options."""
         return iter(())
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
@@ -110,7 +110,7 @@ class ConnectionType(ABC):
 
 
 def unplannable(field: str, message: str, code: str = UNSUPPORTED) -> Refused:
-    """Return the error that a claimed connection cannot be planned."""
+    """Return the error for a claimed connection that cannot be planned."""
     return Refused([fault(field, message, code=code)])
 
 

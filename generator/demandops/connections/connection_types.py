@@ -38,7 +38,7 @@ def by_number() -> list[ConnectionType]:
 
 
 def type_word(*before: str, after: tuple[str, ...] = ()) -> PlainValidator:
-    """Return the validator of a field that holds a type's word, or one of some other words."""
+    """Return the validator of a field that accepts the types' words and the given words."""
 
     def words() -> tuple[str, ...]:
         return (*before, *(known.word for known in by_number()), *after)

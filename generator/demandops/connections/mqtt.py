@@ -46,13 +46,13 @@ class Mqtt(ConnectionType):
     speaks_dds = False
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield that there is a broker, but no image."""
+        """Yield a fault if there is a broker, but no image for the clients."""
         if config.brokers and reader.is_missing(IMAGES_FILE, self.image):
             message = f"'{self.image}' is missing; add it, because MQTT connections run it"
             yield fault("images", message).within(IMAGES_FILE)
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield that there is no broker; if none is named, it follows from the ends."""
+        """Yield a fault if there is no broker; unless one is named, the ends decide which it is."""
         if (
             not connection.broker
             and not {connection.source, connection.target} <= config.nodes.keys()

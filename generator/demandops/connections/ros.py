@@ -88,8 +88,8 @@ class Ros(ConnectionType):
             if found is not None and _listener(found, config) is listener:
                 message = (
                     f"connection '{key.id}' would listen on port {port} of "
-                    f"'{listener.id}', as '{other}' does; use another connection id, or widen "
-                    "firstPort and lastPort of its wan"
+                    f"'{listener.id}', but '{other}' listens there; use another connection id, or "
+                    f"widen firstPort and lastPort under wan of '{listener.id}'"
                 )
                 raise unplannable("connections", message)
         connection = replace(connection, topics=typed)

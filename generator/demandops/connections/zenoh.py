@@ -72,8 +72,8 @@ class Zenoh(ConnectionType):
             yield fault(
                 "type",
                 f"{self.label} finds no route between '{source.id}' and '{target.id}'; give one "
-                f"of them an endpoint under zenoh in {NODES_FILE}, or both one router under "
-                "connect",
+                f"of them an endpoint under zenoh in {NODES_FILE}, or add the same router to "
+                "connect of both",
                 code=UNSUPPORTED,
             )
 
@@ -101,7 +101,7 @@ class Zenoh(ConnectionType):
                     message = (
                         f"rate {route.rate} of '{route.read_topic}' in '{id}' contradicts an "
                         f"existing claim: '{other}' carries it from '{key.id}' with rate {rate}, "
-                        "and the node's bridge has one for each topic; use the same"
+                        "and the node's bridge has one rate for each topic; use the same rate"
                     )
                     raise unplannable("connections", message, "conflict")
         if not peers:

@@ -1,4 +1,4 @@
-"""Applications: what a demand asks for, a claim holds, and services are planned for."""
+"""Applications: demands list them, claims hold them, and services are planned from them."""
 
 from __future__ import annotations
 
@@ -105,9 +105,9 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def without(self, listed: Application) -> tuple[Application | None, list[str]]:
-        """Return what remains without the listed inputs, if anything, and those it did not have.
+        """Return the application without the listed inputs, and the listed inputs that it lacks.
 
-        If none is listed, nothing remains.
+        Without an input it is ``None``. If no input is listed, all are removed.
         """
         if not any(listed.inputs.values()):
             return None, []
@@ -127,7 +127,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return (self.with_inputs(left) if any(left.values()) else None), missing
 
     def without_node(self, node: str) -> Application | None:
-        """Return what remains of it without a node, if anything."""
+        """Return it without a node and the node's inputs; ``None`` if nothing is left."""
         if self.node == node:
             return None
         left = {
@@ -137,7 +137,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return self.with_inputs(left) if any(left.values()) else None
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield what the ledger finds it by."""
+        """Yield the entries by which the ledger's index finds it."""
         yield ("node", self.node)
         for _, topic in self.all_inputs():
             yield ("takes", topic.source, topic.topic)

@@ -20,7 +20,7 @@ from demandops.demand.permission import Access, first_uncovered, needed_access
 def approval_reasons(
     request: DemandRequest, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
 ) -> tuple[str, ...]:
-    """Return what requires approval of a request, each once: ``access domain 'edge'``.
+    """Return the reasons why a request needs approval, each once: ``access domain 'edge'``.
 
     Renewals, releases and the claims of overrides need no approval.
 
@@ -56,7 +56,7 @@ def _reasons(claim: Claim, config: Config) -> Iterator[str]:
 
 
 def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Iterator[str]:
-    """Yield what requires approval, unless one rule grants the access without it."""
+    """Yield the reasons for approval, unless one rule grants the access without approval."""
     rules = [
         rule
         for rule in domain.rules

@@ -28,10 +28,10 @@ CurrentConnection = Callable[[str], Connection | None]
 def with_chosen_types(
     request: AnyRequest, config: Config, current: CurrentConnection
 ) -> AnyRequest:
-    """Return ``request`` with a chosen type for each connection that leaves it open.
+    """Return ``request`` with a type for each connection that has none.
 
-    A claimed connection keeps its current type. Another gets the first type that can carry it
-    (:func:`type_faults`); it stays open if none can.
+    A claimed connection keeps its current type. A new one gets the first type that can carry it
+    (:func:`type_faults`); if no type can, it still has none.
     """
 
     def chosen(one: Demanded) -> Demanded:
@@ -45,7 +45,7 @@ def with_chosen_types(
 
 
 def choose_type(connection: Connection, config: Config) -> ConnectionType | None:
-    """Return the type for a connection that leaves it open, or ``None`` if none can carry it."""
+    """Return the first type that can carry a connection, or ``None`` if no type can."""
     for kind in connection_types.CONNECTION_TYPES:
         if next(type_faults(kind, connection, config), None) is None:
             return kind

@@ -143,7 +143,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 class _Place(Place):
-    """Where a goal lists something; its requesters stand above it."""
+    """The field of a goal's application or connection; the goal has one list of requesters."""
 
     def at(self, path: str) -> str:
         """Return the goal's field for a field below it."""

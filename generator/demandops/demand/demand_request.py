@@ -1,4 +1,4 @@
-"""Demand requests: what one request asks of the ledger, one class for each operation.
+"""Demand requests: one class for each operation on the ledger.
 
 Goals of ROS actions and YAML files are parsed into these values. :func:`faults` yields all faults
 of their contents. How each is carried out: :mod:`demandops.ledger.apply`.
@@ -22,7 +22,7 @@ from demandops.subject import Subject
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a goal lists an application or a connection, for the fields of faults."""
+    """The field of a goal that lists an application or a connection, to locate faults."""
 
     field: str
 
@@ -33,7 +33,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Demanded:
-    """One application or connection that a request lists, and who it is for."""
+    """One application or connection that a request lists, and its requesters."""
 
     held: Application | Connection
     requesters: tuple[str, ...]

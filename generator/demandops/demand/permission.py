@@ -60,7 +60,7 @@ def _service_nodes(app: Application, config: Config) -> Iterable[str]:
 
 
 def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
-    """Yield a fault for each requester without a rule of the domain that grants the access."""
+    """Yield a fault for each requester to whom no rule of the domain grants the access."""
     for index, requester in enumerate(one.requesters if domain.rules else ()):
         own = [rule for rule in domain.rules if matches(requester, rule.requesters)]
         misses = [first_uncovered(rule, access) for rule in own]
@@ -69,7 +69,8 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
         if not own:
             rules = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
             message = (
-                f"no rule of access domain '{domain.name}' is for '{requester}'; its rules: {rules}"
+                f"no rule of access domain '{domain.name}' is for '{requester}', only {rules}; "
+                "have policy/ changed"
             )
         else:
             reasons = "; ".join(
@@ -77,7 +78,7 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
                 f"{kind} {' '.join(getattr(rule, kind))}, not '{value}'"
                 for rule, (kind, value) in zip(own, filter(None, misses), strict=True)
             )
-            message = f"{reasons}; ask for what is allowed, or have policy/ changed"
+            message = f"{reasons}; request what is allowed, or have policy/ changed"
         yield one.fault(f"requesters[{index}]", message, code="not-allowed")
 
 
@@ -94,8 +95,8 @@ def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
         return
     yield fault(
         "lease",
-        f"is {lease_s} s, above leases.longest of access domain '{domain.name}', {longest}; "
-        "request that, and renew",
+        f"is {lease_s} s, but leases.longest of access domain '{domain.name}' is {longest}; "
+        "request a shorter lease, and renew it",
         code="not-allowed",
     )
 

@@ -1,6 +1,8 @@
 """Forges: opens pull requests for proposals, with the API of GitHub or Gitea (Forgejo).
 
-Knows pull requests and HTTP, but not demands or Git: the branch has already been pushed.
+Knows pull requests and HTTP, but not demands or Git: the branch has already been pushed. GitLab
+needs no call: it opens a merge request because of the push's options
+(:mod:`demandops.staterepo.write.proposal_branch`).
 """
 
 from __future__ import annotations
@@ -8,9 +10,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from demandops.config.repo_settings import Proposals
-from demandops.forge.forge import Forge, ForgeError, PullRequest
 from demandops.forge.gitea import Gitea
 from demandops.forge.github import GitHub
+from demandops.forge.pull_requests import Forge, ForgeError, PullRequest
 
 __all__ = ["Forge", "ForgeError", "PullRequest", "forge_for"]
 

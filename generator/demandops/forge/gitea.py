@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 from urllib.parse import quote
 
-from demandops.forge.forge import Forge, ForgeError, PullRequest
+from demandops.forge.pull_requests import Forge, ForgeError, PullRequest
 
 _NOT_FOUND = 404
 

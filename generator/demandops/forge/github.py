@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 from urllib.parse import urlencode
 
-from demandops.forge.forge import Forge, PullRequest
+from demandops.forge.pull_requests import Forge, PullRequest
 
 
 class GitHub(Forge):

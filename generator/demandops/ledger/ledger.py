@@ -60,7 +60,7 @@ class ClaimChange:
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """The claims that a request changed, and what a shutdown listed that was not held."""
+    """The claims that a request changed; ``not_held``: listed by a shutdown, but not held."""
 
     claims: tuple[ClaimChange, ...] = ()
     not_held: tuple[str, ...] = ()
@@ -109,12 +109,12 @@ class Ledger:
         return self.claims_on(Subject(SubjectKind.CONNECTION, connection))
 
     def application(self, id: str) -> Application | None:
-        """Return where a claimed application runs and what it is, by its first claim."""
+        """Return a claimed application as its first claim has it."""
         first = self.first_claim(Subject(SubjectKind.APPLICATION, id))
         return first.application if first else None
 
     def connection(self, id: str) -> Connection | None:
-        """Return the ends and the type of a claimed connection, by its first claim."""
+        """Return a claimed connection as its first claim has it."""
         first = self.first_claim(Subject(SubjectKind.CONNECTION, id))
         return first.connection if first else None
 

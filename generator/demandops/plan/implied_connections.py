@@ -26,7 +26,7 @@ class _InputPlace(Place):
     """The input that needs a connection: faults of the connection are faults of the input."""
 
     def at(self, path: str) -> str:
-        """Return the input's field, or that of the demand's requesters."""
+        """Return the input's field, also for a fault of the connection; requesters keep theirs."""
         return path if path.startswith("requesters") else self.field
 
 

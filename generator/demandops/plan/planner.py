@@ -93,7 +93,7 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
 
 
 def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSource:
-    """Return the chart in the version that the claims ask for, or the default version.
+    """Return the chart in the version that the claims request, or the default version.
 
     Raises:
         Refused: if applications that share the service ask for different versions.
@@ -106,7 +106,7 @@ def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSo
             f"{source.version} (for '{version}')" for version, source in sorted(charts.items())
         )
         message = (
-            f"demands that share {service.chart} ask for versions {versions}; ask for the same"
+            f"demands that share {service.chart} request versions {versions}; request the same one"
         )
         raise Refused([fault("version", message, code="conflict")])
     return next(iter(charts.values()))

@@ -58,11 +58,11 @@ class ServiceRelease:
 
     @property
     def description(self) -> str:
-        """What it is, for commit messages."""
+        """Its description in commit messages."""
         return f"{self.key.service} on {self.node.id} for {self.key.source or self.key.application}"
 
     def facts(self) -> list[str]:
-        """Return what people should know of it, one line each."""
+        """Return one line for each fact about it."""
         return [
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
             *(f"{name} = {value}" for name, value in self.parameters.items()),

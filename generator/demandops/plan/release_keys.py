@@ -1,4 +1,4 @@
-"""The keys of releases that follow from claims.
+"""The keys of the releases that claims need, and that a change of claims affects.
 
 :func:`affected_keys` names the releases that a change of claims may touch, so the cost of a demand
 does not grow with the number of others. :mod:`demandops.plan.planner` derives each release.
@@ -28,8 +28,8 @@ ReleaseKey = ServiceKey | ClientKey
 def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
     """Yield the keys of the releases that the claims on ``subject`` need, except suspended claims.
 
-    If an application's definition is missing, yield none, or refuse if ``strict``: what runs must
-    not stop because a file that it needs was deleted.
+    If an application's definition is missing, yield none. If ``strict``, refuse instead: a deleted
+    file must not stop what runs.
     """
     world = without_suspended(world)
     yield from keys_of_claims(world, world.ledger.claims_on(subject), strict=strict)
@@ -81,7 +81,7 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
 
 
 def _role(world: World, application: str, key: ServiceKey) -> str | None:
-    """Return the inputs that an application's service has an instance for each of.
+    """Return the role whose inputs have one instance each of an application's service.
 
     The text is empty if there is one instance for the application. ``None`` means that ``key`` is
     not a service of the application, for example because it moved or changed its definition.
@@ -100,7 +100,8 @@ def affected_keys(
 ) -> tuple[ReleaseKey, ...]:
     """Return the key of every release that these changes of claims may add, change or remove.
 
-    The cost follows the topics that differ, unless a change moves or redefines an application.
+    The cost grows with the number of changed topics. If a change moves or redefines an application,
+    it grows with all topics of the application.
 
     Raises:
         Refused: if an application definition that ``after`` needs is missing.

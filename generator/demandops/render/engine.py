@@ -38,7 +38,7 @@ _TEMPLATE_FAULTS = (
     ArithmeticError,
     LookupError,
     RecursionError,
-)  # errors that a template can cause; its author has to mend them
+)  # errors that a template can cause; its author has to fix them
 
 
 class _Verbatim(str):
@@ -166,7 +166,7 @@ class Engine:
         except InvalidInput as error:
             raise InvalidInput(
                 fault(
-                    f"{problem.field} of what is rendered", f"{problem.message}; mend the template"
+                    f"{problem.field} of the rendered text", f"{problem.message}; fix the template"
                 ).within(template)
                 for problem in error.faults
             ) from None
@@ -174,21 +174,21 @@ class Engine:
             raise InvalidInput(
                 [
                     fault(
-                        _line(error, template), f"'{error.name}' does not exist; mend the template"
+                        _line(error, template), f"'{error.name}' does not exist; fix the template"
                     ).within(template)
                 ]
             ) from None
         except TemplateSyntaxError as error:
             raise InvalidInput(
                 [
-                    fault(f"line {error.lineno}", f"{error.message}; mend the template").within(
+                    fault(f"line {error.lineno}", f"{error.message}; fix the template").within(
                         template
                     )
                 ]
             ) from None
         except _TEMPLATE_FAULTS as error:
             raise InvalidInput(
-                [fault(_line(error, template), f"{error}; mend the template").within(template)]
+                [fault(_line(error, template), f"{error}; fix the template").within(template)]
             ) from None
         if not isinstance(values, dict):
             raise InvalidInput([fault("", "must give a mapping of Helm values").within(template)])

@@ -56,7 +56,7 @@ def check_values(
         validator = _values_validator(schema)
     except ValueError as error:  # invalid JSON, or an invalid schema
         reason = str(error).splitlines()[0]
-        message = f"is not a valid JSON schema: {reason}; mend it"
+        message = f"is not a valid JSON schema: {reason}; fix it"
         raise InvalidInput([fault("", message).within(file)]) from None
     file = f"{chart.folder}/values.yaml"
     try:
@@ -68,7 +68,7 @@ def check_values(
     faults = [
         fault(
             f"values.{path}" if path else "values",
-            f"{message}; mend {origin} or {chart.folder}",
+            f"{message}; fix {origin} or {chart.folder}",
         ).within(template)
         for path, message in _problems(validator, merged)
     ]

@@ -7,12 +7,12 @@ all. A demand is in the journal before the worker evaluates it.
 from __future__ import annotations
 
 import logging
-import threading
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 
 from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, StateRepoError, Withdrawn
+from demandops.runtime import Runtime
 from demandops.service.ticket import ProposalRecord, Receipt, Ticket, ticket_from_journal
 from demandops.staterepo.write.journal import Journal
 
@@ -28,10 +28,10 @@ class DemandQueue:
     queue is full.
     """
 
-    def __init__(self, journal: Journal, limit: int) -> None:
+    def __init__(self, journal: Journal, limit: int, runtime: Runtime) -> None:
         self._journal = journal
         self._limit = limit
-        self._changed = threading.Condition()
+        self._changed = runtime.condition()
         self._queue = deque(ticket_from_journal(entry) for entry in journal.pending.values())
         self._tickets = {ticket.operation: ticket for ticket in self._queue}
         self._not_journaled: list[Ticket] = []

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from datetime import datetime, timezone
+from datetime import datetime
 from typing import TypeAlias
 
 from demandops.decision import Decision, Outcome, decide
@@ -87,8 +87,9 @@ class Evaluator:
                 return Withdrawn(TAKEN_BACK)
             self._approvals.withdraw_replaced(decision.request)
             before = commits.head.state
+            now = self._repository.runtime.now()
             targets = targets_of_decision(before, decision) if self._with_targets else ()
-            return replace(_commit(commits, ticket, decision), targets=targets)
+            return replace(_commit(commits, ticket, decision, now), targets=targets)
         except InvalidInput as error:
             if self._approvals.has_released_a_proposal(ticket):  # which held no claims yet
                 commits.note_settled(ticket.operation, "Unchanged")
@@ -115,9 +116,11 @@ class Evaluator:
         return published
 
 
-def _commit(commits: commit_batch.CommitBatch, ticket: Ticket, decision: Decision) -> Receipt:
+def _commit(
+    commits: commit_batch.CommitBatch, ticket: Ticket, decision: Decision, now: datetime
+) -> Receipt:
     if decision.files:
-        commit = commits.commit(decision, ticket.operation, ticket.received, _now())
+        commit = commits.commit(decision, ticket.operation, ticket.received, now)
         ticket.notify("committed", f"committed {commit}")
     else:
         commit = str(commits.head.commit)
@@ -155,7 +158,3 @@ def _receipt_of_released(ticket: Ticket, commit: str) -> Receipt:
     goal = ticket.goal
     name = goal.get("id") or goal.get("request") or goal.get("demand") or ""
     return Receipt(ticket.operation, str(name), "released", commit)
-
-
-def _now() -> datetime:
-    return datetime.now(timezone.utc)

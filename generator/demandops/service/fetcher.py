@@ -7,8 +7,6 @@ Demands go first: a fetch stops when a demand arrives, because its push shows wh
 from __future__ import annotations
 
 import logging
-import random
-import threading
 from collections.abc import Callable, Iterable
 
 from demandops.errors import Fault, StateRepoError
@@ -49,10 +47,12 @@ class Fetcher:
         self._repository = repository
         self._queue = queue
         self._new_commit_batch, self._on_published = new_commit_batch, on_published
-        self._timer = PollTimer(fetch_interval, embedded=repository.always_current)
+        self._timer = PollTimer(
+            fetch_interval, repository.runtime, embedded=repository.always_current
+        )
         self._logged: frozenset[Fault] = frozenset()
-        self._stopped = threading.Event()
-        self.remote = RemoteMonitor(repository.address)
+        self._stopped = repository.runtime.event()
+        self.remote = RemoteMonitor(repository.address, repository.runtime)
 
     def fetch_now(self) -> None:
         """Make a fetch due now; from any thread."""
@@ -108,7 +108,7 @@ class Fetcher:
                 self._on_published(commits)
                 return commits.head.commit != commits.start.commit
             self._repository.refresh()
-            self._stopped.wait(random.uniform(0, _LONGEST_PAUSE_S))  # noqa: S311 - not for security
+            self._stopped.wait(self._repository.runtime.uniform(0, _LONGEST_PAUSE_S))
         return False  # other generators are faster, and they carry out the same changes
 
     def record_reached(self, *, pushed: bool) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 from demandops import settings
 from demandops.config.config import Config
 from demandops.errors import DemandOpsError, ShuttingDown, StateRepoError
+from demandops.runtime import REAL, Runtime
 from demandops.service.approvals.approvals import Approvals
 from demandops.service.demand_queue import DemandQueue
 from demandops.service.remote_status import StateRepoStatus
@@ -41,6 +41,7 @@ class Generator:
         fetch_interval: float = 0.0,
         signing_key: Path | None = None,
         progress: Progress = lambda done, total: None,
+        runtime: Runtime = REAL,
     ) -> None:
         """Open the state repo, start the worker and resume what is in the journal.
 
@@ -54,6 +55,7 @@ class Generator:
                 that a repository on this disk is checked every minute.
             signing_key: an SSH key that signs the commits (:mod:`demandops.staterepo.git.signing`).
             progress: called with (files read, files in all) while the ledger is loaded.
+            runtime: tells the time and runs the threads.
 
         Raises:
             StateRepoError, InvalidInput: if the state repo or the key cannot be used.
@@ -64,16 +66,16 @@ class Generator:
             repository = repository_choice.connect(
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
-            repository.signer = signer
+            repository.signer, repository.runtime = signer, runtime
             snapshot = state_in_effect.first_snapshot(repository, progress)
         except BaseException:
             self._slot.close()
             raise
-        self._repository = repository
+        self._repository, self._runtime = repository, runtime
         self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
-        self._queue = DemandQueue(self._slot.journal, queue_limit)
+        self._queue = DemandQueue(self._slot.journal, queue_limit, runtime)
         self._listeners: list[Callable[[Config], None]] = []
         self._approvals = Approvals(
             repository, self._queue, with_targets, settings.forge_token_file()
@@ -88,11 +90,10 @@ class Generator:
             fetch_interval,
         )
         self._finished: Future[bool] | None = None
-        self._stop_lock = threading.Lock()
+        self._stop_lock = runtime.lock()
         for operation in self._queue.operations:
             log.info("resuming demand %s from the journal", operation)
-        self._thread = threading.Thread(target=self._run, name="demandops-writer", daemon=True)
-        self._thread.start()
+        self._thread = runtime.start_thread("writer", self._run)
 
     @property
     def snapshot(self) -> Snapshot:
@@ -134,7 +135,7 @@ class Generator:
         Raises:
             ShuttingDown, QueueFull: if the demand is not accepted at all.
         """
-        ticket = new_ticket(goal, operation, listener)
+        ticket = new_ticket(goal, operation, listener, self._runtime)
         if not ticket.future.done():
             ticket.base = str(self.snapshot.commit)
             self._queue.add(ticket)
@@ -186,9 +187,7 @@ class Generator:
                 return self._finished
             self._finished = finished = Future[bool]()
         self._queue.close()
-        threading.Thread(
-            target=self._end, args=(timeout, finished), name="demandops-stop", daemon=True
-        ).start()
+        self._runtime.start_thread("stop", lambda: self._end(timeout, finished))
         return finished
 
     def _end(self, timeout: float, finished: Future[bool]) -> None:

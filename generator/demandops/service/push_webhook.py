@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 import logging
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from starlette.responses import PlainTextResponse
 from starlette.routing import Route
 
 from demandops.errors import InvalidInput, fault
+from demandops.runtime import REAL
 
 log = logging.getLogger("demandops")
 
@@ -87,8 +87,8 @@ class PushWebhook:
 
     def _warn(self, sender: str) -> None:
         """Log a warning at most once a minute, because anyone may send requests."""
-        if time.monotonic() - self._warned > _WARN_EVERY_S:
-            self._warned = time.monotonic()
+        if REAL.monotonic() - self._warned > _WARN_EVERY_S:
+            self._warned = REAL.monotonic()
             log.warning(
                 "a notification from %s was not signed with the webhook's secret; is it the same "
                 "here and at the Git server?",

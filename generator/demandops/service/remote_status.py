@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
+from datetime import datetime
 
 from demandops.errors import Fault
+from demandops.runtime import Runtime
 
 log = logging.getLogger("demandops")
 
@@ -43,8 +44,8 @@ class StateRepoStatus:
 class RemoteMonitor:
     """Records and logs whether the remote can be reached; any thread may read ``status``."""
 
-    def __init__(self, address: str) -> None:
-        self._address = address
+    def __init__(self, address: str, runtime: Runtime) -> None:
+        self._address, self._runtime = address, runtime
         self.status = RemoteStatus()
 
     @property
@@ -56,14 +57,14 @@ class RemoteMonitor:
         """Record that the remote cannot be reached; warn if it could be before."""
         if not self.is_unreachable:
             log.warning("%s; trying again until it is back", reason)
-            self.status = replace(self.status, unreachable_since=_now())
+            self.status = replace(self.status, unreachable_since=self._runtime.now())
         else:
             log.debug("%s", reason)
         self.status = replace(self.status, unreachable=reason)
 
     def record_reached(self, *, pushed: bool = False) -> None:
         """Record that the remote was reached; log it if it could not be before."""
-        now = _now()
+        now = self._runtime.now()
         before = self.status
         if before.unreachable:
             away = (now - (before.unreachable_since or now)).total_seconds()
@@ -78,7 +79,3 @@ class RemoteMonitor:
         """Record that the remote was reached and rejected a push."""
         self.record_reached()
         self.status = replace(self.status, push_denied=reason)
-
-
-def _now() -> datetime:
-    return datetime.now(timezone.utc)

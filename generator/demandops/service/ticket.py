@@ -5,17 +5,17 @@ from __future__ import annotations
 import json
 import logging
 import re
-import uuid
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field
-from datetime import datetime, timezone
+from datetime import datetime
 from typing import Any, Literal
 
 from demandops.cluster.health import Target
 from demandops.decision import Outcome
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import ClaimChange
+from demandops.runtime import Runtime
 from demandops.staterepo.write.journal import JournalEntry
 
 log = logging.getLogger("demandops")
@@ -136,16 +136,16 @@ class Ticket:
         return JournalEntry(self.operation, self.goal, self.received.isoformat(), self.base, record)
 
 
-def new_ticket(goal: object, operation: str | None, listener: Listener) -> Ticket:
+def new_ticket(goal: object, operation: str | None, listener: Listener, runtime: Runtime) -> Ticket:
     """Return a ticket for a goal; its future has failed already if the goal is not plain data.
 
     Raises:
         ValueError: for an operation id that a commit trailer cannot carry.
     """
-    operation = operation or str(uuid.uuid4())
+    operation = operation or runtime.fresh_id()
     if not _OPERATION.fullmatch(operation):
         raise ValueError(f"{operation!r} is not an operation id; use letters, digits and dashes")
-    ticket = Ticket(operation, goal, datetime.now(timezone.utc), listener)
+    ticket = Ticket(operation, goal, runtime.now(), listener)
     try:
         ticket.goal = json.loads(json.dumps(goal))
     except (TypeError, ValueError, RecursionError):

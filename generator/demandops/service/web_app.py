@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import socket
-import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +20,7 @@ from starlette.routing import BaseRoute, Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from demandops.errors import InvalidInput, fault
+from demandops.runtime import REAL
 
 _TIMEOUT_S = 10.0
 _AT_ONCE = 16
@@ -60,10 +60,7 @@ class WebApp:
             timeout_graceful_shutdown=_STOP_TIMEOUT_S,
         )
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(
-            target=self._server.run, args=([self._socket],), name="demandops-web", daemon=True
-        )
-        self._thread.start()
+        self._thread = REAL.start_thread("web", lambda: self._server.run([self._socket]))
 
     def close(self) -> None:
         """Stop the server and wait for its end."""

@@ -6,10 +6,7 @@ Belongs to one thread, the only one that writes to the state repo.
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Callable
-from datetime import datetime, timezone
 
 from demandops.config.config import Config
 from demandops.errors import ShuttingDown
@@ -48,17 +45,17 @@ class Worker:
     ) -> None:
         self.snapshot = snapshot
         self._approvals = approvals
-        self._repository = repository
+        self._repository, self._runtime = repository, repository.runtime
         self._queue = queue
         self._on_published = on_published
         self._evaluator = Evaluator(repository, queue, approvals, with_targets)
         self._must_fetch = False
         self._tip_is_fresh = False
         self._commits_since_tidy = 0
-        self._lease_expiry = LeaseExpiry()
+        self._lease_expiry = LeaseExpiry(self._runtime)
         self._override_expiry = OverrideExpiry()
         self._ahead = ReadAhead()
-        self._stopped_retrying = threading.Event()
+        self._stopped_retrying = self._runtime.event()
         embedded = repository.always_current
         self.fetcher = Fetcher(
             repository, queue, fetch_interval, self._new_commit_batch, self._set_snapshot
@@ -93,7 +90,7 @@ class Worker:
             DemandOpsError: if the state repo cannot be used; likewise.
         """
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
-        backoff = Backoff(self._batch_limit)
+        backoff = Backoff(self._batch_limit, self._runtime)
         while batch:
             try:
                 wait = self._attempt(batch, backoff)
@@ -130,13 +127,13 @@ class Worker:
         part = batch[: backoff.max_demands]
         self._approvals.remove_released(part, self.snapshot.state)
         commits = self._new_commit_batch()
-        began = time.monotonic()
+        began = self._runtime.monotonic()
         published = self._evaluator.published_before(commits.start, part)
         results: list[Result] = []
         for ticket in part:
             result = self._evaluator.evaluate(commits, ticket, published, results)
             results.append((ticket, result))
-        evaluated = time.monotonic()
+        evaluated = self._runtime.monotonic()
         if commits.head.commit == commits.start.commit and not self._tip_is_fresh:
             # nothing to push, so only a fetch shows whether the remote has moved
             tip = self._repository.refresh()
@@ -151,7 +148,9 @@ class Worker:
         log.info("the state repo has moved; evaluating %d demands again", len(part))
         _mark_maybe_published(part, commits.start)
         self._must_fetch = True
-        return backoff.overtaken(len(part), evaluated - began, time.monotonic() - evaluated)
+        return backoff.overtaken(
+            len(part), evaluated - began, self._runtime.monotonic() - evaluated
+        )
 
     def _answer(self, results: list[Result]) -> None:
         """Answer the demands that have a final result; propose those that need approval."""
@@ -178,14 +177,14 @@ class Worker:
 
     def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
         """Wait; meanwhile journal new demands and report to them why they wait."""
-        end = time.monotonic() + seconds
+        end = self._runtime.monotonic() + seconds
         to_notify = list(batch)
         while not self._stopped_retrying.is_set():
             if self.fetcher.remote.is_unreachable:
                 for ticket in to_notify:
                     ticket.notify("away", f"waiting: {self.fetcher.remote.status.unreachable}")
             self._queue.answer_withdrawn(batch)
-            left = end - time.monotonic()
+            left = end - self._runtime.monotonic()
             if left <= 0:
                 return
             to_notify = self._queue.journal_arrivals(left)
@@ -195,7 +194,7 @@ class Worker:
         state = self.snapshot.state
         seconds = self._approvals.seconds_until_due(LONGEST_WAIT_S)
         seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
-        seconds = self._override_expiry.seconds_until_due(state, _now(), seconds)
+        seconds = self._override_expiry.seconds_until_due(state, self._runtime.now(), seconds)
         fetch = self.fetcher.seconds_until_due()
         return seconds if fetch is None else min(seconds, fetch)
 
@@ -206,9 +205,9 @@ class Worker:
 
     def fetch_if_due(self) -> None:
         """Carry out what others pushed and end overrides, while no demand comes."""
-        due = self._override_expiry.is_due(self.snapshot.state, _now())
+        due = self._override_expiry.is_due(self.snapshot.state, self._runtime.now())
         if not self.fetcher.fetch_if_due(self.snapshot, due):
-            self._override_expiry.postpone(_now())
+            self._override_expiry.postpone(self._runtime.now())
 
     def tidy(self) -> None:
         """Pack the repository every few hundred commits; each adds about twenty loose objects."""
@@ -245,20 +244,16 @@ class Worker:
         before = self.snapshot
         if tip == before.commit and not before.problems:
             commits = commit_batch.CommitBatch(self._repository, before)
-            self._override_expiry.end_due(commits, _now())
+            self._override_expiry.end_due(commits, self._runtime.now())
             return commits
         advance = self._ahead.advance(self._repository.objects, before, tip)
         commits = commit_batch.CommitBatch(self._repository, advance.snapshot)
-        commits.follow(advance, before, _now())
+        commits.follow(advance, before, self._runtime.now())
         self.fetcher.log_problems(commits.head.problems)
-        self._override_expiry.end_due(commits, _now())
+        self._override_expiry.end_due(commits, self._runtime.now())
         return commits
 
 
 def _mark_maybe_published(batch: list[Ticket], start: Snapshot) -> None:
     for ticket in batch:
         ticket.mark_maybe_published(str(start.commit))
-
-
-def _now() -> datetime:
-    return datetime.now(timezone.utc)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from datetime import datetime, timezone
 from itertools import islice
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from demandops.config.config import Config
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger.operations.restoration import Restoration
 from demandops.render.changes.changeset import FileReader
+from demandops.runtime import REAL
 from demandops.staterepo.audit import commit_signatures, verification
 from demandops.staterepo.audit.verification import Verdict
 from demandops.staterepo.git import repository_choice
@@ -85,7 +85,7 @@ class Reader:
         """
         if not revision:
             return str(self._tip)
-        now = datetime.now(timezone.utc)
+        now = REAL.now()
         return str(revisions.resolve(self._objects, self._tip, revision, now).id)
 
     def includes(self, commit: str, other: str) -> bool:
@@ -230,7 +230,7 @@ class Reader:
         return {path: blob is not None for path, blob in changed}
 
     def changes_node(self, commit: str, node: str) -> bool:
-        """Return whether a commit changed what runs on a node, or a claim that names it."""
+        """Return whether a commit changed a release on a node, or a claim that names the node."""
         return ledger_files.changes_node(self._objects, commit, node)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:

@@ -7,8 +7,6 @@ again if the tip moves, and never forced.
 
 from __future__ import annotations
 
-import random
-import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -25,6 +23,7 @@ from demandops.plan.overrides.lifecycle import update_ledger
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import planned_releases
 from demandops.render.gitops.controller_switch import SwitchSteps, switch_steps
+from demandops.runtime import REAL
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo import reader
 from demandops.staterepo.git import tree as trees
@@ -52,7 +51,7 @@ class UpgradeRequest:
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """What an upgrade changes: no files if nothing changed. ``commit`` is the newest commit."""
+    """The files that an upgrade changes, none if nothing changed; ``commit`` is the newest."""
 
     commit: str
     old: Config
@@ -61,7 +60,7 @@ class Upgrade:
 
     @property
     def handover(self) -> SwitchSteps:
-        """What to do on the clusters before and after."""
+        """The steps on the clusters before and after."""
         return switch_steps(self.old, self.new)
 
 
@@ -125,7 +124,7 @@ def upgrade(
             commit = planned.batch.commit_files(files, planned.state, text, author, now)
             if planned.batch.publish():
                 return replace(planned.upgrade, commit=commit)
-            time.sleep(_PAUSE_S * attempt * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
+            REAL.sleep(_PAUSE_S * attempt * REAL.uniform(0.5, 1.0))
             repository.refresh()
     raise StateRepoError(
         f"{repository.address} moved {_ATTEMPTS} times while it was rendered; stop its generators "

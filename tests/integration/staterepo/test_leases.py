@@ -8,9 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +16,12 @@ import pytest
 from demandops import settings
 from demandops.demand.claim import Claim
 from demandops.errors import Refused
-from demandops.service import Generator, worker
-from demandops.service.timing.lease_expiry import LeaseClock
+from demandops.service import Generator
 from demandops.staterepo.write.journal import JournalEntry
 from demandops.staterepo.write.slot import Slot
 
 from tests.kit import rig
+from tests.kit.clock import Clock
 from tests.kit.repo import GitRepo, Person
 
 DOMAINS = "policy/access-domains.yaml"
@@ -33,10 +31,6 @@ kind: AccessDomains
 domains:
 - {name: perception, namespace: perception, nodes: ["*"], leases: {slack: 0s}%s}
 """
-
-
-def _now() -> datetime:
-    return datetime.now(timezone.utc)
 
 
 def _with_policy(repo: Path, more: str = "") -> Path:
@@ -52,7 +46,7 @@ def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory)
     return _with_policy(Path(shutil.copytree(bare_template, folder)))
 
 
-def put(demand: str, lease: str | int | None = 1, who: str = "vehicle00", **more: Any) -> rig.Goal:
+def put(demand: str, lease: str | int | None = 60, who: str = "vehicle00", **more: Any) -> rig.Goal:
     """An application and, derived, a connection that goes with it."""
     made = {
         "kind": "Demand",
@@ -90,18 +84,6 @@ def values(commit: rig.Commit, key: str) -> list[str]:
     return [value for known, value in commit.trailers if known == key]
 
 
-def wait_for(moment: datetime) -> None:
-    rig.wait_until(lambda: _now() > moment, f"{moment} has passed")
-
-
-@contextmanager
-def lasting_leases() -> Iterator[None]:
-    """No generator ends a lease during a block, however slow this machine is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LeaseClock, "ended_claims", lambda self, ledger: (_now(), []))
-        yield
-
-
 def ends(generator: Generator, demand: str) -> datetime:
     return max(claim.lease.expires_at for claim in held(generator, demand) if claim.lease)
 
@@ -113,11 +95,13 @@ def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: dateti
     slot.close()
 
 
-def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(url: str, bare: Path) -> None:
-    with rig.running(url) as generator:
-        with lasting_leases():
-            rig.book(generator, put("short"), put("stays", None))
-            end = ends(generator, "short")
+def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(
+    clock: Clock, url: str, bare: Path
+) -> None:
+    with rig.running(url, runtime=clock) as generator:
+        rig.book(generator, put("short"), put("stays", None))
+        end = ends(generator, "short")
+        clock.pass_(60)
         wait_until_gone(generator, "short")
         assert held(generator, "stays")
     (commit,) = expiries(bare)
@@ -140,14 +124,13 @@ def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(url: str, bare:
 
 
 def test_what_ended_while_the_generator_was_down_goes_when_it_is_back(
-    address: str, bare: Path
+    clock: Clock, address: str, bare: Path
 ) -> None:
-    with lasting_leases(), rig.running(address) as generator:
-        rig.book(generator, put("b", 2), put("a", 1), put("long", "1h"))
-        last = ends(generator, "b")
+    with rig.running(address, runtime=clock) as generator:
+        rig.book(generator, put("b", 120), put("a", 60), put("long", "1h"))
     assert expiries(bare) == []
-    wait_for(last)
-    with rig.running(address) as generator:
+    clock.pass_(120)
+    with rig.running(address, runtime=clock) as generator:
         wait_until_gone(generator, "b")
         wait_until_gone(generator, "a")
         assert held(generator, "long")
@@ -155,22 +138,25 @@ def test_what_ended_while_the_generator_was_down_goes_when_it_is_back(
     rig.assert_sound(bare)
 
 
-def test_a_demand_that_is_put_again_expires_again(bare: Path) -> None:
-    with rig.running(bare) as generator:
+def test_a_demand_that_is_put_again_expires_again(clock: Clock, bare: Path) -> None:
+    with rig.running(bare, runtime=clock) as generator:
         for _ in range(2):
             rig.book(generator, put("again"))
+            clock.pass_(60)
             wait_until_gone(generator, "again")
     assert [commit.one("Operation") for commit in rig.commits(bare)[-4:]] == ["put", "expire"] * 2
 
 
-def test_what_is_renewed_stays_and_makes_commits_of_its_ledger_alone(bare: Path) -> None:
-    with rig.running(bare) as generator:
-        with lasting_leases():
-            rig.book(generator, put("kept", 60), put("other"))
-            files = rig.git(bare, "rev-parse", "main:clusters")
-            (answer,) = rig.book(generator, renew("kept"))
-            assert answer.outcome == "booked"
-            assert rig.git(bare, "rev-parse", "main:clusters") == files
+def test_what_is_renewed_stays_and_makes_commits_of_its_ledger_alone(
+    clock: Clock, bare: Path
+) -> None:
+    with rig.running(bare, runtime=clock) as generator:
+        rig.book(generator, put("kept", 120), put("other"))
+        files = rig.git(bare, "rev-parse", "main:clusters")
+        (answer,) = rig.book(generator, renew("kept"))
+        assert answer.outcome == "booked"
+        assert rig.git(bare, "rev-parse", "main:clusters") == files
+        clock.pass_(60)
         wait_until_gone(generator, "other")
         rig.book(generator, put("kept", "1h"))
     assert [values(commit, "Demand-Id") for commit in expiries(bare)] == [["other"]]
@@ -178,27 +164,29 @@ def test_what_is_renewed_stays_and_makes_commits_of_its_ledger_alone(bare: Path)
     rig.assert_sound(bare)
 
 
-def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(bare: Path) -> None:
-    now = _now()
+def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
+    clock: Clock, bare: Path
+) -> None:
+    now = clock.now()
     leave_in_outbox(bare, "op-put", put("d", 60), now - timedelta(seconds=100))
     assert rig.restart(bare)
     # the record says that it ended 40 s ago; the renewal came before, and no one could take it up
     leave_in_outbox(bare, "op-renew", renew("d"), now - timedelta(seconds=50))
-    with rig.running(bare) as generator:
+    with rig.running(bare, runtime=clock) as generator:
         rig.wait_until(lambda: "op-renew" in rig.operations(bare), "the renewal is taken up")
         assert held(generator, "d")
     assert expiries(bare) == []
 
 
 def test_what_another_generator_renewed_is_kept(
-    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+    clock: Clock, url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, logger="demandops")
-    with rig.running(url) as first, rig.running(url) as second:
-        with lasting_leases():
-            rig.book(first, put("d"))
-            rig.book(second, put("d", "1h"))
-            assert held(first, "d")[0].lease != held(second, "d")[0].lease
+    with rig.running(url, runtime=clock) as first, rig.running(url, runtime=clock) as second:
+        rig.book(first, put("d"))
+        rig.book(second, put("d", "1h"))
+        assert held(first, "d")[0].lease != held(second, "d")[0].lease
+        clock.pass_(60)
         rig.wait_until(
             lambda: held(first, "d")[0].lease == held(second, "d")[0].lease,
             "the first has tried to release it, and learnt better",
@@ -209,25 +197,23 @@ def test_what_another_generator_renewed_is_kept(
     rig.assert_sound(bare)
 
 
-def test_an_idle_generator_releases_what_another_process_booked(
-    bare: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_idle_generator_releases_what_another_process_booked(clock: Clock, bare: Path) -> None:
     """As ``demandops request`` beside ``demandops serve``."""
-    monkeypatch.setattr(worker, "LONGEST_WAIT_S", 0.2)  # between two looks; a minute else
-    with rig.running(bare) as idle:
-        with rig.running(bare) as other:
-            rig.book(other, put("d", 1))
+    with rig.running(bare, runtime=clock) as idle:
+        with rig.running(bare, runtime=clock) as other:
+            rig.book(other, put("d"))
+        clock.pass_(60)
         rig.wait_until(lambda: expiries(bare), "'d' is released")
         wait_until_gone(idle, "d")
     rig.assert_sound(bare)
 
 
-def test_two_generators_release_once(url: str, bare: Path) -> None:
-    with rig.running(url) as first, rig.running(url) as second:
-        with lasting_leases():
-            rig.book(first, put("d"))
-            rig.book(second, put("other", None))  # so that it knows of the first one
-            assert held(second, "d")
+def test_two_generators_release_once(clock: Clock, url: str, bare: Path) -> None:
+    with rig.running(url, runtime=clock) as first, rig.running(url, runtime=clock) as second:
+        rig.book(first, put("d"))
+        rig.book(second, put("other", None))  # so that it knows of the first one
+        assert held(second, "d")
+        clock.pass_(60)
         wait_until_gone(first, "d")
         wait_until_gone(second, "d")
     assert [values(commit, "Demand-Id") for commit in expiries(bare)] == [["d"]]

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from datetime import datetime, timedelta, timezone
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from demandops.errors import InvalidInput, Refused
-from demandops.service import Generator, Receipt, worker
+from demandops.service import Generator, Receipt
 
 from tests.kit import rig
+from tests.kit.clock import Clock
 from tests.kit.config import override
 from tests.kit.repo import read as file
 from tests.kit.rig import Person
@@ -27,29 +28,10 @@ WATCHED: dict[str, Any] = {"services": ["object-detection"], "nodes": ["edge"]}
 
 
 @pytest.fixture
-def remote_generator(url: str) -> Iterator[Generator]:
+def remote_generator(url: str, clock: Clock) -> Iterator[Generator]:
     """A generator that uses the state repo as a remote."""
-    with rig.running(url) as running:
+    with rig.running(url, runtime=clock) as running:
         yield running
-
-
-class Clock:
-    """The generator's clock, which a test sets forward instead of waiting."""
-
-    def __init__(self) -> None:
-        self.ahead = timedelta()
-
-    def now(self) -> datetime:
-        return datetime.now(timezone.utc) + self.ahead
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """The clock by which overrides end; the generator reads it often."""
-    clock = Clock()
-    monkeypatch.setattr(worker, "_now", clock.now)
-    monkeypatch.setattr(worker, "LONGEST_WAIT_S", 0.1)
-    return clock
 
 
 def parsed(bare: Path, path: str) -> Any:
@@ -292,10 +274,10 @@ def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
     marker = "ledger/overrides/brief.yaml"
     assert file(bare, "ledger/overrides/late.yaml")
     assert file(bare, marker) == ""
-    clock.ahead = timedelta(minutes=59)
+    clock.pass_(59 * 60)
     next_demand(generator)
     assert file(bare, marker) == "", "not before its time"
-    clock.ahead = timedelta(hours=1)
+    clock.pass_(60)
     rig.wait_until(lambda: file(bare, marker), "the override has ended")
     assert file(bare, DETECTION) == plain
     (commit,) = [c for c in rig.commits(bare) if c.one("Operation") == "expire-override"]
@@ -318,13 +300,13 @@ def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
 def test_what_expired_while_no_generator_ran_ends_when_one_does(
     clock: Clock, bare: Path, person: Person
 ) -> None:
-    with rig.running(bare) as generator:
+    with rig.running(bare, runtime=clock) as generator:
         rig.book(generator, rig.goal(1))
         end = clock.now() + timedelta(hours=1)
         merge(person, brief=override(WATCHED, replicas=3, expires=end.isoformat()))
         next_demand(generator)
-    clock.ahead = timedelta(hours=1)
-    with rig.running(bare):
+    clock.pass_(3600)
+    with rig.running(bare, runtime=clock):
         rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "it is ended")
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
     rig.assert_sound(bare)
@@ -366,15 +348,16 @@ def test_a_broken_override_is_reported_and_what_was_in_force_stays(
 
 
 def test_an_override_ends_while_people_have_broken_another(
-    clock: Clock, generator: Generator, bare: Path, person: Person
+    clock: Clock, remote_generator: Generator, bare: Path, person: Person
 ) -> None:
+    generator = remote_generator
     end = clock.now() + timedelta(hours=1)
     merge(person, brief=override(WATCHED, replicas=3, expires=end.isoformat()))
     rig.book(generator, rig.goal(1))
     merge(person, broken="apiVersion: [")
     next_demand(generator)
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 3
-    clock.ahead = timedelta(hours=1)
+    clock.pass_(3600)
     rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "it is ended")
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
     next_demand(generator, 2)

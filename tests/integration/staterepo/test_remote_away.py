@@ -85,7 +85,7 @@ def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
         with pytest.raises(StateRepoError, match="cannot be fetched"):
             Generator(url, start_offline=False)
         generator = Generator(url)
-        assert "continuing with what was fetched last" in caplog.text
+        assert "continuing with the commits of the last fetch" in caplog.text
         fresh = generator.submit(goal(2), "op-2")
         rig.wait_until(lambda: "trying again" in caplog.text, "it goes on trying")
         assert not fresh.future.done()

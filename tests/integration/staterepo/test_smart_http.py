@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
 from demandops.errors import StateRepoError
-from demandops.service import Generator, evaluation
+from demandops.service import Generator
 
 from tests.kit import rig
+from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server, serving
 from tests.kit.rig import Gate, goal, leave
 
@@ -59,11 +59,11 @@ def test_an_answer_lost_after_the_push_was_taken_counts_the_demand_once(
 
 
 def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
-    http: str, server: Server, bare: Path, monkeypatch: pytest.MonkeyPatch
+    http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
     """Nobody can be asked whether the push was taken, and other demands come meanwhile."""
     gate = Gate()
-    with rig.running(http) as generator:
+    with rig.running(http, runtime=clock) as generator:
         rig.book(generator, goal(0))
         server.faults.cut_answers, server.faults.away_after_cut = 1, True
         tickets = [generator.submit(goal(1), "op-1", gate)]
@@ -73,7 +73,7 @@ def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
         rig.wait_until(lambda: server.faults.away, "the server has taken the push and is away")
         tickets.append(generator.submit(goal(3), "op-3"))
         rig.wait_until(lambda: server.refused > 3, "it was asked again in vain")
-        _set_clock_forward(monkeypatch)
+        clock.pass_(5)  # a commit that is made anew has another time, so another id
         assert not tickets[0].future.done()
         server.faults.away = server.faults.away_after_cut = False
         outcomes = [rig.receipt(ticket).outcome for ticket in tickets]
@@ -86,11 +86,11 @@ def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
 
 
 def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
-    http: str, server: Server, bare: Path, monkeypatch: pytest.MonkeyPatch
+    http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
     """The push was taken: [join again: nothing to commit, leave]. Asked again, the join is new."""
     gate = Gate()
-    with rig.running(http) as generator:
+    with rig.running(http, runtime=clock) as generator:
         rig.book(generator, goal(1))
         opening = generator.submit(goal(0), listener=gate)
         assert gate.reached.wait(rig.PATIENCE_S)
@@ -101,17 +101,11 @@ def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
         gate.open.set()
         rig.wait_until(lambda: server.taken == taken + 2, "both pushes were taken")
         rig.wait_until(lambda: server.refused > 3, "it was asked again in vain")
-        _set_clock_forward(monkeypatch)
+        clock.pass_(5)  # a commit that is made anew has another time, so another id
         server.faults.away = server.faults.away_after_cut = False
         assert rig.receipt(again).outcome in ("unchanged", "booked")
         assert rig.receipt(released).outcome == "released"
     assert rig.books(bare) == rig.books_after([goal(0)]), "what was released stands again"
-
-
-def _set_clock_forward(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Give a commit that is made anew another time, so another id."""
-    later = datetime.now(timezone.utc) + timedelta(seconds=5)
-    monkeypatch.setattr(evaluation, "_now", lambda: later)
 
 
 def _cut(server: Server) -> None:

@@ -305,7 +305,7 @@ class TestAppdefs:
 
 
 class TestAllTogether:
-    """All faults of all files, so that a person mends them in one go."""
+    """All faults of all files, so that a person fixes them in one go."""
 
     def test_faults_of_several_files(self) -> None:
         change = {

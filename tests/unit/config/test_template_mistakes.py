@@ -75,7 +75,7 @@ def test_a_mistake_is_told_with_template_and_line(name: str) -> None:
     (found,) = appended(text)
     assert found.startswith(f"{TEMPLATE}: line {LAST}: ")
     assert word.lower() in found.lower()
-    assert found.endswith("; mend the template")
+    assert found.endswith("; fix the template")
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_formats_of_usual_size_work() -> None:
     )
     assert appended("extra: " + used + "\n") == [
         f"{TEMPLATE}: values: Additional properties are not allowed ('extra' was unexpected); "
-        f"mend the template or {CHART}"
+        f"fix the template or {CHART}"
     ]
 
 
@@ -154,7 +154,7 @@ class TestValues:
     def test_a_value_that_the_chart_does_not_have(self) -> None:
         assert appended("extra: 5\n") == [
             f"{TEMPLATE}: values: Additional properties are not allowed ('extra' was unexpected); "
-            f"mend the template or {CHART}"
+            f"fix the template or {CHART}"
         ]
 
     def test_every_value_that_does_not_fit(self) -> None:
@@ -170,7 +170,7 @@ class TestValues:
 
     @staticmethod
     def places(found: list[str]) -> list[str]:
-        assert all(one.endswith(f"; mend the template or {CHART}") for one in found)
+        assert all(one.endswith(f"; fix the template or {CHART}") for one in found)
         assert all(one.startswith(f"{TEMPLATE}: ") for one in found)
         return sorted(one.split(": ")[1] for one in found)
 
@@ -186,8 +186,8 @@ class TestValues:
         text = skeleton()[TEMPLATE].replace("{{ source_topic }}", '"{{ source_topic }}"')
         (found,) = faults(text)
         assert found.startswith(f"{TEMPLATE}: line ")
-        assert found.endswith("; mend the template")
-        assert " of what is rendered: not valid YAML: " in found
+        assert found.endswith("; fix the template")
+        assert " of the rendered text: not valid YAML: " in found
 
     def test_a_key_twice(self) -> None:
         (found,) = appended("hostNetwork: true\n")
@@ -228,7 +228,7 @@ class TestBeforeTheFirstDemand:
     def test_a_template_that_nobody_has_demanded_is_checked(self) -> None:
         text = skeleton()[TEMPLATE] + "x: {{ nope }}\n"
         assert self.rehearsal({TEMPLATE: text}) == [
-            f"{TEMPLATE}: line {LAST}: 'nope' is undefined; mend the template"
+            f"{TEMPLATE}: line {LAST}: 'nope' is undefined; fix the template"
         ]
 
     def test_all_templates_are_checked_together(self) -> None:

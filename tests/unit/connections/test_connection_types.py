@@ -162,8 +162,8 @@ class TestZenoh:
         assert faults(state(vehicle00=one, edge=other), demand("zenoh")) == [
             "connections[0].type: 2 (ZENOH) finds no route between 'vehicle00' and 'edge'; give "
             "one "
-            "of them an endpoint under zenoh in inventory/nodes.yaml, or both one router under "
-            "connect"
+            "of them an endpoint under zenoh in inventory/nodes.yaml, or add the same router to "
+            "connect of both"
         ]
 
     def test_one_topic_has_one_rate_on_a_node(self) -> None:
@@ -174,7 +174,8 @@ class TestZenoh:
         assert faults(before, other) == [
             "connections: rate 2.0 of '/a' in 'd' contradicts an existing claim: 'c' carries it "
             "from "
-            "'vehicle00' with rate 5.0, and the node's bridge has one for each topic; use the same"
+            "'vehicle00' with rate 5.0, and the node's bridge has one rate for each topic; "
+            "use the same rate"
         ]
 
 
@@ -212,8 +213,8 @@ class TestRos:
         before = state(vehicle00=TYPED, edge=narrow)
         before = decided(before, demand("ros"))
         assert faults(before, demand("ros", id="d")) == [
-            "connections: connection 'd' would listen on port 20000 of 'edge', as 'c' does; use "
-            "another connection id, or widen firstPort and lastPort of its wan"
+            "connections: connection 'd' would listen on port 20000 of 'edge', but 'c' listens "
+            "there; use another connection id, or widen firstPort and lastPort under wan of 'edge'"
         ]
 
 

@@ -154,7 +154,7 @@ class TestContradictions:
     def test_another_node_for_a_claimed_application(self, books: MemoryRepo) -> None:
         assert books.faults(goal([application(node="cloud", who=["vehicle01"])])) == [
             f"apps[0].header.node_id: 'cloud' contradicts an existing claim: '{APP}'"
-            " is held by vehicle00 on 'edge'; ask for that node, or wait until it is released"
+            " is held by vehicle00 on 'edge'; request that node, or wait until it is released"
         ]
 
     def test_another_node_for_an_application_that_the_same_demand_claimed(
@@ -163,7 +163,7 @@ class TestContradictions:
         assert len(books.faults(goal([application(node="cloud")]))) == 1
 
     @pytest.mark.parametrize(
-        ("changed", "field", "wanted", "stands"),
+        ("changed", "field", "wanted", "held"),
         [
             ({"ends": ("vehicle01", "edge")}, "source_node_id", "vehicle01", "source 'vehicle00'"),
             ({"ends": ("vehicle00", "cloud")}, "target_node_id", "cloud", "target 'edge'"),
@@ -171,11 +171,12 @@ class TestContradictions:
         ],
     )
     def test_other_ends_or_another_broker_of_a_claimed_connection(
-        self, books: MemoryRepo, changed: dict[str, Any], field: str, wanted: str, stands: str
+        self, books: MemoryRepo, changed: dict[str, Any], field: str, wanted: str, held: str
     ) -> None:
         assert books.faults(goal([], [connection(who=["vehicle01"], **changed)])) == [
             f"connections[0].{field}: '{wanted}' contradicts an existing claim: 'vehicle00/edge' "
-            f"is held by vehicle00 with {stands}; use the same, or another connection id"
+            f"is held by vehicle00 with {held}; use the same {held.partition(' ')[0]}, or another "
+            "connection id"
         ]
 
     def test_another_target_for_a_topic_that_is_carried(self, books: MemoryRepo) -> None:

@@ -215,7 +215,7 @@ def test_what_was_promised_is_kept(random: Random, length: int) -> None:
     for _ in range(length):
         pause = random.choice(PAUSES)
         now += pause
-        world.clocks.pass_(pause)
+        world.clock.pass_(pause)
         if not random.randrange(4):
             restart(world, random)
         note(f"at {now}:")
@@ -237,7 +237,7 @@ def test_what_was_promised_is_kept(random: Random, length: int) -> None:
 
 def leave_all(world: running.World, promises: Promises, now: int) -> None:
     """Let every lease end and release the rest: nothing of anybody stays."""
-    world.clocks.pass_(2 * 3600)
+    world.clock.pass_(2 * 3600)
     assert_released(world, promises, now + 2 * 3600)
     for claim in list(world.state.ledger):
         if world.state.ledger.get(claim.key) is None:

@@ -200,7 +200,7 @@ def test_a_demand_that_an_override_breaks_is_told_which() -> None:
     (found,) = refusal.value.faults
     assert (found.file, found.field) == ("overrides/tested.yaml", "values.replicas")
     assert found.message.endswith(
-        "; mend the override or appdefs/object-detection-fusion/charts/object-detection"
+        "; fix the override or appdefs/object-detection-fusion/charts/object-detection"
     )
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from demandops.runtime import REAL
 from demandops.service.timing.backoff import FIRST_PAUSE_S, LONGEST_AWAY_S, LONGEST_TURN_S, Backoff
 
 
 def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
-    pace = Backoff(200)
+    pace = Backoff(200, REAL)
     away = [pace.unreachable() for _ in range(20)]
     assert max(away) <= LONGEST_AWAY_S
     assert min(away[-5:]) >= LONGEST_AWAY_S / 2
@@ -16,7 +17,7 @@ def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
 
 
 def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew() -> None:
-    pace = Backoff(200)
+    pace = Backoff(200, REAL)
     for _ in range(10):
         pace.unreachable()
     pace.overtaken(10, 0.1, 1.0)
@@ -28,7 +29,7 @@ def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew()
 
 
 def test_a_line_is_as_long_as_can_be_judged_while_it_is_pushed() -> None:
-    pace = Backoff(200)
+    pace = Backoff(200, REAL)
     assert pace.max_demands == 200
     pace.overtaken(100, evaluating_s=0.1, pushing_s=0.2)
     assert pace.max_demands == 100

@@ -14,7 +14,8 @@ from demandops.demand.lease import Lease
 from demandops.ledger.ledger import Ledger
 from demandops.service.timing.lease_expiry import LeaseClock
 
-from tests.scenarios.running import START, Clocks, rebuilt
+from tests.kit.clock import Clock
+from tests.scenarios.running import START, rebuilt
 
 
 def leased(*terms: tuple[str, int, int]) -> Ledger:
@@ -33,20 +34,20 @@ def leased(*terms: tuple[str, int, int]) -> Ledger:
 
 
 @pytest.fixture
-def clocks() -> Clocks:
-    return Clocks()
+def clocks() -> Clock:
+    return Clock(START)
 
 
 @pytest.fixture
-def clock(clocks: Clocks) -> LeaseClock:
-    return LeaseClock(clocks.wall, clocks.steady)
+def clock(clocks: Clock) -> LeaseClock:
+    return LeaseClock(clocks)
 
 
 def ended(clock: LeaseClock, ledger: Ledger) -> list[str]:
     return [claim.demand for claim in clock.ended_claims(ledger)[1]]
 
 
-def test_nothing_ends_before_its_slack_has_passed(clocks: Clocks, clock: LeaseClock) -> None:
+def test_nothing_ends_before_its_slack_has_passed(clocks: Clock, clock: LeaseClock) -> None:
     ledger = leased(("b", 61, 0), ("a", 50, 10), ("c", 3600, 0))
     clocks.pass_(60)
     assert ended(clock, ledger) == []
@@ -56,10 +57,10 @@ def test_nothing_ends_before_its_slack_has_passed(clocks: Clocks, clock: LeaseCl
     assert ended(clock, ledger) == ["a"]
     clocks.pass_(0.5)
     assert ended(clock, ledger) == ["a", "b"]
-    assert clock.ended_claims(ledger)[0] == clocks.now
+    assert clock.ended_claims(ledger)[0] == clocks.now()
 
 
-def test_it_is_set_back_and_nothing_goes_early(clocks: Clocks, clock: LeaseClock) -> None:
+def test_it_is_set_back_and_nothing_goes_early(clocks: Clock, clock: LeaseClock) -> None:
     ledger = leased(("a", 60, 0))
     clocks.set_by(-86_400)
     clocks.pass_(3600)
@@ -69,7 +70,7 @@ def test_it_is_set_back_and_nothing_goes_early(clocks: Clocks, clock: LeaseClock
 
 @pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
 def test_it_is_set_forward_and_a_full_term_is_granted(
-    clocks: Clocks,
+    clocks: Clock,
     clock: LeaseClock,
     steps: list[int],
     caplog: pytest.LogCaptureFixture,
@@ -89,7 +90,7 @@ def test_it_is_set_forward_and_a_full_term_is_granted(
     assert ended(clock, ledger) == ["short", "long"]
 
 
-def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clocks, clock: LeaseClock) -> None:
+def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: LeaseClock) -> None:
     ledger = leased(("a", 60, 0))
     clocks.pass_(50)
     clocks.set_by(3600)
@@ -99,14 +100,14 @@ def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clocks, clock: Le
     assert ended(clock, ledger) == ["a"]
 
 
-def test_a_machine_that_slept_grants_a_full_term(clocks: Clocks, clock: LeaseClock) -> None:
+def test_a_machine_that_slept_grants_a_full_term(clocks: Clock, clock: LeaseClock) -> None:
     ledger = leased(("a", 60, 0))
     clocks.set_by(8 * 3600)  # the steady clock stands still meanwhile
     assert ended(clock, ledger) == []
 
 
 def test_a_clock_that_is_drawn_on_slowly_is_no_step(
-    clocks: Clocks, clock: LeaseClock, caplog: pytest.LogCaptureFixture
+    clocks: Clock, clock: LeaseClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
     ledger = leased(("a", 60, 0))
@@ -119,7 +120,7 @@ def test_a_clock_that_is_drawn_on_slowly_is_no_step(
 
 
 def test_none_of_a_demand_goes_while_a_part_is_granted_more(
-    clocks: Clocks, clock: LeaseClock
+    clocks: Clock, clock: LeaseClock
 ) -> None:
     ledger = leased(("both", 60, 0), ("both", 600, 0), ("other", 60, 0))
     clocks.set_by(3600)
@@ -130,7 +131,7 @@ def test_none_of_a_demand_goes_while_a_part_is_granted_more(
     assert ended(clock, ledger) == ["both", "other", "both"]
 
 
-def test_it_looks_again_when_the_first_lease_ends(clocks: Clocks, clock: LeaseClock) -> None:
+def test_it_looks_again_when_the_first_lease_ends(clocks: Clock, clock: LeaseClock) -> None:
     ledger = leased(("a", 20, 10), ("b", 600, 0))
     assert clock.seconds_until_due(ledger, 60.0) == pytest.approx(30.01)
     clocks.pass_(29.5)

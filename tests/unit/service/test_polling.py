@@ -5,35 +5,31 @@ from __future__ import annotations
 import logging
 
 import pytest
+from demandops.runtime import REAL
 from demandops.service.remote_status import RemoteMonitor
 from demandops.service.timing.polling import PollTimer, parse_interval
 
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.kit.clock import Clock
+from tests.kit.memory import NOW
 
 
-def looks(clock: Clock, interval: float, *, embedded: bool = False) -> PollTimer:
-    return PollTimer(interval, embedded=embedded, steady=clock, jittered=lambda pause: pause)
+@pytest.fixture
+def clock() -> Clock:
+    return Clock(NOW)
 
 
-def test_the_first_look_is_due_at_once_and_the_next_after_the_interval() -> None:
-    clock = Clock()
-    made = looks(clock, 30)
+def test_the_first_look_is_due_at_once_and_the_next_after_the_interval(clock: Clock) -> None:
+    made = PollTimer(30, clock)
     assert made.start_if_due()
     made.finished(reached=True)
     assert made.seconds_until_due() == 30 and not made.start_if_due()
-    clock.now += 30
+    clock.pass_(30)
     assert made.start_if_due()
 
 
-def test_while_the_remote_is_away_looks_become_seldom_within_bounds() -> None:
-    clock, pauses = Clock(), []
-    made = looks(clock, 10)
+def test_while_the_remote_is_away_looks_become_seldom_within_bounds(clock: Clock) -> None:
+    pauses = []
+    made = PollTimer(10, clock)
     for _ in range(5):
         made.finished(reached=False)
         pauses.append(made.seconds_until_due())
@@ -42,15 +38,14 @@ def test_while_the_remote_is_away_looks_become_seldom_within_bounds() -> None:
     assert made.seconds_until_due() == 10
 
 
-def test_an_interval_above_the_bound_is_kept() -> None:
-    made = looks(Clock(), 600)
+def test_an_interval_above_the_bound_is_kept(clock: Clock) -> None:
+    made = PollTimer(600, clock)
     made.finished(reached=False)
     assert made.seconds_until_due() == 600
 
 
-def test_what_is_asked_for_many_times_is_one_look_and_one_after_it() -> None:
-    clock = Clock()
-    made = looks(clock, 0)
+def test_what_is_asked_for_many_times_is_one_look_and_one_after_it(clock: Clock) -> None:
+    made = PollTimer(0, clock)
     assert made.seconds_until_due() is None and not made.start_if_due()
     for _ in range(3):
         made.request()
@@ -59,31 +54,30 @@ def test_what_is_asked_for_many_times_is_one_look_and_one_after_it() -> None:
     made.request()  # while the look is under way: it may have come too late for it
     made.finished(reached=True)
     assert made.seconds_until_due() == 0.5, "bursts are not followed one by one"
-    clock.now += 0.5
+    clock.pass_(0.5)
     assert made.start_if_due()
     made.finished(reached=True)
     assert made.seconds_until_due() is None
 
 
-def test_a_look_that_was_cut_short_is_still_due() -> None:
-    clock = Clock()
-    made = looks(clock, 0)
+def test_a_look_that_was_cut_short_is_still_due(clock: Clock) -> None:
+    made = PollTimer(0, clock)
     made.request()
     assert made.start_if_due()
     made.interrupted()
     assert made.start_if_due()
 
 
-def test_a_repository_on_this_disk_is_looked_at_every_second() -> None:
-    made = looks(Clock(), 30, embedded=True)
+def test_a_repository_on_this_disk_is_looked_at_every_second(clock: Clock) -> None:
+    made = PollTimer(30, clock, embedded=True)
     made.finished(reached=True)
     assert made.seconds_until_due() == 1
-    off = looks(Clock(), 0, embedded=True)
+    off = PollTimer(0, clock, embedded=True)
     assert off.seconds_until_due() is None
 
 
 def test_by_chance_looks_come_earlier_and_never_later() -> None:
-    made = PollTimer(100, steady=Clock())
+    made = PollTimer(100, REAL)
     pauses = set()
     for _ in range(50):
         made.finished(reached=True)
@@ -105,24 +99,25 @@ def test_anything_else_is_no_interval(text: str) -> None:
         parse_interval(text)
 
 
-def test_away_and_back_are_logged_once_each(caplog: pytest.LogCaptureFixture) -> None:
+def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, logger="demandops")
-    remote = RemoteMonitor("https://git.example/state.git")
+    remote = RemoteMonitor("https://git.example/state.git", clock)
     remote.record_reached()
     for _ in range(3):
         remote.record_unreachable("cannot be fetched: no route")
     assert remote.is_unreachable and remote.status.unreachable == "cannot be fetched: no route"
+    clock.pass_(90)
     for _ in range(3):
         remote.record_reached(pushed=True)
     assert [record.getMessage() for record in caplog.records] == [
         "cannot be fetched: no route; trying again until it is back",
-        "https://git.example/state.git is back after 0 s",
+        "https://git.example/state.git is back after 90 s",
     ]
     assert not remote.is_unreachable and remote.status.last_push is not None
 
 
-def test_a_push_that_is_denied_is_remembered_until_one_is_taken() -> None:
-    remote = RemoteMonitor("somewhere")
+def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) -> None:
+    remote = RemoteMonitor("somewhere", clock)
     remote.record_push_denied("takes no push: frozen")
     remote.record_reached()
     assert remote.status.push_denied == "takes no push: frozen" and not remote.is_unreachable

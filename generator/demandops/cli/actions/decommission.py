@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from demandops.decision import decide
 from demandops.demand import decommission_goal
 from demandops.errors import Refused
 from demandops.ledger.ledger import ClaimChange
+from demandops.runtime import REAL
 from demandops.staterepo import reader
 from demandops.staterepo.history import authorship
 from demandops.staterepo.load.snapshot import Snapshot
@@ -75,7 +75,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(progress=report)
         try:
-            decision = decide(snapshot.state, goal, datetime.now(timezone.utc), repo.file_reader())
+            decision = decide(snapshot.state, goal, REAL.now(), repo.file_reader())
         except Refused as error:
             _require_nothing_held(error, goal["name"], snapshot)
             return None

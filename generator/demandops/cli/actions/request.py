@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from demandops.cli.output import console, errors, progress, signing_option, stat
 from demandops.decision import admit, decide, form_faults
 from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
 from demandops.input_file import read_input
+from demandops.runtime import REAL
 from demandops.service import Generator, Receipt
 from demandops.service.approvals.proposal import parse_waiting_text
 from demandops.staterepo import reader
@@ -61,8 +61,8 @@ def request(
 
     FILE contains goals of the action DeploymentRequest as YAML, as for `ros2 action send_goal`, or
     documents of the kind Demand (docs/demand.md). Write - for standard input. Nothing is booked
-    unless all documents parse. They are then booked in order; the next one is booked even if one
-    is refused.
+    unless all documents parse. They are then booked in order; if one is refused, the
+    others are still booked.
     """
     documents = [document for file in files for document in _documents(file)]
     if not documents:
@@ -183,7 +183,7 @@ def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[d
 
         for index, document in enumerate(documents):
             try:
-                decision = decide(state, document.goal, datetime.now(timezone.utc), read)
+                decision = decide(state, document.goal, REAL.now(), read)
             except InvalidInput as error:
                 rows.append(_refused(index, document, error))
                 continue

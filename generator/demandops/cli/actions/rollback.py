@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from demandops.cli.output import (
 )
 from demandops.decision import Decision, decide
 from demandops.errors import InvalidInput
+from demandops.runtime import REAL
 from demandops.service import rollback_goal as rollbacks
 from demandops.staterepo import reader
 from demandops.staterepo.history.authorship import Person
@@ -100,7 +100,7 @@ def _dry_run(repo: Reader, target: _Target, base: str) -> dict[str, Any]:
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(base, report).state
     request = repo.restoration(target.to, drop_newer=target.drop_newer)
-    decision = decide(state, request, datetime.now(timezone.utc), repo.file_reader(base))
+    decision = decide(state, request, REAL.now(), repo.file_reader(base))
     return {"outcome": decision.outcome, **_consequences(decision)}
 
 

@@ -129,7 +129,7 @@ def _lines(checked: CheckResult) -> Iterator[str]:
     if consequence is None:
         if not checked.suggestions:
             return
-        yield "\nmend the errors to see what merging would do"
+        yield "\nfix the errors to see what merging would do"
         return
     if consequence.files or checked.bookkeeping:
         since = f" since {checked.base[:10]}" if checked.base else ""

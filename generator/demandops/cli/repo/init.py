@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timezone
 from pathlib import Path
 
 import click
 
 from demandops.cli.json_output import output_option, print_json
 from demandops.cli.output import console, signing_option
+from demandops.runtime import REAL
 from demandops.staterepo import new_repo
 from demandops.staterepo.git.signing import Signer
 
@@ -49,7 +49,7 @@ def init(
     """
     commit = new_repo.init(
         directory,
-        datetime.now(timezone.utc),
+        REAL.now(),
         bare=bare,
         gitops=gitops,
         url=url,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from datetime import datetime, timezone
 from typing import Any
 
 import click
@@ -12,6 +11,7 @@ from demandops import settings
 from demandops.cli.json_output import fault_data, output_option, print_json
 from demandops.cli.output import console, errors, state_repo_option
 from demandops.errors import fault
+from demandops.runtime import REAL
 from demandops.staterepo.write.slot import FoundJournal, find_journals
 
 
@@ -30,7 +30,7 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
     if a journal is damaged, because demands may be missing in it. Then use --set-aside, and send
     again those of the listed demands that are still needed: --output json prints their goals.
     """
-    now = datetime.now(timezone.utc)
+    now = REAL.now()
     found = list(find_journals(settings.data_home(state_repo), now, set_aside=set_aside))
     if output == "json":
         print_json([_row(each) for each in found])

@@ -105,7 +105,7 @@ def _suggestions(checked: CheckResult) -> Iterator[str]:
 def _consequence(checked: CheckResult) -> Iterator[str]:
     consequence = checked.preview
     if consequence is None:
-        yield "\nMend the errors to see what merging would do.\n"
+        yield "\nFix the errors to see what merging would do.\n"
         return
     if not consequence.files and not checked.bookkeeping:
         yield "\nMerging changes no release and no demand.\n"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import click
 from demandops.cli.json_output import output_option, print_json
 from demandops.cli.output import console, progress, signing_option, state_repo_option
 from demandops.render.gitops.controller_switch import Step
+from demandops.runtime import REAL
 from demandops.staterepo import upgrade as upgrading
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.upgrade import Upgrade, UpgradeRequest
@@ -57,7 +57,7 @@ def upgrade(
     """
     request = UpgradeRequest(gitops, url)
     asks = gitops is not None and not yes and output == "text" and sys.stdin.isatty()
-    now = datetime.now(timezone.utc)
+    now = REAL.now()
     signer = Signer(signing_key) if signing_key and not dry_run else None
     with progress("reading the ledger") as report:
         if dry_run or asks:

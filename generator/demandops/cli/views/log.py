@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import datetime, timezone
+from datetime import datetime
 from itertools import islice
 from typing import Any
 
@@ -13,6 +13,7 @@ from rich.table import Table
 from demandops.cli.json_output import commit_data, output_option, print_json
 from demandops.cli.output import console, state_repo_option
 from demandops.errors import StateRepoError
+from demandops.runtime import REAL
 from demandops.staterepo import reader
 from demandops.staterepo.history import revisions
 from demandops.staterepo.history.commit_log import LogEntry
@@ -41,7 +42,7 @@ class _Time(click.ParamType):  # type: ignore[type-arg]
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> datetime:
         """Parse a time."""
-        time = revisions.parse_time(str(value), datetime.now(timezone.utc), end=self._end)
+        time = revisions.parse_time(str(value), REAL.now(), end=self._end)
         if time is None:
             self.fail(f"'{value}' is not a time; write it like {revisions.TIMES}", param, ctx)
         return time

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timezone
-
 import click
 from rich.table import Table
 
@@ -17,6 +15,7 @@ from demandops.cli.json_output import (
 from demandops.cli.output import at_option, console, progress, state_repo_option
 from demandops.config.override import format_time
 from demandops.plan.views.override_report import Entry, override_report
+from demandops.runtime import REAL
 from demandops.staterepo import reader
 
 
@@ -33,7 +32,7 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(at, report)
     state = snapshot.state
-    entries = override_report(state, datetime.now(timezone.utc))
+    entries = override_report(state, REAL.now())
     if output == "json":
         print_json(
             [

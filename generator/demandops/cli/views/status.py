@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from demandops.cli.output import console, errors, progress, state_repo_option
 from demandops.cluster import access
 from demandops.cluster.health import Health, ObjectSelector, Target, health_reader
 from demandops.cluster.object_cache import ObjectCache
+from demandops.runtime import REAL
 from demandops.service import rollout_targets
 from demandops.staterepo import reader
 from demandops.staterepo.reader import Reader
@@ -79,8 +80,12 @@ def _read(
         for name, cluster in clusters.items()
         if cluster.kubeconfig and name in wanted
     }
-    with ThreadPoolExecutor(max(len(stores), 1)) as pool:
-        list(pool.map(lambda store: store.read_once(wanted[store.name]), stores.values()))
+    threads = [
+        REAL.start_thread(f"read-{name}", partial(store.read_once, wanted[name]))
+        for name, store in stores.items()
+    ]
+    for thread in threads:
+        thread.join()
     return stores
 
 

@@ -1,1 +1,1 @@
-"""What each operation does to the ledger, one module each, and what they share."""
+"""The operations on the ledger, one module each, and the rules that they share."""

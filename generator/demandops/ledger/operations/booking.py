@@ -20,7 +20,7 @@ def book(
     *,
     extend: bool = False,
 ) -> Ledger:
-    """Return the ledger with a claim on what is demanded.
+    """Return the ledger with a claim on a demanded application or connection.
 
     Args:
         ledger: the claims.

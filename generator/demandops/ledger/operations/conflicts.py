@@ -1,4 +1,4 @@
-"""Why a demand contradicts existing claims on the same application or connection."""
+"""Contradictions between a demand and existing claims on the same application or connection."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def _of_application(one: Demanded, app: Application, ledger: Ledger) -> Iterator
         return
     held, known = f"'{app.id}' is held by {', '.join(claim.requesters)}", claim.application
     for name, new, current, holding, remedy in (
-        ("node", app.node, known.node, "on", "ask for that node, or wait until it is released"),
+        ("node", app.node, known.node, "on", "request that node, or wait until it is released"),
         ("appdef", app.appdef, known.appdef, "as", "use another application id"),
         (
             "version",
             app.version,
             known.version,
             "in version",
-            "ask for the same, or use another application id",
+            "request the same version, or use another application id",
         ),
     ):
         if new != current:
@@ -61,7 +61,7 @@ def _of_connection(one: Demanded, demanded: Connection, ledger: Ledger) -> Itera
             yield one.fault(
                 name,
                 f"'{new}' contradicts an existing claim: {held} with {name} '{current}'; use "
-                "the same, or another connection id",
+                f"the same {name}, or another connection id",
                 code="conflict",
             )
             return

@@ -1,4 +1,4 @@
-"""Decommissioning: what remains of the claims when a node or a requester leaves for good.
+"""Decommissioning: a node or a requester leaves for good; its claims are released or reduced.
 
 For a node, its applications, the inputs from it and the connections that end at it are released,
 even if others requested them. For a requester, all its claims are released, as by a shutdown. That

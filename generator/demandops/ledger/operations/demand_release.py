@@ -1,4 +1,4 @@
-"""The release of a demand that names itself."""
+"""The release of a demand by its id."""
 
 from __future__ import annotations
 

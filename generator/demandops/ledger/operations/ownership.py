@@ -1,4 +1,4 @@
-"""Who owns a demand that names itself: the requesters of its claims.
+"""The owners of a demand that has an id: the requesters of its claims.
 
 A request that names none of them is refused. So a demand id that two choose by chance does no harm.
 """

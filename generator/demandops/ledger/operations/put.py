@@ -1,4 +1,4 @@
-"""A put: replaces the claims of a demand that names itself by what the request lists."""
+"""A put: a demand with an id holds exactly the applications and connections that it lists."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from demandops.ledger.operations.ownership import refuse_other_owners
 
 
 def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
-    """Book what ``request`` lists, and release everything else that the demand holds.
+    """Book the items that ``request`` lists; release all other claims of the demand.
 
     Raises:
         Refused: if the demand belongs to other requesters or conflicts with other demands.
@@ -30,7 +30,7 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
         faults += conflicts(one, others)
         key = ClaimKey(one.held.subject, demand)
         if ledger.get(key) is not None:
-            message = f"'{key.subject.id}' is listed twice; list it once, with all it takes"
+            message = f"'{key.subject.id}' is listed twice; list it once, with all its topics"
             faults.append(one.fault("id", message))
         ledger = book(ledger, one, request.id, key, start.get(key), now)
         keys.append(key)

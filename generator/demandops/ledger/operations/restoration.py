@@ -1,8 +1,9 @@
 """A restoration: the claims of an earlier commit are booked again.
 
 Claims that were booked since are released only if the request says so. A lease that comes back runs
-for its full term from now on, because its old end may have passed. Claims that an override keeps
-are no demand: they are updated as after every change (:mod:`demandops.plan.overrides.kept_claims`).
+for its full term from now on, because its old end may have passed. Claims that an
+override keeps belong to no demand: :mod:`demandops.plan.overrides.kept_claims` updates them then,
+as after every change.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Restoration(DemandRequest):
 
 
 def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
-    """Make the ledger what it was.
+    """Return the ledger with the claims of the earlier commit, and the changes.
 
     Raises:
         Refused: if that drops or undoes newer claims, and ``drop_newer`` is not set.
@@ -60,7 +61,7 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
-    """Return what the restoration changes; a claim whose lease alone differs stays as it is."""
+    """Return the changed claims; a claim that differs only in its lease does not change."""
     restored = {claim.key: claim for claim in request.claims}
     gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in restored]
     back = [ClaimChange(ledger.get(key), claim) for key, claim in restored.items()]

@@ -55,7 +55,7 @@ def _matching_claim(claims: Iterable[Claim], request: str, listed: Demanded) -> 
 
 
 def _subtract(claim: Claim, one: Demanded, now: datetime) -> tuple[Claim | None, list[str]]:
-    """Return what remains of a claim, if anything, and which topics it did not hold."""
+    """Return the rest of a claim, ``None`` if nothing is left, and topics that it did not hold."""
     held = claim.held
     left, missing = held.without(one.held)  # type: ignore[arg-type]  # it is of the same kind
     if left is None or left == held:

@@ -24,7 +24,7 @@ from demandops.plan.release_keys import keys_of_claims
 
 
 def faults(request: DemandRequest, after: World, changes: Changes) -> Iterator[Fault]:
-    """Yield every new application and connection of a request that an override denies."""
+    """Yield a fault for each new application or connection that an override denies."""
     denying = [one for one in reversed(after.overrides) if one.deny]
     if not denying or not request.adds_claims:
         return
@@ -56,7 +56,7 @@ def _service_traits(one: Demanded, after: World) -> Iterator[Traits]:
 
 
 def _denied_field(override: Override, one: Demanded, services: list[Traits], config: Config) -> str:
-    """Return the field that makes an override deny what is demanded, or an empty text."""
+    """Return the field of a demand that an override denies, or an empty text."""
     for selector in override.select:
         for traits in services if selector.services else [traits_of(one)]:
             if fits(selector, traits, config):

@@ -1,4 +1,4 @@
-"""Quotas: what a booking must not exceed in an access domain."""
+"""Quotas: the limits of an access domain that a booking must not exceed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demandops.subject import Subject, SubjectKind
 
 
 def faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
-    """Yield every quota that ``changes`` exceed, unless the count does not grow."""
+    """Yield a fault for each quota that is exceeded and whose count ``changes`` raised."""
     domain_of = after.config.domain_of
     booked = [change.after for change in changes.claims if change.after]
     holders = {(claim.held.home, who) for claim in booked for who in claim.requesters}

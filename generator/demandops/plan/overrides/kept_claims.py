@@ -1,4 +1,4 @@
-"""``keep``: a claim of the override's own keeps a subject running without a demand.
+"""``keep``: the override has a claim of its own, so a subject runs without a demand.
 
 When the last claim on a subject is released, a claim with the same content is booked for the
 override's owner. It is removed when a demand asks for the subject again. Because it is a claim,

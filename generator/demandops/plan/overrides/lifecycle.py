@@ -1,4 +1,4 @@
-"""What the ledger needs when overrides change or end: kept claims, and markers of ended overrides.
+"""Changes to the ledger when overrides change or end: kept claims, markers of ended overrides.
 
 An override whose end had passed when it was merged never applies. The generator ends an override
 that was in effect with a commit of its own.

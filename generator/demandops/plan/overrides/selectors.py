@@ -1,6 +1,6 @@
-"""Selectors: which releases, claims and demands an override is for.
+"""Selectors: which releases, claims and demands an override matches.
 
-Does not know what an override does to them.
+Knows no effects of overrides.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from demandops.demand.demand_request import Demanded
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """What a selector matches. Only the release of a service has a ``service``."""
+    """The values that a selector is compared with; only a service's release has a ``service``."""
 
     nodes: tuple[str, ...]
     requesters: tuple[str, ...]

@@ -19,7 +19,7 @@ from demandops.subject import SubjectKind
 
 @dataclass(frozen=True, slots=True)
 class ServiceEntry:
-    """Who requests one service, and its inputs (role → sorted topics)."""
+    """One service: its requesters and its inputs (role → sorted topics)."""
 
     applications: tuple[str, ...]
     service: str
@@ -32,7 +32,7 @@ class ServiceEntry:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionEntry:
-    """Who requests one connection, and which source topics it carries."""
+    """One connection: its requesters and the source topics that it carries."""
 
     source: str
     target: str
@@ -65,7 +65,7 @@ class Bookkeeping:
 
 
 def bookkeeping(world: World) -> Bookkeeping:
-    """Return who requests what."""
+    """Return the requesters of each service and connection."""
     services = {}
     for release in explanation.releases(world):
         if isinstance(release, ServiceRelease):

@@ -72,7 +72,7 @@ class _Effects:
 def suggest_override(
     path: str, texts: tuple[str, str | None], release: Release, config: Config, owner: str
 ) -> Suggestion | None:
-    """Return the override for a manual edit, or ``None`` if an override cannot make any of it.
+    """Return the override for a manual edit, or ``None`` if no override has a part of its effect.
 
     Args:
         path: the generated file.

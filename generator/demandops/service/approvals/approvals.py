@@ -7,7 +7,6 @@ there. Until then its branch is kept up to date: merging it must give what main 
 from __future__ import annotations
 
 import logging
-import time
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -174,7 +173,7 @@ class Approvals:
         """Return whether to check the proposals now, with main at ``tip``."""
         if not self._proposals:
             return False
-        now = time.monotonic()
+        now = self._repository.runtime.monotonic()
         if now < self._next_check and self._checked_at == _UNFINISHED:
             return False
         tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)
@@ -188,11 +187,11 @@ class Approvals:
         """Return the seconds until the next check; ``longest`` without proposals."""
         if not self._proposals:
             return longest
-        return min(longest, max(self._next_check - time.monotonic(), 0.05))
+        return min(longest, max(self._next_check - self._repository.runtime.monotonic(), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
         """Fetch the commits of the branches, and plan the next check even if this one fails."""
-        self._check_began = time.monotonic()
+        self._check_began = self._repository.runtime.monotonic()
         self._next_check, self._checked_at = self._check_began + self._interval, _UNFINISHED
         return self._branch_sync.fetch_heads()
 
@@ -225,7 +224,7 @@ class Approvals:
                     self._fail(proposal, error)
             except PushDenied as error:
                 self._fail(proposal, error)
-        ended = time.monotonic()
+        ended = self._repository.runtime.monotonic()
         self._checked_at, self._rest_until = (
             str(snapshot.commit),
             ended + _PAUSE_FACTOR * (ended - self._check_began),

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import datetime, timezone
 from pathlib import Path
 
 from demandops.decision import Decision, decide
@@ -45,7 +44,7 @@ class BranchSync:
         self._repository = repository
         self._queue = queue
         self._branches = ProposalBranches(repository)
-        self._forge = ForgeWorker(token_file, on_update)
+        self._forge = ForgeWorker(token_file, on_update, repository.runtime)
 
     def fetch_heads(self) -> BranchHeads:
         """Fetch the commits of main and of the branches.
@@ -174,7 +173,7 @@ class BranchSync:
     ) -> bool:
         """Commit the demands on main and push the branch; return False if one was withdrawn."""
         line = commit_batch.CommitBatch(self._repository, snapshot)
-        now = datetime.now(timezone.utc)
+        now = self._repository.runtime.now()
         for ticket, step in steps:
             if step.files:
                 line.commit(step, ticket.operation, ticket.received, now, proposal.branch)

@@ -7,14 +7,14 @@ request.
 from __future__ import annotations
 
 import logging
-import queue
-import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from demandops.config.repo_settings import Proposals
 from demandops.forge import ForgeError, PullRequest, forge_for
+from demandops.runtime import Runtime, Thread
 from demandops.settings import MAIN_BRANCH
 
 log = logging.getLogger("demandops")
@@ -34,14 +34,17 @@ class _Task:
 class ForgeWorker:
     """Opens, watches and closes pull requests; its public methods belong to the worker thread."""
 
-    def __init__(self, token_file: Path | None, on_news: Callable[[str], None]) -> None:
-        self._token_file = token_file
+    def __init__(
+        self, token_file: Path | None, on_news: Callable[[str], None], runtime: Runtime
+    ) -> None:
+        self._token_file, self._runtime = token_file, runtime
         self._on_update = on_news
-        self._tasks: queue.Queue[tuple[_Task, bool]] = queue.Queue()
+        self._tasks: deque[tuple[_Task, bool]] = deque()
+        self._due = runtime.event()
         self._wanted: dict[str, _Task] = {}
         self._pull_requests: dict[str, PullRequest | None] = {}
-        self._lock = threading.Lock()
-        self._thread: threading.Thread | None = None
+        self._lock = runtime.lock()
+        self._thread: Thread | None = None
         self._last_error = ""
 
     def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
@@ -70,27 +73,22 @@ class ForgeWorker:
             self._enqueue(task, close=True)
 
     def _enqueue(self, task: _Task, *, close: bool) -> None:
-        self._tasks.put((task, close))
+        self._tasks.append((task, close))
+        self._due.set()
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="demandops-forge", daemon=True)
-            self._thread.start()
+            self._thread = self._runtime.start_thread("forge", self._run)
 
     # ---- in the thread of its own ----
 
     def _run(self) -> None:
         while True:
-            try:
-                task, close = self._tasks.get(timeout=POLL_S)
-            except queue.Empty:
+            if not self._due.wait(POLL_S):
                 with self._lock:
-                    tasks = list(self._wanted.values())
-                for task in tasks:
-                    self._handle(task, close=False)
-                continue
-            try:
+                    self._tasks.extend((task, False) for task in self._wanted.values())
+            self._due.clear()
+            while self._tasks:
+                task, close = self._tasks.popleft()
                 self._handle(task, close=close)
-            finally:
-                self._tasks.task_done()
 
     def _handle(self, task: _Task, *, close: bool) -> None:
         known = self._pull_requests.get(task.branch)

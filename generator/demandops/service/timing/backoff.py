@@ -6,7 +6,7 @@ are jittered and bounded, so no writer starves and a remote that comes back is n
 
 from __future__ import annotations
 
-import random
+from demandops.runtime import Runtime
 
 FIRST_PAUSE_S = 0.05
 LONGEST_AWAY_S = 10.0
@@ -21,8 +21,8 @@ LIMIT_REMOTE = 200
 class Backoff:
     """The delays of one batch of demands."""
 
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
+    def __init__(self, limit: int, runtime: Runtime) -> None:
+        self._limit, self._runtime = limit, runtime
         self.published()
 
     def published(self) -> None:
@@ -43,13 +43,12 @@ class Backoff:
         self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
         wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
         self._away = FIRST_PAUSE_S
-        return _jittered(wait)
+        return self._jittered(wait)
 
     def unreachable(self) -> float:
         """Return the seconds to wait after the remote could not be reached."""
         wait, self._away = self._away, min(self._away * 2, LONGEST_AWAY_S)
-        return _jittered(wait)
+        return self._jittered(wait)
 
-
-def _jittered(seconds: float) -> float:
-    return seconds * random.uniform(0.5, 1.0)  # noqa: S311 - not for security
+    def _jittered(self, seconds: float) -> float:
+        return seconds * self._runtime.uniform(0.5, 1.0)

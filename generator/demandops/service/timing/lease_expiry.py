@@ -8,14 +8,12 @@ was asleep looks the same, so its leases get their full term too.
 from __future__ import annotations
 
 import logging
-import time
-import uuid
-from collections.abc import Callable
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timedelta
 
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Expire
 from demandops.ledger.ledger import Ledger
+from demandops.runtime import Runtime
 from demandops.service.ticket import Ticket
 
 log = logging.getLogger("demandops")
@@ -26,18 +24,12 @@ LONGEST_WAIT_S = 60.0
 """The longest time between two checks of the leases, because the clock may be set meanwhile."""
 
 
-def _wall() -> datetime:
-    return datetime.now(timezone.utc)
-
-
 class LeaseClock:
     """Decides which leases have ended, and when to check again."""
 
-    def __init__(
-        self, wall: Callable[[], datetime] = _wall, steady: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._wall, self._steady = wall, steady
-        self._last = (wall(), steady())
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._last = (runtime.now(), runtime.monotonic())
         self._jumped_at: datetime | None = None
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
@@ -63,7 +55,7 @@ class LeaseClock:
         return min(max((end - self._read_clocks()).total_seconds() + 0.01, _SHORTEST_S), longest)
 
     def _read_clocks(self) -> datetime:
-        wall, steady = self._wall(), self._steady()
+        wall, steady = self._runtime.now(), self._runtime.monotonic()
         expected = self._last[0] + timedelta(seconds=steady - self._last[1])
         if wall - expected > _JUMP:
             jump = (wall - expected).total_seconds()
@@ -84,8 +76,9 @@ class LeaseClock:
 class LeaseExpiry:
     """Makes the demands that release what has ended."""
 
-    def __init__(self) -> None:
-        self._clock = LeaseClock()
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._clock = LeaseClock(runtime)
         self._tried: dict[str, datetime] = {}
 
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
@@ -106,6 +99,6 @@ class LeaseExpiry:
         self._tried |= dict.fromkeys(demands, now)
         requests = (Expire(id=demand, demand=demand) for demand in demands)
         return [
-            Ticket(str(uuid.uuid4()), request, now, lambda stage, text: None)
+            Ticket(self._runtime.fresh_id(), request, now, lambda stage, text: None)
             for request in requests
         ]

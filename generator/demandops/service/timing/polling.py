@@ -1,17 +1,14 @@
 """When to fetch from the state repo while no demand comes.
 
-Knows no Git: it is given a clock, and its user reports the end of each fetch.
+Knows no Git: its user reports the end of each fetch.
 """
 
 from __future__ import annotations
 
-import random
 import re
-import threading
-import time
-from collections.abc import Callable
 
 from demandops.config.policy import seconds_of
+from demandops.runtime import Runtime
 
 DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
@@ -31,39 +28,26 @@ def parse_interval(text: str) -> float:
     return float(seconds_of(text))
 
 
-def _jittered(interval: float) -> float:
-    """Return a little less than the interval, so that a change is seen within it."""
-    return interval * random.uniform(0.8, 1.0)  # noqa: S311 - not for security
-
-
 class PollTimer:
     """The times of the fetches: on request and at an interval that grows while fetches fail.
 
     Any thread may call :meth:`request`; everything else belongs to one thread.
     """
 
-    def __init__(
-        self,
-        interval: float,
-        *,
-        embedded: bool = False,
-        steady: Callable[[], float] = time.monotonic,
-        jittered: Callable[[float], float] = _jittered,
-    ) -> None:
+    def __init__(self, interval: float, runtime: Runtime, *, embedded: bool = False) -> None:
         """Start the timer; the first fetch is due at once.
 
         Args:
             interval: seconds between two fetches; 0: only on :meth:`request`.
+            runtime: tells the time.
             embedded: whether the repository is on this disk.
-            steady: returns the time in seconds.
-            jittered: shortens a pause at random, so that generators do not fetch all at once.
         """
         self._interval = min(interval, _EMBEDDED_S) if embedded else interval
-        self._steady, self._jittered = steady, jittered
+        self._runtime = runtime
         self._pause = self._interval
-        self._last = -_SHORTEST_GAP_S + steady()
-        self._next = steady() if interval else None
-        self._requested = threading.Event()
+        self._last = runtime.monotonic() - _SHORTEST_GAP_S
+        self._next = runtime.monotonic() if interval else None
+        self._requested = runtime.event()
 
     def request(self) -> None:
         """Make a fetch due now; requests before it starts lead to one fetch."""
@@ -74,7 +58,7 @@ class PollTimer:
         times = [] if self._next is None else [self._next]
         if self._requested.is_set():
             times.append(self._last + _SHORTEST_GAP_S)
-        return max(min(times) - self._steady(), 0.0) if times else None
+        return max(min(times) - self._runtime.monotonic(), 0.0) if times else None
 
     def start_if_due(self) -> bool:
         """Return whether a fetch is due; a request from now on leads to another fetch."""
@@ -86,10 +70,11 @@ class PollTimer:
     def finished(self, *, reached: bool) -> None:
         """Plan the next fetch after a fetch or a push, which shows what is new as well."""
         longest = max(_LONGEST_BACKOFF_S, self._interval)
-        self._last = self._steady()
+        self._last = self._runtime.monotonic()
         if self._next is not None:
             self._pause = self._interval if reached else min(self._pause * 2, longest)
-            self._next = self._last + self._jittered(self._pause)
+            # a little less at random, so that generators do not fetch all at once
+            self._next = self._last + self._pause * self._runtime.uniform(0.8, 1.0)
 
     def interrupted(self) -> None:
         """Keep the fetch due, because it was cut short."""

@@ -1,4 +1,4 @@
-"""What a commit of the generator may change: generated files, and claims that its message names.
+"""The files that a generator's commit may change: generated ones, and claims of its message.
 
 Part of proving a commit (:mod:`demandops.staterepo.audit.verification`). Reads only files and
 messages, and does not know releases.

@@ -3,7 +3,7 @@
 A commit is proven whole (everything is loaded and rendered) or by its differences from the commit
 proven before it. The second way relies on object ids, and on plans and files that depend on their
 input only. It does not trust which releases the generator considered affected: it plans and renders
-every release again if any input of its plan changed (:mod:`demandops.plan.incremental_plan`), and
+every release again if any input of its plan changed (:mod:`demandops.plan.traced_plan`), and
 compares every file that differs in Git. The first and the last commit are proven whole.
 """
 
@@ -21,9 +21,9 @@ from demandops.errors import InvalidInput
 from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import ClaimChange
 from demandops.ledger.world import World
-from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
+from demandops.plan.traced_plan import TracedPlan
 from demandops.render import release_file
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
@@ -58,12 +58,12 @@ class Verdict:
 
 
 class _Proof:
-    """A commit that was rendered again, and what the proof of the next one reuses."""
+    """A commit that was rendered again; the proof of the next commit reuses its results."""
 
     def __init__(self, state: State, commit: Commit) -> None:
         """Render a commit whole."""
         self.state, self._commit = state, commit
-        self._plan = IncrementalPlan(state.config)
+        self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         self._held: dict[ReleaseKey, Release] = {}
         """Releases whose files an override holds: they depend on the parent commit."""
@@ -78,7 +78,7 @@ class _Proof:
         return trees.differ(self._commit.tree, commit.tree, roots)
 
     def advance(self, commit: Commit) -> None:
-        """Render what a later commit changed in the ledger, and record which files it changed.
+        """Render the releases that a later commit affects, and record the files that it changed.
 
         Raises:
             _Unreadable: a claim file is not valid.
@@ -102,7 +102,7 @@ class _Proof:
         self._render(changes)
 
     def _render(self, changes: Sequence[ClaimChange]) -> None:
-        """Plan and render what the changes affect, and what overrides hold."""
+        """Plan and render the releases that changes affect, and those that overrides hold."""
         for key, release in self._plan.advance(self.state.ledger, changes).items():
             self._planned.pop(key, None)
             self._held.pop(key, None)
@@ -119,7 +119,7 @@ class _Proof:
         return path, _blob(release_file.release_text(release, state.config, state.engine, current))
 
     def differing(self) -> tuple[str, ...]:
-        """Return the files that differ from what was rendered."""
+        """Return the committed files that differ from the rendered ones."""
         wanted = self._undemanded | dict(self._planned.values())
         before = trees.parent_tree(self._commit)
         if before is not None and _holds(self.state):
@@ -173,7 +173,7 @@ class _Proofs:
         self._proof: _Proof | None = None
 
     def differing(self, commit: Commit, entry: LogEntry, *, whole: bool) -> tuple[str, ...]:
-        """Return the files of a commit that differ from what was rendered.
+        """Return the files of a commit that differ from the rendered ones.
 
         Args:
             whole: do not reuse results of another commit.

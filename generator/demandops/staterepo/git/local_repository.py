@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pygit2
 from pygit2 import Oid, Repository
 
 from demandops.errors import StateRepoError
+from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git.repository import MAIN, StateRepository
 
@@ -61,7 +61,7 @@ class LocalRepository(StateRepository):
         """Remove the branch's lock if a killed process left it: Git holds it for milliseconds."""
         lock = Path(self.objects.path) / f"{MAIN}.lock"
         with suppress(FileNotFoundError):
-            if time.time() - lock.stat().st_mtime > _STALE_LOCK_S:
+            if REAL.now().timestamp() - lock.stat().st_mtime > _STALE_LOCK_S:
                 log.warning("removing %s, which a killed process left behind", lock)
                 lock.unlink()
 

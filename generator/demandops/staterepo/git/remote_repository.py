@@ -11,7 +11,6 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +20,7 @@ import pygit2
 from pygit2 import Oid, Repository
 
 from demandops.errors import StateRepoError
+from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git.address import without_secrets
 from demandops.staterepo.git.repository import (
@@ -71,7 +71,7 @@ class RemoteRepository(StateRepository):
         except RemoteAway as error:
             if not allow_offline:
                 raise
-            log.warning("%s; continuing with what was fetched last", error)
+            log.warning("%s; continuing with the commits of the last fetch", error)
 
     def _is_usable(self) -> bool:
         """Return whether an earlier run left a complete clone."""
@@ -243,13 +243,13 @@ class RemoteRepository(StateRepository):
 
 def _wait_for(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:
     """Return git's output; end git if it takes too long or something is urgent."""
-    end = time.monotonic() + TIMEOUT_S
+    end = REAL.monotonic() + TIMEOUT_S
     while True:
         try:
             return process.communicate(timeout=_POLL_S)
         except subprocess.TimeoutExpired:
             hurry = urgent()
-            if not hurry and time.monotonic() < end:
+            if not hurry and REAL.monotonic() < end:
                 continue
             output = _terminate(process)
             if hurry:

@@ -15,6 +15,7 @@ import pygit2
 from pygit2 import Oid, Repository, Tree
 
 from demandops.errors import StateRepoError
+from demandops.runtime import REAL, Runtime
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.signing import Signer
@@ -43,10 +44,12 @@ class StateRepository(ABC):
     address: str
     signer: Signer | None = None
     """Signs the commits made here; None: they are not signed."""
+    runtime: Runtime = REAL
+    """The clock, chance and threads of whoever writes to it."""
     always_current: bool
     """Whether :meth:`tip` is never out of date (a repository on this disk)."""
     main_reference = MAIN
-    """The branch, or what was last fetched of it."""
+    """The branch, or its remote-tracking branch of the last fetch."""
 
     def tip(self) -> Oid:
         """Return the newest published commit that is known here; does not ask the remote.

@@ -76,7 +76,7 @@ class Signer:
 
 
 def _key_fault(key: Path, output: str) -> str:
-    """Return what is wrong with a key and the remedy, from ssh-keygen's output."""
+    """Return the problem of a key and its remedy, from ssh-keygen's output."""
     if "UNPROTECTED PRIVATE KEY" in output or "bad permissions" in output:
         return f"signing key {key} can be read by others; run: chmod 600 {key}"
     if "Permission denied" in output:

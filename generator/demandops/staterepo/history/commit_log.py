@@ -24,7 +24,7 @@ _WHY = "Why: "
 
 @dataclass(frozen=True, slots=True)
 class LogEntry:
-    """One commit of the state repo, with what its message says."""
+    """One commit of the state repo, with the content of its message."""
 
     commit: str
     time: datetime

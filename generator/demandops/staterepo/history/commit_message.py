@@ -37,7 +37,7 @@ _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 
 
 def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
-    """Return a person and a time, without what Git does not accept in them."""
+    """Return a person and a time, without the characters that Git does not accept."""
     email = _UNFIT.sub("", email) or GENERATOR_EMAIL
     return pygit2.Signature(_name(name), email, int(time.timestamp()), 0)
 
@@ -210,7 +210,7 @@ def of_follow(
     *,
     reports: bool = True,
 ) -> str:
-    """Return the message of a commit that renders what people changed in the state repo."""
+    """Return the message of a commit that renders people's changes of the state repo."""
     problems, releases = list(problems), tuple(releases)
     why = f"Why: commits up to {cause[:12]} changed configuration, ledger or generated files."
     title = _follow_title(releases, cause)

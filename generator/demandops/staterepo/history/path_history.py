@@ -31,7 +31,7 @@ class PathChange:
 
 @dataclass(frozen=True, slots=True)
 class PathHistory:
-    """When a path was added last, changed since, and removed.
+    """The commits that last added a path, changed it since, and removed it.
 
     ``newest`` are the commits that changed it since it was added, newest first; ``more`` is how
     many are left out. ``stopped`` is the commit that removed it, or None if it exists.
@@ -91,7 +91,7 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
 
 
 def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -> list[str]:
-    """Return what ``git log`` prints about a path, which is the last of ``query``."""
+    """Return the output of ``git log`` for a path, which is the last of ``query``."""
     *options, path = query
     commits = [str(commit_of(repo, tip).id), *([f"^{until}"] if until else [])]
     with git.Repo(repo.path) as opened:

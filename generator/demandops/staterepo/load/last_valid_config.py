@@ -114,7 +114,7 @@ def load_last_valid_config(
     to: Oid,
     load: Callable[[Mapping[str, str]], Config],
 ) -> LastValidConfig:
-    """Return the configuration of a commit, with last valid versions of what is not valid.
+    """Return the configuration of a commit, with the last valid versions of invalid files.
 
     Args:
         before: what was in effect before.
@@ -144,7 +144,7 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
-    """Return files and those merged in the same commits or of the same definition."""
+    """Return these files, those of the same commits, and those of the same definition."""
     together = set(broken)
     merges = [
         {path for path, _ in trees.differences(commit.parents[0].tree, commit.tree, CONFIG_ROOTS)}

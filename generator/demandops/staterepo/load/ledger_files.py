@@ -105,7 +105,7 @@ def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
 
 
 def changes_node(repo: Repository, revision: str | Oid, node: str) -> bool:
-    """Return whether a commit changed what runs on a node, or a claim that names it."""
+    """Return whether a commit changed a release on a node, or a claim that names the node."""
     commit = trees.commit_of(repo, revision)
     before, after = trees.parent_tree(commit), commit.tree
     if before is None:

@@ -1,4 +1,4 @@
-"""The problem report: a file in the state repo that lists what is not valid there.
+"""The problem report: a file in the state repo that lists the invalid files.
 
 It names each fault, since which commit it exists, and who made that commit. The same problems give
 the same bytes, so an unchanged report causes no commit. Pure: texts and faults in, text out.

@@ -1,7 +1,8 @@
-"""Claims that a person changed and that cannot be planned: quarantined, file by file.
+"""Quarantine: people's changes that cannot be planned are not applied.
 
-The edited file stays in the repo, for example a claim that names an unknown node, but the last
-valid version of the claim is in effect (:func:`ledger_files.last_valid_claims`).
+A claim that cannot be planned, for example because it names an unknown node, stays in its file. Its
+last valid version is in effect (:func:`ledger_files.last_valid_claims`). If the new configuration
+is the reason, the old configuration stays in effect.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ class Accepted:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What people changed, and why subjects cannot be planned with the new configuration or old.
+    """People's changes, and the faults of subjects with the new and with the old configuration.
 
-    A subject is at fault if it cannot be planned with either: else the configuration is.
+    If a subject cannot be planned with either, its claims are at fault. If only the new
+    configuration fails, that configuration is at fault.
     """
 
     repo: Repository
@@ -46,14 +48,14 @@ class Judgement:
     """The new ledger with the configuration that was in effect before."""
 
     def with_new_config(self) -> Accepted:
-        """Return what is in effect with the new configuration."""
+        """Return the state in effect if the new configuration is accepted."""
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
         return self._without(Accepted(self.advance.snapshot, self.advance.subjects), faults)
 
     def with_old_config(self, faults: Iterable[Fault]) -> Accepted:
-        """Return what is in effect because of ``faults`` of the new configuration."""
+        """Return the state in effect if ``faults`` rule out the new configuration."""
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
         snapshot = replace(

@@ -1,4 +1,4 @@
-"""The commit that a rollback returns to: its claims, and which configuration changed since."""
+"""The commit to roll back to: its claims, and the configuration files that changed since."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ Progress = Callable[[int, int], None]
 class Snapshot:
     """A commit and its state: configuration and ledger.
 
-    ``problems``: what is not valid; the last valid versions are in effect instead.
+    ``problems``: the faults of invalid files; their last valid versions are in effect.
     ``last_valid_commit``: the newest commit without problems.
     ``quarantined_files``: ledger files whose content at this commit is not in effect.
     ``other_config_source``: the source of the configuration in effect, if not this commit.
@@ -187,9 +187,10 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Remembers what was read after the published snapshot until a commit is published on it.
+    """Keeps what was read after the published snapshot, until a commit is published on it.
 
-    If other writers are faster, each attempt would otherwise read more and again be too late.
+    So an attempt reads only what is new. If it read everything again, faster writers could always
+    be ahead of it.
     """
 
     def __init__(self) -> None:
@@ -197,7 +198,7 @@ class ReadAhead:
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        """Return what differs between ``before`` and ``tip``.
+        """Return the advance from ``before`` to ``tip``.
 
         Raises:
             StateRepoError: ``tip`` has another render version.

@@ -3,7 +3,8 @@
 The generator's commits record it in trailers. ``In-Force`` names the newest commit where all files
 were valid. ``Configuration`` names the commit whose configuration is in effect. Each ``Stands-In``
 names a file that is in effect in another version, as path and blob. A restart and
-``demandops verify`` start from these; what people changed since is applied like while it runs.
+``demandops verify`` start from these trailers. They then apply people's later changes with the same
+code as a running generator.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
 def state_at(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state in effect at any commit: what is recorded, and what people changed since.
+    """Return the state in effect at any commit: the recorded state with people's later changes.
 
     Raises:
         InvalidInput, StateRepoError: there never was a valid state.
@@ -85,7 +86,7 @@ def state_at(
 def start_at(
     repo: Repository, commit: Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the newest state up to a commit that is known: recorded, or of an all valid commit.
+    """Return the newest known state up to a commit: a recorded one, or one without invalid files.
 
     Raises:
         InvalidInput, StateRepoError: there never was a valid state.

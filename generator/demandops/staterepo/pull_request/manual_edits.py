@@ -111,7 +111,7 @@ def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | Non
 
 
 def _source_of(path: str) -> str:
-    """Return what to edit instead of a generated file that is not a release."""
+    """Return the files to edit instead of a generated file that is not a release."""
     if path.startswith(f"{BOOTSTRAP_ROOT}/"):
         return "demandops.yaml, inventory/ or policy/access-domains.yaml"
     if "/_charts/" in path:

@@ -1,4 +1,4 @@
-"""Whether an edit of a checked-out state repo can be merged, and what merging would do.
+"""The check of a pull request: whether an edit can be merged, and the effect of the merge.
 
 All files must be valid and render, generated files must not have manual edits, and a changed chart
 must have a new version, because Flux and Argo CD compare only versions. The edit is compared with
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
+from datetime import datetime
 from pathlib import Path
 
 from demandops import strict_yaml
@@ -29,6 +29,7 @@ from demandops.plan.views.override_report import override_report, warnings
 from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview
 from demandops.render.changes.override_suggestion import Suggestion
+from demandops.runtime import REAL
 from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.load import ledger_files
@@ -55,7 +56,7 @@ class CheckResult:
 
 
 def check(folder: Path, base: str | None = None, now: datetime | None = None) -> CheckResult:
-    """Check the files of a folder, render them, and preview what merging would do.
+    """Check the files of a folder, render them, and preview the effect of a merge.
 
     Args:
         folder: a checked-out state repo, or its files without Git.
@@ -69,7 +70,7 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
-    edit = _Edit(files, start, now or datetime.now(timezone.utc))
+    edit = _Edit(files, start, now or REAL.now())
     claims = ledger_files.read(sorted(files.items()))
     faults += claims.faults
     result = CheckResult((), base=start.commit if start else None)

@@ -7,7 +7,6 @@ evaluated again on the new tip.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -51,7 +50,7 @@ _PAUSE_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class _Followed:
-    """What follows from people's changes: the state in effect, the files, the kept claims."""
+    """The effect of people's changes: the state in effect, the files and the kept claims."""
 
     snapshot: Snapshot
     change: Changeset
@@ -117,7 +116,7 @@ class CommitBatch:
         self._settled.append((f"{outcome}-Operation-Id", operation))
 
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
-        """Render what people changed and commit the files that differ, if any.
+        """Apply people's changes: render, and commit the files that differ, if any.
 
         What cannot be planned or rendered (a claim's node was removed from the inventory) stays
         as it was and is listed in the head's problems.
@@ -151,7 +150,7 @@ class CommitBatch:
         self.commit_files(files, followed.snapshot.state, text, author, now)
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Return what follows, with the old configuration if the new one cannot be planned."""
+        """Return the effect, with the old configuration if the new one cannot be planned."""
         judgement = quarantine.judge(self._objects, advance, before, self._tree)
         accepted = judgement.with_new_config()
         if advance.config_changed:
@@ -190,7 +189,7 @@ class CommitBatch:
         return {} if wanted == current else {problem_report.PATH: wanted}
 
     def end_override(self, override: Override, now: datetime) -> None:
-        """Commit the end of an expired override, and what it changes.
+        """Commit the end of an expired override, with its effect on claims and releases.
 
         Raises:
             Refused, InvalidInput: the state without the override cannot be planned or rendered.
@@ -251,7 +250,7 @@ class CommitBatch:
                 # object while it is read
                 if attempt == _ATTEMPTS:
                     raise
-                time.sleep(_PAUSE_S * attempt)
+                self._repository.runtime.sleep(_PAUSE_S * attempt)
         return made
 
     def publish(self) -> bool:

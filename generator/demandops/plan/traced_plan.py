@@ -1,8 +1,9 @@
-"""A plan that follows a sequence of ledgers: it records what each release read of the ledger.
+"""A plan that follows a sequence of ledgers, for the proof of commits.
 
-Planning is a function of ledger and configuration. If nothing that a release read has changed, its
-plan is the same; only the others are planned again. The generator predicts which releases a claim
-affects. A proof must not rely on that prediction, so it records the reads instead.
+Planning is a function of ledger and configuration. The plan records which parts of the ledger were
+read for each release. If none of them changes, the release stays the same; only the others are
+planned again. The generator predicts which releases a claim affects
+(:func:`demandops.plan.release_keys.affected_keys`). A proof must not rely on that prediction.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _ALL: _Read = ("all",)
 """A read of the whole ledger."""
 
 
-class IncrementalPlan:
+class TracedPlan:
     """The plan of one configuration for a sequence of ledgers with the same ended overrides."""
 
     def __init__(self, config: Config) -> None:

@@ -1,4 +1,4 @@
-"""What GitHub and Gitea have in common: pull requests, and the calls that change them."""
+"""Pull requests at a forge, and the HTTP calls that GitHub and Gitea share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plans brought forward are the plans made afresh, whatever is booked in whatever order."""
+"""A traced plan is the plan that is made from nothing, whatever is booked in whatever order."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from demandops.config.config import Config
 from demandops.decision import Decision
 from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.ledger.world import World
-from demandops.plan.incremental_plan import IncrementalPlan
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys
+from demandops.plan.traced_plan import TracedPlan
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -31,7 +31,7 @@ class Following:
     """What somebody holds who hears only of changes."""
 
     def __init__(self, config: Config) -> None:
-        self._plan = IncrementalPlan(config)
+        self._plan = TracedPlan(config)
         self.releases: dict[ReleaseKey, Release] = {}
 
     def take(self, ledger: Ledger, changes: tuple[ClaimChange, ...]) -> int:

@@ -1,0 +1,40 @@
+"""A generator in one thread: everything that it does follows from a seed."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from pathlib import Path
+
+from demandops.service import Generator
+
+from tests.kit import rig
+from tests.kit.turns import Turns
+
+
+def history(seed: int, template: Path, folder: Path) -> list[str]:
+    """Return the commits of random demands, sent while the generator works and while it rests."""
+    bare = Path(shutil.copytree(template, folder / "state.git"))
+    turns = Turns(seed)
+    threads = threading.active_count()
+    generator = Generator(str(bare), data=folder / "data", runtime=turns)
+    tickets = []
+    for _ in range(12):
+        number = turns.chance.randrange(3)
+        tickets.append(generator.submit(turns.chance.choice([rig.goal(number), rig.leave(number)])))
+        turns.sleep(turns.chance.choice([0, 0.001, 40]))
+    stopped = generator.stop()
+    turns.wait(stopped.done)
+    assert stopped.result() and all(ticket.future.done() for ticket in tickets)
+    assert threading.active_count() == threads
+    rig.assert_sound(bare)
+    return [commit.id for commit in rig.commits(bare)]
+
+
+def test_a_seed_decides_what_is_committed(bare_template: Path, tmp_path: Path) -> None:
+    once, again, other = (
+        history(seed, bare_template, tmp_path / name)
+        for seed, name in ((1, "once"), (1, "again"), (2, "other"))
+    )
+    assert once == again != other
+    assert len(once) > 3

@@ -1,0 +1,47 @@
+"""The clock that tests move instead of waiting."""
+
+from __future__ import annotations
+
+import threading
+from datetime import datetime, timedelta
+
+from demandops.runtime import Runtime
+
+_LONGEST_WAIT_S = 0.05
+
+
+class Clock(Runtime):
+    """A runtime whose clocks a test moves; from a given start they stand still in between.
+
+    If they stand still, nothing is left to chance either.
+    """
+
+    def __init__(self, start: datetime | None = None) -> None:
+        self._start = start
+        self._passed = self._set = 0.0
+
+    def now(self) -> datetime:
+        return (self._start or super().now()) + timedelta(seconds=self._passed + self._set)
+
+    def monotonic(self) -> float:
+        return self._passed if self._start else self._passed + super().monotonic()
+
+    def uniform(self, low: float, high: float) -> float:
+        return high if self._start else super().uniform(low, high)
+
+    def condition(self) -> threading.Condition:
+        """Return a condition whose waits soon end, so that a moved clock is noticed."""
+        return _Impatient()
+
+    def pass_(self, seconds: float) -> None:
+        """Let time pass on both clocks."""
+        self._passed += seconds
+
+    def set_by(self, seconds: float) -> None:
+        """Set the wall clock alone, as a person does."""
+        self._set += seconds
+
+
+class _Impatient(threading.Condition):
+    def wait(self, timeout: float | None = None) -> bool:
+        return super().wait(_LONGEST_WAIT_S if timeout is None else min(timeout, _LONGEST_WAIT_S))

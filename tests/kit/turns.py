@@ -1,0 +1,114 @@
+"""A runtime that runs all threads in one, in an order and at times that follow from a seed."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from math import inf
+from typing import Any
+
+from greenlet import getcurrent, greenlet
+
+from tests.kit.clock import Clock
+from tests.kit.memory import NOW
+
+
+class Turns(Clock):
+    """Threads take turns when they wait; waiting takes no time, the clock goes forward instead."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(NOW)
+        self.chance = random.Random(seed)
+        self._main = self._turn = getcurrent()
+        self._waiting: dict[greenlet, tuple[Callable[[], bool], float]] = {}
+
+    def uniform(self, low: float, high: float) -> float:
+        return self.chance.uniform(low, high)
+
+    def fresh_id(self) -> str:
+        return f"{self.chance.getrandbits(128):032x}"
+
+    def sleep(self, seconds: float) -> None:
+        self.wait(lambda: False, seconds)
+
+    def event(self) -> Any:
+        return _Event(self)
+
+    def condition(self) -> Any:
+        return _Condition(self)
+
+    def start_thread(self, name: str, target: Callable[[], object]) -> Any:
+        thread = _Thread(target, self._main)
+        thread.turns = self
+        self._waiting[thread] = (lambda: True, inf)
+        return thread
+
+    def wait(self, is_over: Callable[[], bool], timeout: float | None = None) -> None:
+        """Let others run until something is so, or some seconds have passed."""
+        me = getcurrent()
+        self._waiting[me] = (is_over, inf if timeout is None else self.monotonic() + timeout)
+        self._turn = self._next()
+        while self._turn is not me:
+            self._turn.switch()
+            if self._turn.dead:  # the end of a thread leads to the main one
+                self._turn = self._next()
+
+    def _next(self) -> greenlet:
+        """Return whose turn it is: by chance one that need not wait, else the first in time."""
+        free = [one for one, (is_over, _) in self._waiting.items() if is_over()]
+        if not free:
+            end = min(end for _, end in self._waiting.values())
+            assert end < inf, "all threads wait for each other"
+            self._passed = max(self._passed, end)
+            free = [one for one, (_, until) in self._waiting.items() if until <= self._passed]
+        chosen = self.chance.choice(free)
+        del self._waiting[chosen]
+        return chosen
+
+
+class _Thread(greenlet):
+    turns: Turns
+
+    def is_alive(self) -> bool:
+        return not self.dead
+
+    def join(self, timeout: float | None = None) -> None:
+        self.turns.wait(lambda: self.dead, timeout)
+
+
+class _Event:
+    def __init__(self, turns: Turns) -> None:
+        self._turns, self._is_set = turns, False
+
+    def is_set(self) -> bool:
+        return self._is_set
+
+    def set(self) -> None:
+        self._is_set = True
+
+    def clear(self) -> None:
+        self._is_set = False
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self._turns.wait(self.is_set, timeout)
+        return self._is_set
+
+
+class _Condition:
+    """Needs no lock, because a turn ends only with a wait."""
+
+    def __init__(self, turns: Turns) -> None:
+        self._turns, self._changes = turns, 0
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *reason: object) -> None:
+        pass
+
+    def notify(self) -> None:
+        self._changes += 1
+
+    def wait(self, timeout: float | None = None) -> None:
+        seen = self._changes
+        self._turns.wait(lambda: self._changes != seen, timeout)
