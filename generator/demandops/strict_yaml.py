@@ -113,41 +113,45 @@ def _mark(error: yaml.YAMLError) -> str:
     return f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
 
 
-def load_all(text: str) -> Iterator[Any]:
+def load_all(text: str, file: str = "") -> Iterator[Any]:
     """Yield the documents of ``text``.
 
     Raises:
-        InvalidInput: if it is not strict YAML.
+        InvalidInput: if it is not strict YAML; the fault names ``file``.
     """
     try:
         depth = 0
         for event in yaml.parse(text, Loader=_Loader):
             depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
             if depth > _MAX_DEPTH:  # before the C parser builds it and overruns its stack
-                raise InvalidInput([fault("", f"is nested deeper than {_MAX_DEPTH} levels")])
+                message = f"is nested deeper than {_MAX_DEPTH} levels"
+                raise InvalidInput([fault("", message).within(file)])
             if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
                 where = f"line {event.start_mark.line + 1}" if event.start_mark else ""
-                raise InvalidInput(
-                    [
-                        fault(
-                            where,
-                            "anchors and aliases (& and *) are not allowed; write the value out",
-                        )
-                    ]
-                )
+                message = "anchors and aliases (& and *) are not allowed; write the value out"
+                raise InvalidInput([fault(where, message).within(file)])
         yield from yaml.load_all(text, Loader=_StrictLoader)
     except yaml.YAMLError as error:
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise InvalidInput([fault(_mark(error), f"not valid YAML: {problem}")]) from error
+        raise InvalidInput([_fault_of(error).within(file)]) from error
     except _MISFITS as error:
-        raise InvalidInput([fault("", _MISFIT)]) from error
+        raise InvalidInput([fault("", _MISFIT).within(file)]) from error
 
 
-def load(text: str) -> Any:  # noqa: ANN401 - the caller parses raw YAML into models
-    """Return the only document of ``text``, or ``None`` if it is empty."""
-    documents = list(load_all(text))
+def _fault_of(error: yaml.YAMLError) -> Fault:
+    problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+    return fault(_mark(error), f"not valid YAML: {problem}")
+
+
+def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which models then parse
+    """Return the only document of ``text``, or ``None`` if it is empty.
+
+    Raises:
+        InvalidInput: if it is not strict YAML; the fault names ``file``.
+    """
+    documents = list(load_all(text, file))
     if len(documents) > 1:
-        raise InvalidInput([fault("", f"holds {len(documents)} documents; only one is allowed")])
+        message = f"holds {len(documents)} documents; only one is allowed"
+        raise InvalidInput([fault("", message).within(file)])
     return documents[0] if documents else None
 
 
@@ -162,8 +166,7 @@ def load_rendered(text: str) -> Any:  # noqa: ANN401
     try:
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
     except yaml.YAMLError as error:
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise InvalidInput([fault(_mark(error), f"not valid YAML: {problem}")]) from error
+        raise InvalidInput([_fault_of(error)]) from error
     except _MISFITS as error:
         raise InvalidInput([fault("", _MISFIT)]) from error
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import signal
-import sys
-from pathlib import Path
 from typing import Any
 
 import click
 from demandops import strict_yaml
-from demandops.cli.output import console, errors, output_option, print_json
+from demandops.cli.json_output import output_option, print_json
+from demandops.cli.output import console, errors
 from demandops.errors import InvalidInput, fault
+from demandops.input_file import read_input
 from demandops.runtime import REAL
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 
@@ -66,14 +66,8 @@ def demand(
 
 
 def _read_document(file: str) -> dict[str, Any]:
-    name = "standard input" if file == "-" else file
-    try:
-        text = sys.stdin.read() if file == "-" else Path(file).read_text()
-        data = strict_yaml.load(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput([fault("", f"cannot be read: {error}").within(name)]) from None
-    except InvalidInput as error:
-        raise InvalidInput(strict_yaml.faults_in(error, name)) from None
+    name, text = read_input(file)
+    data = strict_yaml.load(text, name)
     if not isinstance(data, dict) or data.get("kind") != "Demand":
         message = "must be a mapping with kind: Demand"
         raise InvalidInput([fault("kind", message).within(name)])
@@ -93,6 +87,7 @@ def _print_answer(answer: Answer, output: str) -> None:
                 "commit": answer.commit,
                 "reached": answer.reached,
                 "lease": answer.lease_s or None,
+                "faults": [],
                 "warnings": list(answer.warnings),
             }
         )

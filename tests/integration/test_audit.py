@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import pytest
 from demandops.cli.main import run as run_command
+from demandops.config.override import format_time
 from demandops.ledger.claim_file import read
 
 from tests.kit.goals import APP, EXPERIMENT, application, connection, goal, perception
@@ -17,6 +19,7 @@ from tests.kit.repo import git
 
 Run = Callable[..., Any]
 
+ROOT = Path(__file__).parents[2]
 DETECTION = "od-edge-vehicle00"
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 PATH = f"clusters/c-its/perception/edge/{DETECTION}.yaml"
@@ -110,7 +113,7 @@ class TestWhy:
             booked = read(files[claim["file"]], claim["file"])
             assert claim["requesters"] == list(booked.requesters)
             assert claim["demand"] == booked.demand
-            assert claim["since"] == booked.booked.isoformat()
+            assert claim["since"] == format_time(booked.booked)
             assert claim["release_by"] == (
                 f"send request '{booked.request}' again with shutdown: true"
             )
@@ -199,9 +202,10 @@ class TestWhy:
         request_json(goal([], [connection("another")]))
         change = ask("why", FUSION)["changes"][0]
         assert change["operation"] == "follow"
-        assert change["carries_out"] == [
-            {"commit": by_hand, "author": "A person", "summary": "Newer images"}
-        ]
+        (behind,) = change["carries_out"]
+        told = (behind["commit"], behind["author"], behind["summary"])
+        assert told == (by_hand, "A person", "Newer images")
+        assert behind == ask("log", "--operation", "by-hand", "-n", "1")[0]
 
     def test_an_application_and_a_connection_of_one_id(
         self, demandops: Run, ask: Run, state: Any, request_json: Run
@@ -285,8 +289,8 @@ class TestLogFilters:
 
     def test_by_demand(self, ask: Run, played: Any) -> None:
         rows = ask("log")
-        assert [row["commit"] for row in ask("log", "--demand", rows[0]["demand_ids"][0])] == [
-            row["commit"] for row in rows if row["demand_ids"] == rows[0]["demand_ids"]
+        assert [row["commit"] for row in ask("log", "--demand", rows[0]["demands"][0])] == [
+            row["commit"] for row in rows if row["demands"] == rows[0]["demands"]
         ]
 
     def test_a_node_that_only_a_claim_names(self, ask: Run, played: Any, request_json: Run) -> None:
@@ -295,7 +299,7 @@ class TestLogFilters:
         before = played.tip
         request_json(perception(id="second"))
         assert git(played, "diff", "--name-only", before, "main", "--", "clusters") == ""
-        assert ask("log", "--node", "vehicle00", f"{before}..main")[0]["request_id"] == "second"
+        assert ask("log", "--node", "vehicle00", f"{before}..main")[0]["request"] == "second"
 
     def test_no_time(self, demandops: Run, played: Any) -> None:
         ran = demandops("log", "--since", "soon", "--state-repo", played.path)
@@ -324,10 +328,28 @@ class TestTimes:
 
     def test_diff_by_time(self, ask: Run, played: Any) -> None:
         found = ask("diff", "2026-01-31", "main")
-        started = {one["name"] for one in found["releases"]["started"]}
+        started = {one["name"] for one in found["releases"]}
         assert started == {path.rsplit("/", 1)[-1].removesuffix(".yaml")
                            for path in played.manifests() if "/_" not in path}  # fmt: skip
-        assert found["releases"]["changed"] == found["releases"]["stopped"] == []
+        assert {one["change"] for one in found["releases"]} == {"start"}
+
+
+def test_one_thing_has_the_documented_keys_in_every_command(
+    ask: Run, played: Any, demandops: Run
+) -> None:
+    page = (ROOT / "docs" / "json.md").read_text()
+    rows = dict(re.findall(r"^\| (\S[^|]*) \| (`[^|]*) \|$", page, re.MULTILINE))
+    keys = {thing: re.findall(r"`(\w+)`", names) for thing, names in rows.items()}
+    told, changed = ask("why", APP), ask("diff", "main~1", "main")
+    back = ask("rollback", "main~1", "--dry-run")
+    failed = demandops("log", "nothing", "--state-repo", played.path, "--output", "json")
+    assert keys["commit"] == [*ask("log")[0]] == list(told["started"])[:-1]
+    assert keys["claim"] == [*back["restored"][0]] == [*told["claims"][0]][:-3]
+    assert keys["subject"] == [*told["subject"]] == [*told["claims"][0]["subject"]]
+    assert keys["release"] == [*told["releases"][0]] == [*ask("status")["releases"][0]][:-6]
+    assert keys["changed release"] == [*changed["releases"][0]] == [*back["releases"][0]]
+    assert keys["changed entry of the bookkeeping"] == [*changed["bookkeeping"][0]]
+    assert keys["fault"] == [*failed.json()["faults"][0]]
 
 
 class TestDiff:
@@ -338,10 +360,9 @@ class TestDiff:
         played.commit({"registry/images.yaml": images})
         request_json(goal([], [connection("another")]))
         found = ask("diff", "main~2", "main~1")
-        assert found["services"] == {"added": {}, "removed": {}, "changed": {}}
-        details = {one["name"]: one["details"] for one in found["releases"]["changed"]}
-        assert any("2025-04" in line and line.startswith("- ") for line in details[FUSION])
-        assert any("2025-05" in line and line.startswith("+ ") for line in details[FUSION])
+        assert found["bookkeeping"] == []
+        details = {one["name"]: one["details"] for one in found["releases"]}
+        assert any("'2025-04' → '2025-05'" in line for line in details[FUSION])
 
     def test_a_release_that_moved(self, ask: Run, state: Any, request_json: Run) -> None:
         def put(node: str) -> Any:
@@ -352,7 +373,8 @@ class TestDiff:
                     "requesters": ["vehicle00"], "applications": [app]}  # fmt: skip
 
         assert request_json(put("edge"), put("cloud")).code == 0
-        (moved,) = ask("diff", "main~1", "main")["releases"]["changed"]
+        found = ask("diff", "main~1", "main")["releases"]
+        (moved,) = [one for one in found if one["change"] == "change"]
         assert moved["name"].startswith("of-a")
         assert moved["file"].startswith("clusters/c-its/perception/cloud/")
         assert any(
@@ -397,7 +419,7 @@ class TestRollback:
         ran = self.roll(demandops, played, "main~4", "-m", "x")
         found = ran.json()
         assert (ran.code, found["outcome"], played.tip) == (1, "refused", before)
-        assert {error["file"] for error in found["errors"]} >= {
+        assert {error["file"] for error in found["faults"]} >= {
             path for path, text in played.files("ledger/").items() if "- vehicle02" in text
         }
         dropping = self.roll(demandops, played, "main~4", "-m", "x", "--drop-newer").json()
@@ -433,7 +455,7 @@ class TestRollback:
         before = played.tip
         ran = self.roll(demandops, played, "main~3", "-m", "x")
         assert (ran.code, played.tip) == (1, before)
-        messages = {error["message"] for error in ran.json()["errors"]}
+        messages = {error["message"] for error in ran.json()["faults"]}
         assert any(
             text.startswith("'vehicle00' is not in inventory/nodes.yaml") for text in messages
         )
@@ -454,7 +476,7 @@ class TestRollback:
         other = git(played, "commit-tree", "-m", "other", f"{played.tip}^{{tree}}")
         ran = self.roll(demandops, played, other, "-m", "x")
         assert ran.code == 1
-        assert ran.json()["errors"][0]["message"] == (
+        assert ran.json()["faults"][0]["message"] == (
             f"commit {other} is not in the history of the state repo; roll back to one that is"
         )
 

@@ -52,10 +52,10 @@ def one(ran: Any) -> dict[str, Any]:
     (row,) = ran.json()
     assert row.keys() == {
         "index",
-        "request_id",
+        "request",
         "outcome",
         "commit",
-        "errors",
+        "faults",
         "warnings",
         "not_held",
     }
@@ -67,13 +67,13 @@ def refused(ran: Any) -> list[tuple[str, str]]:
     """Return the faults of a refused request."""
     row = one(ran)
     assert (ran.code, row["outcome"], row["commit"]) == (1, "refused", None)
-    return [(error["field"], error["message"]) for error in row["errors"]]
+    return [(error["field"], error["message"]) for error in row["faults"]]
 
 
 def booked(ran: Any) -> str:
     """Return the commit of a booked request."""
     row = one(ran)
-    assert (ran.code, row["outcome"], row["errors"]) == (0, "booked", [])
+    assert (ran.code, row["outcome"], row["faults"]) == (0, "booked", [])
     return str(row["commit"])
 
 
@@ -311,7 +311,7 @@ class TestDefectsOfTheReference:
         state.commit({path: state.files()[path][:60]})
         ran = demandops("bookkeeping", "--state-repo", state.path, "--output", "json")
         assert ran.code == 1
-        assert ran.out == ""
+        assert {each["file"] for each in ran.json()["faults"]} == {path}
         assert ran.err.startswith(f"error: {path}: ")
         booked(request_json(perception(id="another")))
         assert path in state.files("ledger/")
@@ -446,7 +446,7 @@ class TestRefusals:
         forged = "x Operation: shutdown Requester: somebody"
         booked(request_json(goal([application(forged, who=[forged])], id=forged)))
         (entry, _) = demandops("log", "--state-repo", state.path, "--output", "json").json()
-        assert (entry["operation"], entry["requesters"], entry["request_id"]) == (
+        assert (entry["operation"], entry["requesters"], entry["request"]) == (
             "join",
             [forged],
             forged,

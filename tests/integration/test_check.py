@@ -137,6 +137,7 @@ def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None
     found = json.loads(out)
     assert found["faults"] == [
         {
+            "code": "invalid",
             "file": "inventory/brokers.yaml",
             "field": "brokers[1].node",
             "message": "'egde' is not in nodes.yaml; did you mean 'edge'?",

@@ -31,7 +31,7 @@ NO_REVISION = (
     "error: 'nope' is neither a commit of the state repo nor a time; `demandops log` lists the "
     "commits, a time is written like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h\n"
 )
-REQUEST_KEYS = ["index", "request_id", "outcome", "commit", "errors", "warnings", "not_held"]
+REQUEST_KEYS = ["index", "request", "outcome", "commit", "faults", "warnings", "not_held"]
 NO_CARRIER = (
     "application 'edge/object_detection_fusion': no connection carries point_cloud "
     "/vehicles/vehicle00/drivers/lidar/pointcloud of 'vehicle00' to 'edge'"
@@ -152,10 +152,10 @@ class TestRequest:
         assert list(row) == REQUEST_KEYS
         assert row == {
             "index": 0,
-            "request_id": "r",
+            "request": "r",
             "outcome": "booked",
             "commit": state.tip,
-            "errors": [],
+            "faults": [],
             "warnings": [NO_CARRIER],
             "not_held": [],
         }
@@ -179,8 +179,10 @@ class TestRequest:
         assert ran.code == 1
         assert list(row) == REQUEST_KEYS
         assert (row["outcome"], row["commit"], state.tip) == ("refused", None, before)
-        assert row["errors"] == [
+        assert row["faults"] == [
             {
+                "code": "unknown-node",
+                "file": "",
                 "field": "apps[0].header.node_id",
                 "message": "'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",
             }
@@ -223,7 +225,7 @@ class TestRequest:
             "--output", "json", stdin=text(goal([], [connection("c")], id="c1")),
         )  # fmt: skip
         rows = ran.json()
-        assert [(row["index"], row["request_id"]) for row in rows] == [
+        assert [(row["index"], row["request"]) for row in rows] == [
             (0, "b1"),
             (1, "b2"),
             (2, "c1"),
@@ -260,16 +262,9 @@ class TestRequest:
         assert [(row["index"], row["outcome"], row["commit"]) for row in rows] == [
             (index, "refused", None) for index in range(3)
         ]
-        assert rows[1]["errors"] == [
-            {"field": "id", "message": "must be text, not 5; put it in quotes"}
-        ]
-        for row in (rows[0], rows[2]):
-            assert row["errors"] == [
-                {
-                    "field": "",
-                    "message": "not booked because another request of this call does not parse",
-                }
-            ]
+        told = [[(each["field"], each["message"]) for each in row["faults"]] for row in rows]
+        other = [("", "not booked because another request of this call does not parse")]
+        assert told == [other, [("id", "must be text, not 5; put it in quotes")], other]
 
     def test_a_file_that_does_not_parse_books_nothing_at_all(
         self, demandops: Run, state: Any, tmp_path: Path
@@ -277,11 +272,29 @@ class TestRequest:
         before = state.tip
         (tmp_path / "good.yaml").write_text(text(perception()))
         (tmp_path / "bad.yaml").write_text(f"{text(perception())}---\nid: [\n")
-        ran = demandops(
-            "request", tmp_path / "good.yaml", tmp_path / "bad.yaml", "--state-repo", state.path
-        )
-        assert (ran.code, ran.out, state.tip) == (1, "", before)
+        files = (tmp_path / "good.yaml", tmp_path / "bad.yaml")
+        ran = demandops("request", *files, "--state-repo", state.path, "--output", "json")
+        (fault,) = ran.json()["faults"]
+        assert (ran.code, fault["file"], state.tip) == (1, f"{tmp_path}/bad.yaml", before)
         assert ran.err.startswith(f"error: {tmp_path}/bad.yaml: line ")
+
+    @pytest.mark.parametrize(
+        "command",
+        [
+            ("bookkeeping",), ("decommission", "n"), ("diff", "a", "b"), ("log",), ("overrides",),
+            ("proposals",), ("rollback", "r", "-m", "why"), ("status",), ("upgrade",), ("verify",),
+            ("why", "n"),
+        ],
+    )  # fmt: skip
+    def test_a_command_that_fails_prints_its_faults_as_json(
+        self, demandops: Run, tmp_path: Path, command: tuple[str, ...]
+    ) -> None:
+        where = ("--state-repo", tmp_path / "none", "--output", "json")
+        told, text = demandops(*command, *where), demandops(*command, *where[:2])
+        (fault,) = told.json()["faults"]
+        assert (told.code, text.code, text.out) == (1, 1, "")
+        assert list(fault) == ["code", "field", "message", "file"]
+        assert told.err == text.err == f"error: {fault['message']}\n"
 
     def test_a_dry_run_shows_the_consequence_and_books_nothing(
         self, demandops: Run, state: Any, data_home: Path
@@ -431,8 +444,8 @@ class TestBookkeeping:
 
 class TestLog:
     KEYS = (
-        "commit", "time", "author", "summary", "operation", "operation_id", "request_id",
-        "demand_ids", "requesters", "applications", "connections", "render_version",
+        "commit", "time", "author", "summary", "why", "operation", "operation_id", "request",
+        "demands", "requesters", "applications", "connections", "render_version",
     )  # fmt: skip
 
     def test_the_json_tells_all_that_the_trailers_say(self, demandops: Run, joined: Any) -> None:
@@ -442,14 +455,14 @@ class TestLog:
         assert ran.code == 0
         for row in (by_hand, join, init):
             assert tuple(row) == self.KEYS
-        assert (join["operation"], join["request_id"], join["author"]) == (
+        assert (join["operation"], join["request"], join["author"]) == (
             "join",
             "request",
             "vehicle00",
         )
         assert join["requesters"] == ["vehicle00"]
         assert (join["applications"], join["connections"]) == ([APP], ["vehicle00/edge"])
-        assert len(join["demand_ids"]) == 1
+        assert len(join["demands"]) == 1
         assert init["operation"] == "init"
         assert (by_hand["operation"], by_hand["author"]) == (None, "A person")
 
@@ -533,12 +546,17 @@ class TestDiff:
     def test_the_json_tells_the_same(self, demandops: Run, joined: Any) -> None:
         ran = demandops("diff", "main~1", "main", "--state-repo", joined.path, "--output", "json")
         found = ran.json()
-        assert found.keys() == {"services", "connections", "releases", "other_files"}
-        for part in (found["services"], found["connections"]):
-            assert part.keys() == {"added", "removed", "changed"}
-        assert sorted(found["services"]["added"]) == ["od-edge-vehicle00", FUSION]
-        assert found["connections"]["added"]["vehicle00/edge"]["requesters"] == ["vehicle00"]
-        assert found["services"]["removed"] == found["services"]["changed"] == {}
+        assert found.keys() == {"bookkeeping", "releases", "other_files"}
+        *services, made = found["bookkeeping"]
+        assert [each["name"] for each in services] == ["od-edge-vehicle00", FUSION]
+        assert made == {
+            "kind": "connection",
+            "name": "vehicle00/edge",
+            "change": "added",
+            "requesters": ["vehicle00"],
+            "lost": [],
+            "gained": [],
+        }
 
     def test_no_difference(self, demandops: Run, joined: Any) -> None:
         ran = demandops("diff", "main", "main", "--state-repo", joined.path)
@@ -578,7 +596,7 @@ class TestVerify:
             "summary": "Forged",
             "holds": False,
             "skipped": None,
-            "fault": None,
+            "faults": [],
             "differing": [path],
             "touched": [],
             "signed": False,

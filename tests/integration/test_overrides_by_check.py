@@ -72,13 +72,13 @@ def test_the_override_suggested_gives_the_file_that_was_edited_by_hand(
         assert old in text
         text = text.replace(old, new)
     (clone / path).write_text(text)
-    (suggested,) = demandops("check", clone, "--output", "json").json()["overrides"]
+    (suggested,) = demandops("check", clone, "--output", "json").json()["suggestions"]
     git(clone, "checkout", "--quiet", ".")
     (clone / suggested["file"]).parent.mkdir(exist_ok=True)
     (clone / suggested["file"]).write_text(suggested["text"])
 
     found = demandops("check", clone, "--output", "json").json()
-    assert (found["faults"], found["outdated"]) == ([], [path])
+    assert (found["faults"], [one["file"] for one in found["files"]]) == ([], [path])
     git(clone, "add", "--all")
     git(clone, "commit", "--quiet", "-m", "Override instead")
     git(clone, "push", "--quiet", "origin", "main")
@@ -90,7 +90,7 @@ def test_the_deletion_suggested_stops_what_was_deleted_by_hand(
     demandops: Run, state: Any, book: Callable[..., Any], clone: Path
 ) -> None:
     (clone / CLIENT).unlink()
-    (suggested,) = demandops("check", clone, "--output", "json").json()["overrides"]
+    (suggested,) = demandops("check", clone, "--output", "json").json()["suggestions"]
     git(clone, "checkout", "--quiet", ".")
     state.commit({suggested["file"]: suggested["text"]})
     goal = yaml.safe_dump(perception(id="second"))

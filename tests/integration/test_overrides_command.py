@@ -61,7 +61,17 @@ def test_overrides_are_listed_with_what_each_does(demandops: Run, overridden: Gi
             "values": {"replicas": 2, "nodeSelector": None},
             "images": {"object-detection": {"tag": "x"}},
         },
-        "releases": ["od-edge-vehicle00"],
+        "releases": [
+            {
+                "name": "od-edge-vehicle00",
+                "what": "object-detection on edge for vehicle00",
+                "cluster": "c-its",
+                "domain": "perception",
+                "namespace": "perception",
+                "node": "edge",
+                "file": "clusters/c-its/perception/edge/od-edge-vehicle00.yaml",
+            }
+        ],
         "claims": [],
         "priority": 3,
         "owner": "petra",
@@ -77,11 +87,11 @@ def test_overrides_are_listed_with_what_each_does(demandops: Run, overridden: Gi
         "over": "expired",
     }
     (suspended,) = rows["closed"]["claims"]
-    assert suspended.startswith("connection 'vehicle00/edge' of ")
+    assert suspended["subject"] == {"kind": "connection", "id": "vehicle00/edge"}
     (kept,) = rows["lasting"]["claims"]
-    assert kept.startswith("application 'edge/object_detection_fusion' of ")
+    assert kept["subject"] == {"kind": "application", "id": "edge/object_detection_fusion"}
     (off,) = rows["off"]["releases"]
-    assert off.startswith("of-edge-")
+    assert off["name"].startswith("of-edge-")
     table = demandops("overrides", "--state-repo", overridden.path)
     for word in ("od-edge-vehicle00", "matches nothing", "2020-01-01T00:00:00Z", "petra"):
         assert word in table.out
@@ -162,8 +172,12 @@ def test_why_tells_what_overrides_do(demandops: Run, overridden: GitRepo) -> Non
     shaped = asked("od-edge-vehicle00")
     (by,) = shaped["overrides"]
     assert by == {
+        "name": "many",
         "file": "overrides/many.yaml",
-        "effects": ["values", "images"],
+        "effects": {
+            "values": {"replicas": 2, "nodeSelector": None},
+            "images": {"object-detection": {"tag": "x"}},
+        },
         "priority": 3,
         "owner": "petra",
         "reason": "why",
@@ -172,12 +186,12 @@ def test_why_tells_what_overrides_do(demandops: Run, overridden: GitRepo) -> Non
     line = "  overrides/many.yaml: values, images (priority 3), of petra: why"
     assert line in why("od-edge-vehicle00").out.splitlines()
     (fusion,) = [
-        name
+        release["name"]
         for entry in demandops(
             "overrides", "--state-repo", overridden.path, "--output", "json"
         ).json()
         if entry["name"] == "off"
-        for name in entry["releases"]
+        for release in entry["releases"]
     ]
     denied = asked(fusion)
     assert (denied["runs"], denied["denied_by"]["file"]) == (False, "overrides/off.yaml")

@@ -66,10 +66,10 @@ def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:
     branch = git(strict, "for-each-ref", "--format=%(refname:short)", "refs/heads/demand")
     assert row == {
         "index": 0,
-        "request_id": "request",
+        "request": "request",
         "outcome": "proposed",
         "commit": None,
-        "errors": [],
+        "faults": [],
         "warnings": [],
         "not_held": [],
         "proposal": {"branch": branch, "link": ""},

@@ -145,13 +145,13 @@ def test_other_edits_become_the_effect_that_is_made_for_them(
     left: list[str],
 ) -> None:
     edit(branch / path, *replaced)
-    (suggested,) = found()["overrides"]
+    (suggested,) = found()["suggestions"]
     override = yaml.safe_load(suggested["text"])
     head = ("apiVersion", "kind", "reason", "owner", "select")
     assert {key: override[key] for key in override if key not in head} == effects
-    assert (suggested["instead_of"], suggested["left"]) == (path, left)
+    assert (suggested["instead_of"], suggested["not_covered"]) == (path, left)
     also = ["od-edge-vehicle00"] if path == DETECTION else []
-    assert suggested["also"] == also
+    assert suggested["other_releases"] == also
 
 
 def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, check: Run) -> None:
@@ -168,7 +168,7 @@ def test_a_suggested_override_is_one_that_can_be_merged(
     edit(branch / FUSION, ("replicas: 1", "replicas: 3"), ("domainId: 0", "domainId: 7"))
     edit(branch / CLIENT, ("mqtt_client:kilted", "mqtt_client:jazzy"))
     (branch / DETECTION).unlink()
-    suggested = found()["overrides"]
+    suggested = found()["suggestions"]
     assert len(suggested) == 3
     for one in suggested:
         override.OverrideFile.model_validate(yaml.safe_load(one["text"]))
@@ -210,7 +210,7 @@ def test_an_override_that_is_there_is_not_overwritten_by_the_one_suggested(
         "select: [{nodes: [cloud]}]\nhold: true\n"
     )
     (branch / DETECTION).unlink()
-    assert found()["overrides"][0]["file"] == "overrides/od-edge-station00-2.yaml"
+    assert found()["suggestions"][0]["file"] == "overrides/od-edge-station00-2.yaml"
 
 
 # ---- claims and configuration, and what follows ----
@@ -275,7 +275,7 @@ def test_all_faults_of_claims_configuration_and_hand_edits_are_told_together(
     assert {one["file"].split("/")[0] for one in data["faults"]} == {
         "ledger", "inventory", "policy", "clusters",
     }  # fmt: skip
-    assert len(data["overrides"]) == 1
+    assert len(data["suggestions"]) == 1
 
 
 def test_a_node_in_use_that_is_taken_away_is_told_with_how_to_give_it_up(
@@ -326,6 +326,7 @@ def test_a_symbolic_link_is_not_followed(
     brokers.symlink_to(secret)
     data = found()
     assert {
+        "code": "invalid",
         "file": "inventory/brokers.yaml",
         "field": "",
         "message": "is a symbolic link, which is not followed; replace it by a file",

@@ -71,11 +71,11 @@ def assert_told_as_expected(
     """Check the rows of one call: each request's outcome, and the commit that came of it."""
     assert [row["outcome"] for row in rows] == [result.outcome for result in expected]
     assert [row["index"] for row in rows] == list(range(len(goals)))
-    assert [row["request_id"] for row in rows] == [goal["id"] for goal in goals]
+    assert [row["request"] for row in rows] == [goal["id"] for goal in goals]
     done = [row["commit"] for row in rows if row["outcome"] in ("booked", "released")]
     assert done == new, "one commit for each demand that changes something, in order"
     for row in rows:
-        assert bool(row["errors"]) == (row["outcome"] == "refused")
+        assert bool(row["faults"]) == (row["outcome"] == "refused")
         assert (row["commit"] is None) == (row["outcome"] == "refused")
 
 

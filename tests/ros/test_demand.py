@@ -206,7 +206,8 @@ def test_the_command_line_sends_holds_and_gives_up(
     assert sent.json()["outcome"] == "booked"
     assert demandops("demand", file).out.startswith("unchanged in ")
     assert demandops("demand", file, "--release").out.startswith("released in ")
-    gone = demandops("demand", file, "--release")
+    gone = demandops("demand", file, "--release", "--output", "json")
+    assert [each["code"] for each in gone.json()["faults"]] == ["not-held"]
     assert gone.code == 1 and "not-held: demand: 'typed' holds nothing" in gone.err
     holding = subprocess.Popen(
         [sys.executable, "-m", "demandops.cli.main", "demand", str(file), "--hold"],

@@ -17,80 +17,26 @@ from demandops.cli.output import errors
 from demandops.errors import DemandOpsError, InvalidInput
 
 COMMANDS = {
-    "bookkeeping": (
-        "demandops.cli.views.bookkeeping:bookkeeping",
-        "Show who requests which service and connection.",
-    ),
-    "check": (
-        "demandops.cli.repo.check:check",
-        "Check edits of a state repo and show their consequences.",
-    ),
-    "decommission": (
-        "demandops.cli.actions.decommission:decommission",
-        "Release all claims of a node or a requester.",
-    ),
-    "demand": (
-        "demandops_ros.demand_command:demand",
-        "Send a demand to a running node.",
-    ),
-    "diff": (
-        "demandops.cli.views.diff:diff",
-        "Show the differences between two commits.",
-    ),
-    "init": (
-        "demandops.cli.repo.init:init",
-        "Create a state repo.",
-    ),
-    "journal": (
-        "demandops.cli.repo.journal:journal",
-        "List the accepted demands that are not published.",
-    ),
-    "log": (
-        "demandops.cli.views.log:log",
-        "List the commits of the state repo, newest first.",
-    ),
-    "overrides": (
-        "demandops.cli.views.overrides:overrides",
-        "List the overrides and what each one does.",
-    ),
-    "proposals": (
-        "demandops.cli.views.proposals:proposals",
-        "List the demands that await approval.",
-    ),
-    "request": (
-        "demandops.cli.actions.request:request",
-        "Book demand requests from files.",
-    ),
-    "rollback": (
-        "demandops.cli.actions.rollback:rollback",
-        "Restore the ledger of an earlier commit, by a new commit.",
-    ),
-    "schema": (
-        "demandops.cli.repo.schema:schema",
-        "Print the JSON Schema of a kind of file.",
-    ),
-    "serve": (
-        "demandops_ros.serve_command:serve",
-        "Run the ROS 2 node that accepts demands.",
-    ),
-    "status": (
-        "demandops.cli.views.status:status",
-        "Show the state of each release on its cluster.",
-    ),
-    "upgrade": (
-        "demandops.cli.repo.upgrade:upgrade",
-        "Render everything again, in one commit.",
-    ),
-    "verify": (
-        "demandops.cli.repo.verify:verify",
-        "Render the ledger of commits again and compare the bytes.",
-    ),
-    "why": (
-        "demandops.cli.views.why:why",
-        "Explain why something runs or ran.",
-    ),
+    "bookkeeping": ("views", "Show who requests which service and connection."),
+    "check": ("repo", "Check edits of a state repo and show their consequences."),
+    "decommission": ("actions", "Release all claims of a node or a requester."),
+    "demand": ("demandops_ros", "Send a demand to a running node."),
+    "diff": ("views", "Show the differences between two commits."),
+    "init": ("repo", "Create a state repo."),
+    "journal": ("repo", "List the accepted demands that are not published."),
+    "log": ("views", "List the commits of the state repo, newest first."),
+    "overrides": ("views", "List the overrides and what each one does."),
+    "proposals": ("views", "List the demands that await approval."),
+    "request": ("actions", "Book demand requests from files."),
+    "rollback": ("actions", "Restore the ledger of an earlier commit, by a new commit."),
+    "schema": ("repo", "Print the JSON Schema of a kind of file."),
+    "serve": ("demandops_ros", "Run the ROS 2 node that accepts demands."),
+    "status": ("views", "Show the state of each release on its cluster."),
+    "upgrade": ("repo", "Render everything again, in one commit."),
+    "verify": ("repo", "Render the ledger of commits again and compare the bytes."),
+    "why": ("views", "Explain why something runs or ran."),
 }
-"""Each command, by name: ``module:function`` and its short help."""
+"""Each command, by name: the room of its module, and its short help."""
 
 
 class ExitCode(IntEnum):
@@ -109,9 +55,11 @@ def load(name: str) -> click.Command:
     Raises:
         click.ClickException: a package that the command needs is not installed.
     """
-    module, _, function = COMMANDS[name][0].partition(":")
+    room = COMMANDS[name][0]
+    ros = room == "demandops_ros"
+    module = f"demandops_ros.{name}_command" if ros else f"demandops.cli.{room}.{name}"
     try:
-        command: click.Command = getattr(import_module(module), function)
+        command: click.Command = getattr(import_module(module), name)
     except ModuleNotFoundError as error:
         if str(error.name).split(".")[0] in ("demandops", "demandops_ros"):
             raise
@@ -168,12 +116,9 @@ def run(args: list[str] | None = None) -> int:
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")
         return ExitCode.USER_ERROR
-    except InvalidInput as error:
-        for each in error.faults:
-            errors.print(f"error: {each}")
-        return ExitCode.USER_ERROR
     except DemandOpsError as error:
-        errors.print(f"error: {error}")
+        for each in error.faults if isinstance(error, InvalidInput) else [error]:
+            errors.print(f"error: {each}")
         return ExitCode.USER_ERROR
     except BrokenPipeError:  # `demandops log | head`
         sys.stderr.close()

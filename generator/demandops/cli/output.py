@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -26,7 +25,7 @@ _PATIENCE_S = 0.5
 Progress = Callable[[int, int], None]
 
 
-def _console(stderr: bool) -> Console:
+def console(stderr: bool = False) -> Console:
     """Return a console; if the stream is not a terminal, it is wide and has no colors."""
     from rich.console import Console  # noqa: PLC0415
 
@@ -35,10 +34,15 @@ def _console(stderr: bool) -> Console:
     return Console(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
-SIGNS = {"start": "+", "change": "~", "stop": "-"}
-"""The mark of a release, by its change."""
-
-REV_HELP = "A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h"
+SIGNS = {
+    "start": "+",
+    "change": "~",
+    "stop": "-",
+    "added": "+",
+    "changed": "~",
+    "removed": "-",
+}
+"""The mark of a release or an entry, by its change."""
 
 
 class _Errors:
@@ -56,20 +60,15 @@ def _visible(char: str) -> str:
 errors = _Errors()
 
 
-def console() -> Console:
-    """Return a console for the current standard output."""
-    return _console(stderr=False)
-
-
 def warn_of(problems: Iterable[object]) -> None:
     """Warn about invalid files whose last valid version is in effect."""
     for problem in problems:
-        errors.print(f"warning: {problem} (its last valid version is in effect)")
+        errors.print(f"warning: {problem}; its last valid version is in effect")
 
 
-def print_json(data: object) -> None:
-    """Print ``data`` as JSON."""
-    click.echo(json.dumps(data, indent=2, ensure_ascii=False))
+def printable(text: str) -> str:
+    """Return text without characters that would control a terminal or a page."""
+    return "".join(char if char.isprintable() or char in "\n\t" else "�" for char in text)
 
 
 state_repo_option = click.option(
@@ -92,13 +91,12 @@ signing_option = click.option(
     "key of a key in an SSH agent; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
 )
 
-output_option = click.option(
-    "--output",
-    "output",
-    type=click.Choice(["text", "json"]),
-    default="text",
-    show_default=True,
-    help="The output format.",
+at_option = click.option(
+    "--at",
+    "at",
+    metavar="REV|TIME",
+    help="A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h; default: "
+    "the newest commit.",
 )
 
 
@@ -116,7 +114,7 @@ def progress(title: str) -> Iterator[Progress]:
                 return
             from rich.progress import Progress as Bar  # noqa: PLC0415
 
-            bar = Bar(console=_console(stderr=True), transient=True)
+            bar = Bar(console=console(stderr=True), transient=True)
             task = bar.add_task(title, total=total)
             bar.start()
         bar.update(task, completed=done, total=total)

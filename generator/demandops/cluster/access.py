@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, parse_file
 from demandops.errors import Fault, InvalidInput, fault
+from demandops.input_file import read_input
 
 
 class NoAccess(ValueError):
@@ -86,16 +87,12 @@ def read(path: Path) -> AccessFile:
     Raises:
         InvalidInput: with all faults.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise InvalidInput([fault("", f"cannot be read: {reason}").within(str(path))]) from None
-    content = parse_file(AccessFile, text, str(path))
+    name, text = read_input(path)
+    content = parse_file(AccessFile, text, name)
     faults = [
-        problem.within(str(path))
-        for name, access in content.clusters.items()
-        for problem in _secret_faults(name, access)
+        problem.within(name)
+        for cluster, access in content.clusters.items()
+        for problem in _secret_faults(cluster, access)
     ]
     if faults:
         raise InvalidInput(faults)

@@ -11,7 +11,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel, Text, Word
+from demandops.config.base_model import (
+    Approval,
+    CamelModel,
+    DnsLabel,
+    FileModel,
+    Items,
+    Positive,
+    Text,
+    Word,
+)
 from demandops.errors import suggestion
 
 TopicPattern = Annotated[
@@ -23,14 +32,14 @@ TopicPattern = Annotated[
 """A topic name; ``{instance}`` is replaced by the service's source or application."""
 
 
-class Input(FrozenModel):
+class Input(CamelModel):
     """A role of demanded topics, for example ``point_cloud``."""
 
     description: Text = ""
     type: Text = ""
 
 
-class Parameter(FrozenModel):
+class Parameter(CamelModel):
     """A value that demands may set, and how the values of several demands are merged."""
 
     description: Text = ""
@@ -38,14 +47,12 @@ class Parameter(FrozenModel):
     merge: Literal["union", "max", "min", "latest"] | None = None
 
 
-class Scaling(FrozenModel):
+class Scaling(CamelModel):
     """The number of replicas: one for ``topics_per_replica`` inputs, from ``min`` to ``max``."""
 
     min: Annotated[int, Field(ge=0, le=1000)] = 1
     max: Annotated[int, Field(ge=1, le=1000)] = 1
-    topics_per_replica: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, alias="topicsPerReplica"
-    )
+    topics_per_replica: Positive | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> Scaling:
@@ -54,7 +61,7 @@ class Scaling(FrozenModel):
         return self
 
 
-class Service(FrozenModel):
+class Service(CamelModel):
     """One deployable part of an application, with one Helm release for each instance.
 
     ``each`` names an input; every topic of it gets its own instance, which applications share.
@@ -70,7 +77,7 @@ class Service(FrozenModel):
     placement: Literal["application", "source"] = "application"
     scaling: Scaling = Scaling()
     chart: DnsLabel
-    images: tuple[DnsLabel, ...] = Field(default=(), strict=False)
+    images: Items[DnsLabel] = ()
     values: Annotated[str, StringConstraints(pattern=r"^values/[A-Za-z0-9_.-]+$")]
 
     @model_validator(mode="after")
@@ -82,7 +89,7 @@ class Service(FrozenModel):
         return self
 
 
-class WireNames(FrozenModel):
+class WireNames(CamelModel):
     """The names of this application in the reference's ``DeploymentRequest``.
 
     ``type`` is the number in ``Application.type``. ``inputs`` maps the topic lists of the
@@ -101,7 +108,7 @@ class ApplicationDefinition(FileModel):
     description: Text = ""
     inputs: dict[Word, Input]
     parameters: dict[Word, Parameter] = Field(default_factory=dict)
-    deployment_request: WireNames | None = Field(default=None, alias="deploymentRequest")
+    deployment_request: WireNames | None = None
     services: dict[DnsLabel, Service] = Field(min_length=1)
     approval: Approval = "none"
 

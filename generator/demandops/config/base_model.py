@@ -7,9 +7,18 @@ faults that name the field as it is written in the file.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+)
+from pydantic.alias_generators import to_camel
 
 from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput, fault, quoted, suggestion
@@ -17,6 +26,13 @@ from demandops.identifiers import control_character
 from demandops.settings import API_VERSION
 
 Model = TypeVar("Model", bound=BaseModel)
+Item = TypeVar("Item")
+
+Items = Annotated[tuple[Item, ...], Field(strict=False)]
+"""A list in a file."""
+
+Positive = Annotated[int, Field(ge=1)]
+"""A whole number above zero."""
 
 DnsLabel = Annotated[
     str, StringConstraints(pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$", max_length=63)
@@ -27,14 +43,34 @@ Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_lengt
 """The name of a role or a channel in a configuration file."""
 
 
-def _visible(value: str) -> str:
+def without(problem_of: Callable[[str], str]) -> AfterValidator:
+    """Return a validator that rejects text with a problem."""
+
+    def check(value: str) -> str:
+        problem = problem_of(value)
+        if problem:
+            raise ValueError(problem)
+        return value
+
+    return AfterValidator(check)
+
+
+def readable_by(parse: Callable[[str], object]) -> AfterValidator:
+    """Return a validator that rejects text that ``parse`` cannot read, and keeps the others."""
+
+    def check(value: str) -> str:
+        parse(value)
+        return value
+
+    return AfterValidator(check)
+
+
+def _hidden(value: str) -> str:
     control = control_character(re.sub(r"[\n\t]", " ", value))
-    if control:
-        raise ValueError(f"{quoted(value)} holds the control character {control}; remove it")
-    return value
+    return control and f"{quoted(value)} holds the control character {control}; remove it"
 
 
-Visible = AfterValidator(_visible)
+Visible = without(_hidden)
 """Rejects the control characters that hide or reorder text; lines and tabs are valid."""
 
 Text = Annotated[str, Visible]
@@ -50,7 +86,13 @@ class FrozenModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-class FileModel(FrozenModel):
+class CamelModel(FrozenModel):
+    """A part of a configuration file: ``hostNetwork`` there is ``host_network`` here."""
+
+    model_config = ConfigDict(alias_generator=to_camel)
+
+
+class FileModel(CamelModel):
     """A configuration file; ``apiVersion`` names its format."""
 
     apiVersion: Literal["demandops/v1"]
@@ -134,16 +176,8 @@ def parse_file(model: type[Model], text: str, file: str) -> Model:
     Raises:
         InvalidInput: with every fault.
     """
-    try:
-        data = strict_yaml.load(text)
-    except InvalidInput as error:
-        raise InvalidInput(strict_yaml.faults_in(error, file)) from None
+    data = strict_yaml.load(text, file)
     if not isinstance(data, dict):
-        raise InvalidInput(
-            [
-                fault("", f"must be a mapping that starts with apiVersion: {API_VERSION}").within(
-                    file
-                )
-            ]
-        )
+        message = f"must be a mapping that starts with apiVersion: {API_VERSION}"
+        raise InvalidInput([fault("", message).within(file)])
     return parse(model, data, file)

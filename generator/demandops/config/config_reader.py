@@ -9,7 +9,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from demandops import strict_yaml
 from demandops.config.base_model import DnsLabel, faults_of, parse, parse_file
-from demandops.errors import Fault, InvalidInput, fault
+from demandops.errors import Fault, InvalidInput, fault, suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
 Raw = TypeVar("Raw", list[Any], dict[str, Any])
@@ -23,7 +23,7 @@ class ConfigReader:
     def __init__(self, files: Mapping[str, str]) -> None:
         self.files = files
         self.faults: list[Fault] = []
-        self._positions: dict[str, dict[str, int]] = {}
+        self._positions: dict[str, dict[str, str]] = {}
         self._incomplete: set[str] = set()
 
     def add_fault(self, file: str, field: str, message: str) -> None:
@@ -47,7 +47,7 @@ class ConfigReader:
     ) -> dict[str, Model]:
         """Return the valid items of a file that lists items, by name; add the others' faults."""
         items: dict[str, Model] = {}
-        positions: dict[str, int] = {}
+        positions: dict[str, str] = {}
         raw = self._collection(file, whole, field, list)
         complete = raw is not None
         for index, entry in enumerate(raw or ()):
@@ -61,7 +61,7 @@ class ConfigReader:
             if parsed is None or not isinstance(name, str):
                 complete = False
                 continue
-            items[name], positions[name] = parsed, index
+            items[name], positions[name] = parsed, f"{field}[{index}]"
         self._positions[file] = positions
         if not complete:
             self._incomplete.add(file)
@@ -85,22 +85,25 @@ class ConfigReader:
                 parsed = None
             if parsed is not None:
                 items[name] = parsed
-        self._positions[file] = {name: index for index, name in enumerate(items)}
+        self._positions[file] = {name: f"{field}.{name}" for name in items}
         if raw is None or len(items) < len(raw):
             self._incomplete.add(file)
         return items
 
-    def index_of(self, file: str, name: str) -> int:
-        """Return the position of an item in its file."""
+    def place_of(self, file: str, name: str) -> str:
+        """Return the field of an item in its file: ``nodes[3]``."""
         return self._positions[file][name]
 
     def is_missing(self, file: str, name: str) -> bool:
         """Return whether a file surely has no such item; False if an invalid item could be it."""
         return file not in self._incomplete and name not in self._positions[file]
 
-    def item_names(self, file: str) -> list[str]:
-        """Return the names of a file's items."""
-        return list(self._positions[file])
+    def check_reference(self, file: str, field: str, name: str, known_in: str) -> None:
+        """Add a fault if the file ``known_in`` surely has no item of the name in ``field``."""
+        if self.is_missing(known_in, name):
+            where = known_in.removeprefix("inventory/")
+            known = suggestion(name, self._positions[known_in])
+            self.add_fault(file, field, f"'{name}' is not in {where}{known}")
 
     def _collection(
         self, file: str, whole: type[BaseModel], field: str, kind: type[Raw]
@@ -111,9 +114,9 @@ class ConfigReader:
             self.read_file(file, whole)
             return None
         try:
-            data = strict_yaml.load(text)
+            data = strict_yaml.load(text, file)
         except InvalidInput as error:
-            self.faults += strict_yaml.faults_in(error, file)
+            self.faults += error.faults
             return None
         raw = data.get(field) if isinstance(data, dict) else None
         if not isinstance(data, dict) or not isinstance(raw, kind):

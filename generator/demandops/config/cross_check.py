@@ -29,13 +29,10 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
     """Add every fault across files or entries to the reader."""
     for check in (
         _check_inventory,
-        _check_topics,
         _check_namespaces,
-        _check_controllers_namespace,
         _check_charts,
         _check_services,
         _check_wire_types,
-        _check_bridged,
         _check_connection_types,
         _check_overrides,
         check_override_conflicts,
@@ -44,55 +41,37 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_inventory(config: Config, reader: ConfigReader) -> None:
-    for node in config.nodes.values():
-        if reader.is_missing(CLUSTERS_FILE, node.cluster):
-            reader.add_fault(
-                NODES_FILE,
-                f"nodes[{reader.index_of(NODES_FILE, node.id)}].cluster",
-                f"'{node.cluster}' is not in clusters.yaml"
-                + suggestion(node.cluster, reader.item_names(CLUSTERS_FILE)),
-            )
-    for broker in config.brokers.values():
-        if reader.is_missing(NODES_FILE, broker.node):
-            reader.add_fault(
-                BROKERS_FILE,
-                f"brokers[{reader.index_of(BROKERS_FILE, broker.node)}].node",
-                f"'{broker.node}' is not in nodes.yaml"
-                + suggestion(broker.node, reader.item_names(NODES_FILE)),
-            )
-
-
-def _check_topics(config: Config, reader: ConfigReader) -> None:
     roles = {role for appdef in config.appdefs.values() for role in appdef.inputs}
-    for node in config.nodes.values() if roles else ():
+    for node in config.nodes.values():
+        place = reader.place_of(NODES_FILE, node.id)
+        reader.check_reference(NODES_FILE, f"{place}.cluster", node.cluster, CLUSTERS_FILE)
+        for peer in node.bridged:
+            reader.check_reference(NODES_FILE, f"{place}.bridged.{peer}", peer, NODES_FILE)
         for role in node.topics:
-            if role not in roles:
-                reader.add_fault(
-                    NODES_FILE,
-                    f"nodes[{reader.index_of(NODES_FILE, node.id)}].topics.{role}",
-                    f"'{role}' is not an input of any application" + suggestion(role, roles),
-                )
+            if roles and role not in roles:
+                message = f"'{role}' is not an input of any application{suggestion(role, roles)}"
+                reader.add_fault(NODES_FILE, f"{place}.topics.{role}", message)
+    for broker in config.brokers.values():
+        place = reader.place_of(BROKERS_FILE, broker.node)
+        reader.check_reference(BROKERS_FILE, f"{place}.node", broker.node, NODES_FILE)
 
 
 def _check_namespaces(config: Config, reader: ConfigReader) -> None:
+    argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
     seen: dict[str, str] = {}
     for domain in config.domains.values():
+        place = f"{reader.place_of(DOMAINS_FILE, domain.name)}.namespace"
         other = seen.setdefault(domain.namespace, domain.name)
         if other != domain.name:
             reader.add_fault(
                 DOMAINS_FILE,
-                f"domains[{reader.index_of(DOMAINS_FILE, domain.name)}].namespace",
+                place,
                 f"'{domain.namespace}' is already the namespace of '{other}'; give each its own",
             )
-
-
-def _check_controllers_namespace(config: Config, reader: ConfigReader) -> None:
-    argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
-    for domain in config.domains.values():
         if argocd and domain.namespace == argocd.namespace:
             reader.add_fault(
                 DOMAINS_FILE,
-                f"domains[{reader.index_of(DOMAINS_FILE, domain.name)}].namespace",
+                place,
                 f"'{domain.namespace}' is Argo CD's own namespace, where an Application may do "
                 "all that Argo CD may; choose another",
             )
@@ -115,9 +94,9 @@ def _check_chart(where: str, chart: ChartSource, config: Config, reader: ConfigR
         reader.add_fault(CHARTS_FILE, f"{where}.folder", message)
         return
     try:
-        metadata = strict_yaml.load(text)
+        metadata = strict_yaml.load(text, path)
     except InvalidInput as error:
-        reader.faults += strict_yaml.faults_in(error, path)
+        reader.faults += error.faults
         return
     version = metadata.get("version") if isinstance(metadata, dict) else None
     if version != chart.version:
@@ -135,17 +114,9 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
         file = f"appdefs/{appdef.name}/appdef.yaml"
         for name, service in appdef.services.items():
             where = f"services.{name}"
-            if reader.is_missing(CHARTS_FILE, service.chart):
-                known = suggestion(service.chart, reader.item_names(CHARTS_FILE))
-                reader.add_fault(
-                    file, f"{where}.chart", f"'{service.chart}' is not in {CHARTS_FILE}{known}"
-                )
+            reader.check_reference(file, f"{where}.chart", service.chart, CHARTS_FILE)
             for image in service.images:
-                if reader.is_missing(IMAGES_FILE, image):
-                    known = suggestion(image, reader.item_names(IMAGES_FILE))
-                    reader.add_fault(
-                        file, f"{where}.images", f"'{image}' is not in {IMAGES_FILE}{known}"
-                    )
+                reader.check_reference(file, f"{where}.images", image, IMAGES_FILE)
             if config.values_template(appdef.name, service) not in config.files:
                 message = f"'{service.values}' does not exist; add it beside appdef.yaml"
                 reader.add_fault(file, f"{where}.values", message)
@@ -172,15 +143,6 @@ def _same(config: Config, one: tuple[str, str, Service], other: tuple[str, str, 
     return bool(one[2].each) and one[1:] == other[1:] and texts[0] == texts[1]
 
 
-def _check_bridged(config: Config, reader: ConfigReader) -> None:
-    for node in config.nodes.values():
-        for peer in node.bridged:
-            if reader.is_missing(NODES_FILE, peer):
-                place = f"nodes[{reader.index_of(NODES_FILE, node.id)}].bridged.{peer}"
-                known = suggestion(peer, reader.item_names(NODES_FILE))
-                reader.add_fault(NODES_FILE, place, f"'{peer}' is not in nodes.yaml{known}")
-
-
 def _check_connection_types(config: Config, reader: ConfigReader) -> None:
     for known in connection_types.by_number():
         reader.faults += known.config_faults(config, reader)
@@ -204,16 +166,10 @@ def _check_wire_types(config: Config, reader: ConfigReader) -> None:
 def _check_overrides(config: Config, reader: ConfigReader) -> None:
     for override in config.overrides.values():
         for image in override.images or ():
-            if reader.is_missing(IMAGES_FILE, image):
-                known = suggestion(image, reader.item_names(IMAGES_FILE))
-                message = f"'{image}' is not in {IMAGES_FILE}{known}"
-                reader.add_fault(override.path, f"images.{image}", message)
-        node = override.node
-        if node is not None and reader.is_missing(NODES_FILE, node):
-            known = suggestion(node, reader.item_names(NODES_FILE))
-            reader.add_fault(override.path, "node", f"'{node}' is not in nodes.yaml{known}")
-        elif node is not None and not reader.is_missing(NODES_FILE, node):
-            _check_moved_to(node, override, config, reader)
+            reader.check_reference(override.path, f"images.{image}", image, IMAGES_FILE)
+        if override.node is not None:
+            reader.check_reference(override.path, "node", override.node, NODES_FILE)
+            _check_moved_to(override.node, override, config, reader)
         versions = _versions_for(override, config)
         if override.version and versions and override.version not in versions:
             reader.add_fault(

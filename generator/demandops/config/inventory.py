@@ -9,9 +9,18 @@ from __future__ import annotations
 import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, StringConstraints, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
-from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Text, Visible, Word
+from demandops.config.base_model import (
+    CamelModel,
+    DnsLabel,
+    FileModel,
+    Items,
+    Text,
+    Visible,
+    Word,
+    without,
+)
 from demandops.identifiers import id_problem, message_type_problem, topic_problem
 
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
@@ -25,22 +34,22 @@ Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$"), V
 """A Zenoh endpoint without certificates: ``tcp/host:7447``."""
 
 
-class Tls(FrozenModel):
+class Tls(CamelModel):
     """TLS to a broker; without ``caSecret``, the client trusts the CAs of its image."""
 
-    ca_secret: DnsLabel | None = Field(default=None, alias="caSecret")
-    ca_key: SecretKey = Field(default="ca.crt", alias="caKey")
+    ca_secret: DnsLabel | None = None
+    ca_key: SecretKey = "ca.crt"
 
 
-class Credentials(FrozenModel):
+class Credentials(CamelModel):
     """The Secret with a broker's user name and password, and their keys in it."""
 
     secret: DnsLabel
-    user_key: SecretKey = Field(default="username", alias="userKey")
-    password_key: SecretKey = Field(default="password", alias="passwordKey")
+    user_key: SecretKey = "username"
+    password_key: SecretKey = "password"  # noqa: S105 - the name of a key
 
 
-class Zenoh(FrozenModel):
+class Zenoh(CamelModel):
     """The Zenoh bridge that a node runs when a connection needs it.
 
     Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
@@ -49,8 +58,8 @@ class Zenoh(FrozenModel):
     """
 
     endpoint: Endpoint | None = None
-    listen: tuple[Endpoint, ...] = Field(default=(), strict=False)
-    connect: tuple[Endpoint, ...] = Field(default=(), strict=False)
+    listen: Items[Endpoint] = ()
+    connect: Items[Endpoint] = ()
 
     @model_validator(mode="after")
     def _reachable(self) -> Zenoh:
@@ -66,12 +75,12 @@ class Zenoh(FrozenModel):
         return (f"{protocol}/0.0.0.0:{address.rpartition(':')[2]}",)
 
 
-class Wan(FrozenModel):
+class Wan(CamelModel):
     """The address of a node's DDS Routers, with one port for each ROS connection."""
 
     host: Host
-    first_port: Annotated[int, Field(ge=1024, le=65535)] = Field(default=20000, alias="firstPort")
-    last_port: Annotated[int, Field(ge=1024, le=65535)] = Field(default=29999, alias="lastPort")
+    first_port: Annotated[int, Field(ge=1024, le=65535)] = 20000
+    last_port: Annotated[int, Field(ge=1024, le=65535)] = 29999
     transport: Literal["tcp", "udp"] = "tcp"
 
     @model_validator(mode="after")
@@ -83,30 +92,9 @@ class Wan(FrozenModel):
         return self
 
 
-def _id(value: str) -> str:
-    problem = id_problem(value)
-    if problem:
-        raise ValueError(problem)
-    return value
-
-
-def _topic(value: str) -> str:
-    problem = topic_problem(value)
-    if problem:
-        raise ValueError(problem)
-    return value
-
-
-def _message_type(value: str) -> str:
-    problem = message_type_problem(value)
-    if problem:
-        raise ValueError(problem)
-    return value
-
-
-NodeId = Annotated[str, AfterValidator(_id)]
-Topic = Annotated[str, AfterValidator(_topic)]
-MessageType = Annotated[str, AfterValidator(_message_type)]
+NodeId = Annotated[str, without(id_problem)]
+Topic = Annotated[str, without(topic_problem)]
+MessageType = Annotated[str, without(message_type_problem)]
 
 LabelKey = Annotated[
     str,
@@ -116,14 +104,14 @@ _LABEL_VALUE = re.compile(r"([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?")
 LabelValue = Annotated[str, StringConstraints(pattern=f"^{_LABEL_VALUE.pattern}$")]
 
 
-class Cluster(FrozenModel):
+class Cluster(CamelModel):
     """A Kubernetes cluster whose GitOps controller reads ``clusters/<name>/``."""
 
     name: DnsLabel
     description: Text = ""
 
 
-class Toleration(FrozenModel):
+class Toleration(CamelModel):
     """A taint of the node that workloads tolerate (Kubernetes core/v1 Toleration)."""
 
     key: Text = ""
@@ -140,16 +128,16 @@ class Toleration(FrozenModel):
         return self
 
 
-class Ros(FrozenModel):
+class Ros(CamelModel):
     """The settings that a container needs to join the node's ROS graph."""
 
-    domain_id: Annotated[int, Field(ge=0, le=232)] = Field(default=0, alias="domainId")
+    domain_id: Annotated[int, Field(ge=0, le=232)] = 0
     rmw: Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"] = (
         "rmw_cyclonedds_cpp"
     )
 
 
-class Node(FrozenModel):
+class Node(CamelModel):
     """A C-ITS entity that runs services.
 
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
@@ -165,18 +153,14 @@ class Node(FrozenModel):
     cluster: DnsLabel
     selector: dict[LabelKey, LabelValue] | None = None
     topics: dict[Word, Topic] = Field(default_factory=dict)
-    tolerations: tuple[Toleration, ...] = Field(default=(), strict=False)
-    image_pull_secrets: tuple[DnsLabel, ...] = Field(
-        default=(), alias="imagePullSecrets", strict=False
-    )
-    host_network: bool = Field(default=True, alias="hostNetwork")
+    tolerations: Items[Toleration] = ()
+    image_pull_secrets: Items[DnsLabel] = ()
+    host_network: bool = True
     ros: Ros = Ros()
     zenoh: Zenoh | None = None
     wan: Wan | None = None
     types: dict[Topic, MessageType] = Field(default_factory=dict)
-    bridged: dict[NodeId, Annotated[tuple[Topic, ...], Field(strict=False)]] = Field(
-        default_factory=dict
-    )
+    bridged: dict[NodeId, Items[Topic]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _findable(self) -> Node:
@@ -192,7 +176,7 @@ class Node(FrozenModel):
         return dict(self.selector) if self.selector is not None else {"node_id": self.id}
 
 
-class Broker(FrozenModel):
+class Broker(CamelModel):
     """A message broker and the node that it runs on."""
 
     node: NodeId
@@ -207,18 +191,18 @@ class ClustersFile(FileModel):
     """``inventory/clusters.yaml``."""
 
     kind: Literal["Clusters"]
-    clusters: tuple[Cluster, ...] = Field(strict=False)
+    clusters: Items[Cluster]
 
 
 class NodesFile(FileModel):
     """``inventory/nodes.yaml``."""
 
     kind: Literal["Nodes"]
-    nodes: tuple[Node, ...] = Field(strict=False)
+    nodes: Items[Node]
 
 
 class BrokersFile(FileModel):
     """``inventory/brokers.yaml``."""
 
     kind: Literal["Brokers"]
-    brokers: tuple[Broker, ...] = Field(strict=False)
+    brokers: Items[Broker]

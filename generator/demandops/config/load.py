@@ -134,7 +134,7 @@ def _domains_of_nodes(
             names = " and ".join(f"'{domain.name}'" for domain in matching)
             reader.add_fault(
                 NODES_FILE,
-                f"nodes[{reader.index_of(NODES_FILE, node)}].id",
+                f"{reader.place_of(NODES_FILE, node)}.id",
                 f"'{node}' is in the access domains {names}; narrow their patterns so that it is "
                 "in one",
             )

@@ -15,9 +15,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Text, Visible
+from demandops.config.base_model import (
+    DnsLabel,
+    FileModel,
+    FrozenModel,
+    Items,
+    Text,
+    Visible,
+    readable_by,
+    without,
+)
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
-from demandops.config.registry import Image
+from demandops.config.registry import Digest, Image, Repository, Tag
 from demandops.errors import quoted
 from demandops.identifiers import id_problem
 
@@ -58,24 +67,12 @@ def format_time(moment: datetime) -> str:
     return re.sub(r"\.?0*\+00:00$", "Z", text)
 
 
-def _moment(text: str) -> str:
-    parse_time(text)
-    return text
-
-
 def _one_line(text: str) -> str:
     if not text.strip() or text != text.strip():
         raise ValueError("is empty or starts or ends with white space; write one line of text")
     if not text.isprintable():
         raise ValueError(f"{quoted(text)} is more than one line of plain text; write one line")
     return text
-
-
-def _owner(text: str) -> str:
-    problem = id_problem(text)
-    if problem:
-        raise ValueError(problem)
-    return _one_line(text)
 
 
 def _finite(value: Any) -> None:  # noqa: ANN401 - Helm values are any data
@@ -97,7 +94,7 @@ def _some(items: tuple[Any, ...]) -> tuple[Any, ...]:
     return items
 
 
-Patterns = Annotated[tuple[Text, ...], Field(strict=False), AfterValidator(_some)]
+Patterns = Annotated[Items[Text], AfterValidator(_some)]
 Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)]
 
 
@@ -139,11 +136,9 @@ class Selector(FrozenModel):
 class ImagePin(FrozenModel):
     """Changes to an image of the registry; absent fields leave it unchanged."""
 
-    repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")] | None = None
-    tag: (
-        Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")] | None
-    ) = None
-    digest: Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")] | None = None
+    repository: Repository | None = None
+    tag: Tag | None = None
+    digest: Digest | None = None
 
     @model_validator(mode="after")
     def _says_something(self) -> ImagePin:
@@ -166,10 +161,12 @@ class OverrideFile(FileModel):
 
     kind: Literal["Override"]
     reason: Line
-    owner: Annotated[str, StringConstraints(max_length=100), AfterValidator(_owner)]
+    owner: Annotated[
+        str, StringConstraints(max_length=100), without(id_problem), AfterValidator(_one_line)
+    ]
     priority: Annotated[int, Field(ge=-1_000_000, le=1_000_000)] = 0
-    expires: Annotated[str, AfterValidator(_moment)] | None = None
-    select: Annotated[tuple[Selector, ...], Field(strict=False), AfterValidator(_some)]
+    expires: Annotated[str, readable_by(parse_time)] | None = None
+    select: Annotated[Items[Selector], AfterValidator(_some)]
     values: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(_patch)] | None = None
     version: Annotated[str, StringConstraints(min_length=1, max_length=63), Visible] | None = None
     images: Annotated[dict[DnsLabel, ImagePin], Field(min_length=1)] | None = None

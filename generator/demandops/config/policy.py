@@ -10,9 +10,18 @@ import re
 from fnmatch import fnmatchcase
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from demandops.config.base_model import Approval, DnsLabel, FileModel, FrozenModel, Text
+from demandops.config.base_model import (
+    Approval,
+    CamelModel,
+    DnsLabel,
+    FileModel,
+    Items,
+    Positive,
+    Text,
+    readable_by,
+)
 from demandops.errors import quoted
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
@@ -35,12 +44,7 @@ def seconds_of(text: str) -> int:
     return seconds
 
 
-def _duration(text: str) -> str:
-    seconds_of(text)
-    return text
-
-
-Duration = Annotated[str, AfterValidator(_duration)]
+Duration = Annotated[str, readable_by(seconds_of)]
 Patterns = Annotated[tuple[Text, ...], Field(strict=False, min_length=1)]
 
 
@@ -49,7 +53,7 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
     return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
 
 
-class Rule(FrozenModel):
+class Rule(CamelModel):
     """The demands that some requesters may make; each requester of a demand needs such a rule.
 
     ``nodes`` are the nodes of applications and the ends of connections, ``brokers`` the nodes of
@@ -64,24 +68,18 @@ class Rule(FrozenModel):
     approval: Approval | None = None
 
 
-class Quotas(FrozenModel):
+class Quotas(CamelModel):
     """The upper limits of an access domain; an absent one means no limit.
 
     ``demands_per_minute`` limits the demands that one generator receives from a requester.
     """
 
-    claims_per_requester: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, alias="claimsPerRequester"
-    )
-    services_per_node: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, alias="servicesPerNode"
-    )
-    demands_per_minute: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, alias="demandsPerMinute"
-    )
+    claims_per_requester: Positive | None = None
+    services_per_node: Positive | None = None
+    demands_per_minute: Positive | None = None
 
 
-class LeasePolicy(FrozenModel):
+class LeasePolicy(CamelModel):
     """How long a demand's claims last without a renewal.
 
     Demands that request no lease get ``default``; without it their claims last forever. With
@@ -93,7 +91,7 @@ class LeasePolicy(FrozenModel):
     default: Duration | None = None
     longest: Duration | None = None
     slack: Duration = "30s"
-    deployment_requests: bool = Field(default=False, alias="deploymentRequests")
+    deployment_requests: bool = False
 
     @model_validator(mode="after")
     def _consistent(self) -> LeasePolicy:
@@ -108,7 +106,7 @@ class LeasePolicy(FrozenModel):
         return self
 
 
-class AccessDomain(FrozenModel):
+class AccessDomain(CamelModel):
     """A namespace and service account, the nodes whose releases are in it, and who may use them.
 
     Without ``rules``, all requesters may demand anything on its nodes.
@@ -116,9 +114,9 @@ class AccessDomain(FrozenModel):
 
     name: DnsLabel
     namespace: DnsLabel
-    service_account: DnsLabel = Field(default="demandops", alias="serviceAccount")
-    nodes: tuple[Text, ...] = Field(default=("*",), strict=False)
-    rules: tuple[Rule, ...] = Field(default=(), strict=False)
+    service_account: DnsLabel = "demandops"
+    nodes: Items[Text] = ("*",)
+    rules: Items[Rule] = ()
     quotas: Quotas = Quotas()
     leases: LeasePolicy = LeasePolicy()
     network: Literal["open", "namespace"] = "open"
@@ -137,4 +135,4 @@ class AccessDomainsFile(FileModel):
     """``policy/access-domains.yaml``."""
 
     kind: Literal["AccessDomains"]
-    domains: tuple[AccessDomain, ...] = Field(strict=False)
+    domains: Items[AccessDomain]

@@ -16,14 +16,18 @@ ChartVersion = Annotated[
     str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
 ]
 
+ChartFolder = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
+
+Repository = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")]
+Tag = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")]
+Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
+
 
 class ChartSource(FrozenModel):
     """One version of a Helm chart; exactly one of ``folder``, ``oci``, ``http`` is its source."""
 
     version: ChartVersion
-    folder: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")] | None = (
-        None
-    )
+    folder: ChartFolder | None = None
     oci: Annotated[str, StringConstraints(pattern=r"^oci://[^\s]+$"), Visible] | None = None
     http: Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$"), Visible] | None = None
 
@@ -85,11 +89,9 @@ class Chart(ChartSource):
 class Image(FrozenModel):
     """A container image, pinned by tag or digest; if it has both, the digest counts."""
 
-    repository: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")]
-    tag: (
-        Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")] | None
-    ) = None
-    digest: Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")] | None = None
+    repository: Repository
+    tag: Tag | None = None
+    digest: Digest | None = None
 
     @model_validator(mode="after")
     def _pinned(self) -> Image:

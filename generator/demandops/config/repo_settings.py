@@ -5,9 +5,17 @@ from __future__ import annotations
 import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, StringConstraints, model_validator
+from pydantic import StringConstraints, model_validator
 
-from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Visible
+from demandops.config.base_model import (
+    DnsLabel,
+    FileModel,
+    FrozenModel,
+    Items,
+    Positive,
+    Visible,
+    without,
+)
 from demandops.errors import quoted
 
 ROOT_FILE = "demandops.yaml"
@@ -42,16 +50,16 @@ _WEB_URL = re.compile(
 )
 
 
-def _web_url(text: str) -> str:
-    if not _WEB_URL.fullmatch(text):
-        raise ValueError(
-            f"{quoted(text)} is not an address that a token may be sent to; write "
-            "https://HOST/PATH, without a user (plain http only for this machine)"
-        )
-    return text
+def _web_url_problem(text: str) -> str:
+    if _WEB_URL.fullmatch(text):
+        return ""
+    return (
+        f"{quoted(text)} is not an address that a token may be sent to; write "
+        "https://HOST/PATH, without a user (plain http only for this machine)"
+    )
 
 
-WebUrl = Annotated[str, AfterValidator(_web_url), Visible]
+WebUrl = Annotated[str, without(_web_url_problem), Visible]
 
 
 class Proposals(FrozenModel):
@@ -65,9 +73,7 @@ class Proposals(FrozenModel):
     forge: Literal["none", "gitlab", "github", "gitea"] = "none"
     url: WebUrl | None = None
     api: WebUrl | None = None
-    labels: tuple[Annotated[str, StringConstraints(pattern=r"^[^\s,][^\n\r,]*$"), Visible], ...] = (
-        Field(default=(), strict=False)
-    )
+    labels: Items[Annotated[str, StringConstraints(pattern=r"^[^\s,][^\n\r,]*$"), Visible]] = ()
 
     @model_validator(mode="after")
     def _complete(self) -> Proposals:
@@ -98,7 +104,7 @@ class RepoSettings(FileModel):
 
     kind: Literal["StateRepository"]
     gitops: Literal["flux", "argocd"]
-    render_version: int = Field(alias="renderVersion", ge=1)
+    render_version: Positive
     source: DnsLabel = "demandops"
     flux: Flux | None = None
     argocd: ArgoCd | None = None

@@ -43,7 +43,7 @@ class Zenoh(ConnectionType):
             host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
             if node.zenoh and (other := hosts.setdefault(host, node.id)) != node.id:
                 yield fault(
-                    f"nodes[{reader.index_of(NODES_FILE, node.id)}].zenoh",
+                    f"{reader.place_of(NODES_FILE, node.id)}.zenoh",
                     f"'{other}' already runs a bridge on the same host and ROS domain; remove one "
                     "of them",
                 ).within(NODES_FILE)

@@ -227,10 +227,7 @@ def read(text: str, path: str) -> Claim:
     Raises:
         InvalidInput: with every fault, also if the path does not match the ids in the file.
     """
-    try:
-        data = strict_yaml.load(text)
-    except InvalidInput as error:
-        raise InvalidInput(strict_yaml.faults_in(error, path)) from None
+    data = strict_yaml.load(text, path)
     kind = data.get("kind") if isinstance(data, dict) else None
     version = _VERSION.match(str(data.get("apiVersion", ""))) if isinstance(data, dict) else None
     if version and int(version[1]) > 1:

@@ -119,7 +119,7 @@ def test_with_a_requester_goes_all_that_is_claimed_in_its_name(bare: Path, deman
     told = json.loads(out)
     assert (code, told["name"], told["outcome"]) == (0, "user1", "released")
     assert told["commit"] == rig.tip(bare)
-    assert {(c["kind"], c["id"]): c["left"] for c in told["claims"]} == {
+    assert {tuple(c["subject"].values()): c["left"] for c in told["claims"]} == {
         ("application", "edge/fusion-1"): None,
         ("connection", "vehicle01/edge"): None,
         ("application", "edge/fusion-2"): None,

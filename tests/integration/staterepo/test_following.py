@@ -478,7 +478,7 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
     ]
     assert "of-edge-fusion-1" in out
     assert run(["status", "--state-repo", str(bare), "--output", "json"]) == 0
-    (told,) = json.loads(capsys.readouterr().out)["problems"]
+    (told,) = json.loads(capsys.readouterr().out)["faults"]
     assert (told["file"], told["field"], told["since"]) == (NODES, "nodes[0].cluster", made)
     assert run(["bookkeeping", "--state-repo", str(bare)]) == 0
     shown = capsys.readouterr()

@@ -302,7 +302,7 @@ def test_a_damaged_journal_stops_the_start_until_it_is_set_aside(
     assert "demandops journal --set-aside" in listed.err
     (row,) = demandops(*command, "--set-aside", "--output", "json").json()
     assert Path(row["set_aside"]).read_bytes() == text
-    assert [each["operation"] for each in row["demands"]] == ["op-9", "op-2"]
+    assert [each["operation_id"] for each in row["demands"]] == ["op-9", "op-2"]
     assert row["demands"][1]["goal"] == goal(2)
     with rig.running(url) as generator:
         rig.receipt(generator.submit(row["demands"][1]["goal"], "op-2"))

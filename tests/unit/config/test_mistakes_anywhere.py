@@ -37,9 +37,9 @@ class Loader:
         self._parse = strict_yaml.load
         monkeypatch.setattr(strict_yaml, "load", self._load)
 
-    def _load(self, text: str) -> Any:
+    def _load(self, text: str, file: str = "") -> Any:
         if text not in self._parsed:
-            self._parsed[text] = self._parse(text)
+            self._parsed[text] = self._parse(text, file)
         return self._parsed[text]
 
     def document(self, file: str) -> Any:

@@ -8,21 +8,14 @@ from typing import Any
 
 import click
 
-from demandops.cli.actions.request import show_releases
-from demandops.cli.output import (
-    console,
-    output_option,
-    print_json,
-    progress,
-    signing_option,
-    state_repo_option,
-)
+from demandops.cli.actions.ledger_change import show_consequences, started_generator
+from demandops.cli.json_output import claim_data, output_option, print_json
+from demandops.cli.output import console, progress, signing_option, state_repo_option
 from demandops.decision import decide
 from demandops.demand import decommission_goal
 from demandops.errors import Refused
 from demandops.ledger.ledger import ClaimChange
 from demandops.runtime import REAL
-from demandops.service import Generator
 from demandops.staterepo import reader
 from demandops.staterepo.history import authorship
 from demandops.staterepo.load.snapshot import Snapshot
@@ -59,58 +52,43 @@ def decommission(
     goal = decommission_goal.as_data(
         name, (kinds,) if kinds else ("node", "requester"), str(authorship.operator())
     )
-    try:
-        if dry_run:
-            row = _dry_run(goal, state_repo, output)
-        else:
-            row = _decommission(goal, state_repo, signing_key)
-    except _NothingHeld:
-        row = _row(name, "unchanged", None, ())
+    done = _dry_run(goal, state_repo, output) if dry_run else _book(goal, state_repo, signing_key)
+    row = done or _row(name, "unchanged", None, ())
     if output == "json":
         print_json(row)
     else:
         _print(row, dry_run)
 
 
-class _NothingHeld(Exception):
-    """Raised when a known node holds no claims, which is not an error."""
+def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any] | None:
+    """Return what was released, or None if a known node holds nothing, which is not an error."""
+    with started_generator(state_repo, signing_key) as generator:
+        try:
+            receipt = generator.submit(goal).future.result()
+        except Refused as error:
+            _require_nothing_held(error, goal["name"], generator.snapshot)
+            return None
+    return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)
 
 
-def _holds_nothing(error: Refused, name: str, snapshot: Snapshot) -> bool:
-    codes = {each.code for each in error.faults}
-    return codes == {"not-held"} and name in snapshot.state.config.nodes
-
-
-def _decommission(
-    goal: dict[str, Any], state_repo: str, signing_key: Path | None
-) -> dict[str, Any]:
-    with progress("reading the ledger") as report:
-        generator = Generator(
-            state_repo, start_offline=False, signing_key=signing_key, progress=report
-        )
-    try:
-        receipt = generator.submit(goal).future.result()
-        return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)
-    except Refused as error:
-        if _holds_nothing(error, goal["name"], generator.snapshot):
-            raise _NothingHeld from None
-        raise
-    finally:
-        generator.close(timeout=0)
-
-
-def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any]:
+def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any] | None:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(progress=report)
         try:
             decision = decide(snapshot.state, goal, REAL.now(), repo.file_reader())
         except Refused as error:
-            if _holds_nothing(error, goal["name"], snapshot):
-                raise _NothingHeld from None
-            raise
+            _require_nothing_held(error, goal["name"], snapshot)
+            return None
     if output == "text":
-        show_releases(decision)
+        show_consequences(decision)
     return _row(goal["name"], decision.outcome, None, decision.changes.claims)
+
+
+def _require_nothing_held(error: Refused, name: str, snapshot: Snapshot) -> None:
+    """Raise the error unless it says that a known node holds nothing."""
+    codes = {each.code for each in error.faults}
+    if codes != {"not-held"} or name not in snapshot.state.config.nodes:
+        raise error
 
 
 def _row(
@@ -121,14 +99,10 @@ def _row(
         "outcome": outcome,
         "commit": commit,
         "claims": [
-            {
-                "kind": change.key.subject.kind.value[:-1],
-                "id": change.key.subject.id,
-                "demand": change.key.demand,
-                "requesters": list(change.before.requesters) if change.before else [],
-                "left": list(change.after.requesters) if change.after else None,
-            }
+            claim_data(change.before)
+            | {"left": list(change.after.requesters) if change.after else None}
             for change in changes
+            if change.before
         ],
     }
 
@@ -140,7 +114,8 @@ def _print(row: dict[str, Any], dry_run: bool) -> None:
         return
     would = "would be " if dry_run else ""
     for claim in row["claims"]:
-        text = f"{claim['kind']} '{claim['id']}' for {', '.join(claim['requesters'])}"
+        subject = claim["subject"]
+        text = f"{subject['kind']} '{subject['id']}' for {', '.join(claim['requesters'])}"
         if claim["left"] is None:
             out.print(f"{would}released: {text}")
         else:

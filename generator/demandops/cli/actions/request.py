@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -12,18 +11,12 @@ from typing import Any
 import click
 
 from demandops import strict_yaml
-from demandops.cli.output import (
-    SIGNS,
-    console,
-    errors,
-    output_option,
-    print_json,
-    progress,
-    signing_option,
-    state_repo_option,
-)
-from demandops.decision import Decision, admit, decide, form_faults
+from demandops.cli.actions.ledger_change import fault_lines, show_consequences, started_generator
+from demandops.cli.json_output import faults_of, output_option, print_json
+from demandops.cli.output import console, errors, progress, signing_option, state_repo_option
+from demandops.decision import admit, decide, form_faults
 from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
+from demandops.input_file import read_input
 from demandops.runtime import REAL
 from demandops.service import Generator, Receipt
 from demandops.service.approvals.proposal import parse_waiting_text
@@ -90,28 +83,17 @@ def request(
 
 
 def _documents(file: str) -> Iterable[_Document]:
-    name = "standard input" if file == "-" else file
-    try:
-        data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
-        text = data.decode("utf-8")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise InvalidInput([fault("", f"cannot be read: {reason}").within(name)]) from None
-    except UnicodeDecodeError:
-        raise InvalidInput([fault("", "is not UTF-8 text").within(name)]) from None
-    try:
-        return [_Document(name, goal) for goal in strict_yaml.load_all(text) if goal is not None]
-    except InvalidInput as error:
-        raise InvalidInput(strict_yaml.faults_in(error, name)) from None
+    name, text = read_input(file)
+    return [_Document(name, goal) for goal in strict_yaml.load_all(text, name) if goal is not None]
 
 
 def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str, Any]:
     return {
         "index": index,
-        "request_id": request_id,
+        "request": request_id,
         "outcome": outcome,
         "commit": None,
-        "errors": [],
+        "faults": [],
         "warnings": [],
         "not_held": [],
     } | more
@@ -125,37 +107,25 @@ def _unbooked(
         state = repo.snapshot().state
     rows = []
     for index, (document, form) in enumerate(zip(documents, faulty, strict=True)):
-        faults = [fault("", "not booked because another request of this call does not parse")]
+        message = "not booked because another request of this call does not parse"
+        refusal = InvalidInput([fault("", message)])
         if form:
             try:
                 admit(state, document.goal)
             except InvalidInput as error:
-                faults = list(error.faults)
-        rows.append(_row(index, document.request_id, "refused", errors=_errors(faults)))
+                refusal = error
+        rows.append(_refused(index, document, refusal))
     return rows
 
 
-def _errors(faults: Iterable[Fault]) -> list[dict[str, str]]:
-    return [{"field": each.field, "message": _message(each)} for each in faults]
-
-
-def _message(each: Fault) -> str:
-    return f"{each.file}: {each.message}" if each.file else each.message
-
-
 def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str, Any]:
-    faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
-    return _row(index, document.request_id, "refused", errors=_errors(faults))
+    return _row(index, document.request_id, "refused", faults=faults_of(error))
 
 
 def _book(
     documents: list[_Document], state_repo: str, wait: bool, signing_key: Path | None
 ) -> list[dict[str, Any]]:
-    with progress("reading the ledger") as report:
-        generator = Generator(
-            state_repo, start_offline=False, signing_key=signing_key, progress=report
-        )
-    try:
+    with started_generator(state_repo, signing_key) as generator:
         answers = [_submitted(generator, document, wait) for document in documents]
         rows = []
         for index, (document, answer) in enumerate(zip(documents, answers, strict=True)):
@@ -164,13 +134,12 @@ def _book(
             except DemandOpsError as error:
                 rows.append(_refused(index, document, error))
                 continue
-            if isinstance(result, Receipt):
-                rows.append(_booked(index, result))
-            else:
+            if not isinstance(result, Receipt):
                 rows.append(_row(index, document.request_id, "proposed", proposal=result))
+                continue
+            told = {name: getattr(result, name) for name in ("commit", "warnings", "not_held")}
+            rows.append(_row(index, result.request_id, result.outcome, **told))
         return rows
-    finally:
-        generator.close(timeout=0)
 
 
 def _submitted(
@@ -201,17 +170,6 @@ def _submitted(
     return answer
 
 
-def _booked(index: int, receipt: Receipt) -> dict[str, Any]:
-    return _row(
-        index,
-        receipt.request_id,
-        receipt.outcome,
-        commit=receipt.commit,
-        warnings=list(receipt.warnings),
-        not_held=list(receipt.not_held),
-    )
-
-
 def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[dict[str, Any]]:
     """Decide each request after the one before it, in memory only."""
     rows = []
@@ -231,13 +189,17 @@ def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[d
                 continue
             state = decision.state
             written.update(decision.files)
+            outcome = "proposed" if decision.approval else decision.outcome
             if output == "text":
-                _show_consequences(index, decision)
+                console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
+                for rule in decision.approval:
+                    console().print(f"  needs approval: {rule} requires it")
+                show_consequences(decision)
             rows.append(
                 _row(
                     index,
                     decision.request.id,
-                    "proposed" if decision.approval else decision.outcome,
+                    outcome,
                     warnings=list(decision.warnings),
                     not_held=list(decision.changes.not_held),
                     **({"approval": list(decision.approval)} if decision.approval else {}),
@@ -246,34 +208,14 @@ def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[d
     return rows
 
 
-def _show_consequences(index: int, decision: Decision) -> None:
-    outcome = "proposed" if decision.approval else decision.outcome
-    console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
-    for rule in decision.approval:
-        console().print(f"  needs approval: {rule} requires it")
-    show_releases(decision)
-
-
-def show_releases(decision: Decision) -> None:
-    """Print the releases that a decision changes and the files that it writes or removes."""
-    out = console()
-    for release in decision.releases:
-        out.print(f"  {SIGNS[release.change]} {release.name} ({release.description})")
-        for detail in release.details:
-            out.print(f"      {detail}")
-    for path, text in sorted(decision.files.items()):
-        out.print(f"  {'remove' if text is None else 'write '} {path}")
-
-
 def _print(rows: list[dict[str, Any]], documents: list[_Document], dry_run: bool) -> None:
     out = console()
     for row, document in zip(rows, documents, strict=True):
-        title = f"{document.file}: request {row['index']} '{row['request_id']}'"
+        title = f"{document.file}: request {row['index']} '{row['request']}'"
         if row["outcome"] == "refused":
             errors.print(f"{title} refused")
-            for error in row["errors"]:
-                where = f"{error['field']}: " if error["field"] else ""
-                errors.print(f"  {where}{error['message']}")
+            for line in fault_lines(row["faults"]):
+                errors.print(line)
         elif not dry_run:
             proposal = row.get("proposal")
             out.print(

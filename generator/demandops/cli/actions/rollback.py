@@ -8,21 +8,25 @@ from typing import Any
 
 import click
 
+from demandops.cli.actions.ledger_change import fault_lines, started_generator
+from demandops.cli.json_output import (
+    claim_data,
+    faults_of,
+    output_option,
+    print_json,
+    release_change_data,
+)
 from demandops.cli.output import (
     SIGNS,
     console,
     errors,
-    output_option,
-    print_json,
     progress,
     signing_option,
     state_repo_option,
 )
 from demandops.decision import Decision, decide
 from demandops.errors import InvalidInput
-from demandops.ledger import claim_file
 from demandops.runtime import REAL
-from demandops.service import Generator
 from demandops.service import rollback_goal as rollbacks
 from demandops.staterepo import reader
 from demandops.staterepo.history.authorship import Person
@@ -76,18 +80,18 @@ def rollback(  # noqa: PLR0913, PLR0917 - one for each option
         base = repo.commit()
         result: dict[str, Any] = {"to": target.to, "outcome": "refused", "commit": None}
         result |= _consequences(None)
-        result |= {"configuration_since": repo.config_files_changed_since(target.to), "errors": []}
+        result |= {"configuration_since": repo.config_files_changed_since(target.to), "faults": []}
         try:
             result |= _dry_run(repo, target, base)
         except InvalidInput as error:
-            result["errors"] = _errors(error)
-    if not dry_run and not result["errors"]:
+            result["faults"] = faults_of(error)
+    if not dry_run and not result["faults"]:
         result |= _roll_back(state_repo, target, signing_key, base)
     if output == "json":
         print_json(result)
     else:
         _print(result, dry_run)
-    if result["errors"]:
+    if result["faults"]:
         ctx.exit(1)
 
 
@@ -106,40 +110,21 @@ def _consequences(decision: Decision | None) -> dict[str, Any]:
         word = "changed_back" if change.before else "restored"
         claim = change.after or change.before
         assert claim is not None  # noqa: S101 - a change has at least one side
-        claims[word if change.after else "dropped"].append(
-            {
-                "subject": str(claim.subject),
-                "demand": claim.demand,
-                "request": claim.request,
-                "requesters": list(claim.requesters),
-                "file": claim_file.path_of(claim.key),
-            }
-        )
-    releases = [
-        {
-            "name": each.name,
-            "change": each.change,
-            "what": each.description,
-            "details": list(each.details),
-        }
-        for each in (decision.releases if decision else ())
-    ]
-    return {**claims, "releases": releases}
+        claims[word if change.after else "dropped"].append(claim_data(claim))
+    releases = decision.releases if decision else ()
+    return {**claims, "releases": [release_change_data(each) for each in releases]}
 
 
 def _roll_back(state_repo: str, target: _Target, key: Path | None, base: str) -> dict[str, Any]:
     """Roll back with a generator; return the result."""
-    with progress("reading the ledger") as report:
-        generator = Generator(state_repo, start_offline=False, signing_key=key, progress=report)
+    goal = rollbacks.goal(
+        target.to, drop_newer=target.drop_newer, reason=target.reason, who=target.person
+    )
     try:
-        goal = rollbacks.goal(
-            target.to, drop_newer=target.drop_newer, reason=target.reason, who=target.person
-        )
-        receipt = generator.submit(goal).future.result()
+        with started_generator(state_repo, key) as generator:
+            receipt = generator.submit(goal).future.result()
     except InvalidInput as error:
-        return {"outcome": "refused", **_consequences(None), "errors": _errors(error)}
-    finally:
-        generator.close(timeout=0)
+        return {"outcome": "refused", **_consequences(None), "faults": faults_of(error)}
     result: dict[str, Any] = {"outcome": receipt.outcome, "commit": receipt.commit}
     if receipt.outcome == "unchanged":
         return result | _consequences(None)
@@ -150,19 +135,12 @@ def _roll_back(state_repo: str, target: _Target, key: Path | None, base: str) ->
     return result
 
 
-def _errors(error: InvalidInput) -> list[dict[str, str]]:
-    return [
-        {"file": each.file, "field": each.field, "message": each.message} for each in error.faults
-    ]
-
-
 def _print(result: dict[str, Any], dry_run: bool) -> None:
     to, out = result["to"][:10], console()
-    if result["errors"]:
+    if result["faults"]:
         errors.print(f"the rollback to {to} is refused:")
-        for error in result["errors"]:
-            where = [part for part in (error["file"], error["field"]) if part]
-            errors.print(f"  {': '.join([*where, error['message']])}")
+        for line in fault_lines(result["faults"]):
+            errors.print(line)
     elif result["outcome"] == "unchanged":
         out.print(f"the ledger is the same as at {to}; there is nothing to roll back")
     elif dry_run:
@@ -172,7 +150,8 @@ def _print(result: dict[str, Any], dry_run: bool) -> None:
     for word, sign in _SIGN.items():
         for claim in result[word]:
             who = ", ".join(claim["requesters"])
-            out.print(f"  {sign} claim of {who} on {claim['subject']} ({word.replace('_', ' ')})")
+            subject = f"{claim['subject']['kind']} '{claim['subject']['id']}'"
+            out.print(f"  {sign} claim of {who} on {subject} ({word.replace('_', ' ')})")
     for release in result["releases"]:
         out.print(f"  {SIGNS[release['change']]} release {release['name']} ({release['what']})")
         for detail in release["details"]:

@@ -8,25 +8,22 @@ from typing import Any
 
 import click
 
-from demandops.cli.output import console, errors, print_json
+from demandops.cli.json_output import (
+    entry_change_data,
+    fault_data,
+    output_formats,
+    print_json,
+    release_change_data,
+)
+from demandops.cli.output import console, errors, printable
 from demandops.cli.repo import pull_request_comment
-from demandops.plan.views.bookkeeping_diff import EntryChange
-from demandops.render.changes.changeset import ReleaseChange
+from demandops.cli.views.diff import entry_lines, release_lines
 from demandops.render.changes.merge_preview import FileChange
 from demandops.staterepo.pull_request import merge_check
 from demandops.staterepo.pull_request.merge_check import CheckResult
 
 _MOST_DIFF_LINES = 400
 _MOST_DIFF_LINES_JSON = 20_000
-
-_SIGNS = {
-    "start": "+",
-    "change": "~",
-    "stop": "-",
-    "added": "+",
-    "changed": "~",
-    "removed": "-",
-}
 
 
 @click.command()
@@ -42,12 +39,11 @@ _SIGNS = {
     help="The branch that the edits will be merged into. They are compared with the merge base. "
     "Default: origin/main, or main.",
 )
-@click.option(
-    "--output",
-    type=click.Choice(["text", "json", "markdown"]),
-    default="text",
-    show_default=True,
-    help="The output format; markdown is for a comment on a pull request.",
+@output_formats(
+    "text",
+    "json",
+    "markdown",
+    description="The output format; markdown is for a comment on a pull request.",
 )
 def check(directory: Path, base: str | None, output: str) -> None:
     """Check edits of a state repo and show their consequences.
@@ -69,66 +65,31 @@ def check(directory: Path, base: str | None, output: str) -> None:
 
 
 def _data(checked: CheckResult) -> dict[str, Any]:
-    consequence = checked.preview
-    diffs, left = _bounded(consequence.files if consequence else (), _MOST_DIFF_LINES_JSON)
+    found, entries = checked.preview, checked.bookkeeping
+    files = found.files if found else ()
+    diffs, left = _bounded(files, _MOST_DIFF_LINES_JSON)
+    changes = [
+        {"file": each.path, "change": each.change, "diff": diffs.get(each.path)} for each in files
+    ]
     return {
-        "faults": [
-            {"file": each.file, "field": each.field, "message": each.message}
-            for each in checked.faults
-        ],
-        "warnings": [{"file": each.file, "message": each.message} for each in checked.warnings],
-        "overrides": [
+        "faults": [fault_data(each) for each in checked.faults],
+        "warnings": [fault_data(each) for each in checked.warnings],
+        "suggestions": [
             {
                 "instead_of": each.path,
                 "file": each.name,
                 "text": each.text,
-                "left": list(each.not_covered),
-                "also": list(each.other_releases),
+                "not_covered": list(each.not_covered),
+                "other_releases": list(each.other_releases),
             }
             for each in checked.suggestions
         ],
         "base": checked.base,
         "base_valid": checked.base_valid,
-        "releases": [_release_data(each) for each in consequence.releases] if consequence else None,
-        "files": [
-            {
-                "path": each.path,
-                "change": "add"
-                if each.before is None
-                else "remove"
-                if each.after is None
-                else "change",
-                "diff": diffs.get(each.path),
-            }
-            for each in consequence.files
-        ]
-        if consequence
-        else None,
-        "outdated": [each.path for each in consequence.files] if consequence else [],
+        "releases": [release_change_data(each) for each in found.releases] if found else None,
+        "files": changes if found else None,
         "diff_lines_left_out": left,
-        "bookkeeping": [_entry_data(each) for each in checked.bookkeeping]
-        if checked.bookkeeping is not None
-        else None,
-    }
-
-
-def _release_data(release: ReleaseChange) -> dict[str, Any]:
-    return {
-        "name": release.name,
-        "change": release.change,
-        "what": release.description,
-        "details": list(release.details),
-    }
-
-
-def _entry_data(entry: EntryChange) -> dict[str, Any]:
-    return {
-        "kind": entry.kind,
-        "name": entry.name,
-        "change": entry.change,
-        "requesters": list(entry.requesters),
-        "lost": list(entry.lost),
-        "gained": list(entry.gained),
+        "bookkeeping": None if entries is None else [entry_change_data(each) for each in entries],
     }
 
 
@@ -155,16 +116,7 @@ def _print(directory: Path, checked: CheckResult) -> None:
     if not checked.faults:
         out.print(f"{directory}: all files are valid and everything renders")
     for line in _lines(checked):
-        out.print(_visible(line), soft_wrap=True)
-
-
-def _files(count: int) -> str:
-    return "1 file" if count == 1 else f"{count} files"
-
-
-def _visible(line: str) -> str:
-    """Return a line without characters that would control the terminal."""
-    return "".join(char if char.isprintable() or char in "\n\t" else "�" for char in line)
+        out.print(printable(line), soft_wrap=True)
 
 
 def _lines(checked: CheckResult) -> Iterator[str]:
@@ -186,26 +138,18 @@ def _lines(checked: CheckResult) -> Iterator[str]:
         yield "(its own files are not valid; compared with its last valid files)"
     if consequence.releases:
         yield "\ndesired state:"
-        for release in consequence.releases:
-            yield f"  {_SIGNS[release.change]} {release.name} ({release.description})"
-            yield from (f"      {detail}" for detail in release.details)
+        yield from (f"  {line}" for line in release_lines(consequence.releases))
     if checked.bookkeeping:
         yield "\nbookkeeping:"
-        for entry in checked.bookkeeping:
-            yield f"  {_SIGNS[entry.change]} {entry.kind} {entry.name}{_for(entry)}"
-            yield from (f"      - {fact}" for fact in entry.lost)
-            yield from (f"      + {fact}" for fact in entry.gained)
+        yield from (f"  {line}" for line in entry_lines(checked.bookkeeping))
     yield from _file_lines(consequence.files)
-
-
-def _for(entry: EntryChange) -> str:
-    return "" if entry.change == "changed" else f" for {', '.join(entry.requesters)}"
 
 
 def _file_lines(files: tuple[FileChange, ...]) -> Iterator[str]:
     if not files:
         return
-    yield f"\nthe generator will write or remove {_files(len(files))}:"
+    count = "1 file" if len(files) == 1 else f"{len(files)} files"
+    yield f"\nthe generator will write or remove {count}:"
     yield from (f"  {'remove' if each.after is None else 'write '} {each.path}" for each in files)
     shown, left = _bounded(
         tuple(each for each in files if each.after is not None), _MOST_DIFF_LINES

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from demandops.cli.output import console, output_option, print_json, signing_option
+from demandops.cli.json_output import output_option, print_json
+from demandops.cli.output import console, signing_option
 from demandops.runtime import REAL
 from demandops.staterepo import new_repo
 from demandops.staterepo.git.signing import Signer

@@ -8,7 +8,9 @@ from typing import Any
 import click
 
 from demandops import settings
-from demandops.cli.output import console, errors, output_option, print_json, state_repo_option
+from demandops.cli.json_output import fault_data, output_option, print_json
+from demandops.cli.output import console, errors, state_repo_option
+from demandops.errors import fault
 from demandops.runtime import REAL
 from demandops.staterepo.write.slot import FoundJournal, find_journals
 
@@ -46,10 +48,10 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
 def _row(found: FoundJournal) -> dict[str, Any]:
     return {
         "file": str(found.file),
-        "damage": found.damage or None,
+        "faults": [fault_data(fault("", found.damage))] if found.damage else [],
         "set_aside": str(found.set_aside) if found.set_aside else None,
         "demands": [
-            {"operation": each.operation, "received": each.received, "goal": each.goal}
+            {"operation_id": each.operation, "received": each.received, "goal": each.goal}
             for each in found.demands
         ],
     }

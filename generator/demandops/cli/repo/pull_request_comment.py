@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 
+from demandops.cli.output import printable
 from demandops.plan.views.bookkeeping_diff import EntryChange
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.changes.merge_preview import FileChange
@@ -51,7 +52,7 @@ def code(text: str) -> str:
 
 def fence(text: str, language: str) -> str:
     """Return text as a block of code."""
-    text = "".join(char if char.isprintable() or char in "\n\t" else "�" for char in text)
+    text = printable(text)
     marks = _longer_than_any(text, least=3)
     return f"{marks}{language}\n{text.rstrip()}\n{marks}\n"
 

@@ -9,14 +9,8 @@ from typing import Any
 
 import click
 
-from demandops.cli.output import (
-    console,
-    output_option,
-    print_json,
-    progress,
-    signing_option,
-    state_repo_option,
-)
+from demandops.cli.json_output import output_option, print_json
+from demandops.cli.output import console, progress, signing_option, state_repo_option
 from demandops.render.gitops.controller_switch import Step
 from demandops.runtime import REAL
 from demandops.staterepo import upgrade as upgrading

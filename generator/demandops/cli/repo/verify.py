@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import click
 
-from demandops.cli.output import console, output_option, print_json, progress, state_repo_option
+from demandops.cli.json_output import fault_data, output_option, print_json
+from demandops.cli.output import console, progress, state_repo_option
+from demandops.errors import fault
 from demandops.staterepo import reader
 from demandops.staterepo.audit.verification import Verdict
 
@@ -40,18 +43,9 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
 
 
 def _row(verdict: Verdict) -> dict[str, Any]:
-    return {
-        "commit": verdict.commit,
-        "summary": verdict.summary,
-        "holds": verdict.holds,
-        "skipped": verdict.skipped or None,
-        "fault": verdict.fault or None,
-        "differing": list(verdict.differing),
-        "touched": list(verdict.touched),
-        "signed": verdict.signed,
-        "signer": verdict.signer or None,
-        "signature": verdict.signature or None,
-    }
+    row = {name: None if value == "" else value for name, value in asdict(verdict).items()}
+    message = row.pop("fault")
+    return row | {"faults": [fault_data(fault("", message))] if message else []}
 
 
 def _lines(verdicts: list[Verdict]) -> Iterator[str]:

@@ -5,15 +5,8 @@ from __future__ import annotations
 import click
 from rich.table import Table
 
-from demandops.cli.output import (
-    REV_HELP,
-    console,
-    errors,
-    output_option,
-    print_json,
-    progress,
-    state_repo_option,
-)
+from demandops.cli.json_output import output_option, print_json
+from demandops.cli.output import at_option, console, progress, state_repo_option, warn_of
 from demandops.plan.views.bookkeeping import Bookkeeping, as_data
 from demandops.plan.views.bookkeeping import bookkeeping as derive
 from demandops.staterepo import reader
@@ -23,15 +16,14 @@ _NONE = "(nothing)"
 
 @click.command()
 @state_repo_option
-@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; default: the newest commit.")
+@at_option
 @output_option
 def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     """Show who requests which service and connection."""
     with reader.opened(state_repo) as repo:
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(at, report)
-        for problem in repo.problems() if at is None else ():
-            errors.print(f"warning: {problem}; its last valid version is in effect")
+        warn_of(repo.problems() if at is None else ())
     books, commit = derive(snapshot.state), str(snapshot.commit)
     if output == "json":
         print_json(as_data(books, commit))

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict
-from typing import Any
 
 import click
 
-from demandops.cli.output import (
-    SIGNS,
-    console,
+from demandops.cli.json_output import (
+    entry_change_data,
     output_option,
     print_json,
-    progress,
-    state_repo_option,
-    warn_of,
+    release_change_data,
 )
+from demandops.cli.output import SIGNS, console, progress, state_repo_option, warn_of
 from demandops.plan.views.bookkeeping import bookkeeping
 from demandops.plan.views.bookkeeping_diff import EntryChange, bookkeeping_changes
-from demandops.render.changes.commit_diff import ReleaseDifference, compare
+from demandops.render.changes.changeset import ReleaseChange
+from demandops.render.changes.merge_preview import MergePreview, planned_releases, preview
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo import reader
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
-
-_LISTS = {"start": "started", "change": "changed", "stop": "stopped"}
-_SIGN_OF = {"added": "+", "changed": "~", "removed": "-"}
 
 
 @click.command()
@@ -42,31 +36,23 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
     """
     with reader.opened(state_repo) as repo:
         old, new = (_loaded(repo, revision) for revision in (before, after))
-        releases, others = _releases(repo, old, new)
-    sides = [bookkeeping(each.state) for each in (old, new)]
-    entries = bookkeeping_changes(*sides)
+        found = _compare(repo, old, new)
+    entries = bookkeeping_changes(*(bookkeeping(each.state) for each in (old, new)))
     if output == "json":
-        was, now = map(asdict, sides)
         print_json(
             {
-                kind: _entries(
-                    [each for each in entries if f"{each.kind}s" == kind], was[kind], now[kind]
-                )
-                for kind in ("services", "connections")
-            }
-            | {
-                "releases": {
-                    word: [_row(each) for each in releases if each.change == change]
-                    for change, word in _LISTS.items()
-                },
-                "other_files": others,
+                "bookkeeping": [entry_change_data(each) for each in entries],
+                "releases": [release_change_data(each) for each in found.releases],
+                "other_files": list(found.other_files),
             }
         )
         return
     out = console()
-    for line in list(_entry_lines(entries)) or ["no difference in bookkeeping"]:
+    for line in list(entry_lines(entries)) or ["no difference in bookkeeping"]:
         out.print(line)
-    for line in list(_release_lines(releases, others)) or ["no difference in releases"]:
+    files = [f"~ file {path}" for path in found.other_files]
+    lines = [*release_lines(found.releases, "release "), *files]
+    for line in lines or ["no difference in releases"]:
         out.print(line)
 
 
@@ -77,52 +63,27 @@ def _loaded(repo: Reader, revision: str) -> Snapshot:
     return snapshot
 
 
-def _releases(
-    repo: Reader, old: Snapshot, new: Snapshot
-) -> tuple[list[ReleaseDifference], list[str]]:
-    before, after = repo.file_reader(str(old.commit)), repo.file_reader(str(new.commit))
+def _compare(repo: Reader, old: Snapshot, new: Snapshot) -> MergePreview:
+    sides = [(repo.file_reader(str(each.commit)), each.state) for each in (old, new)]
     differing = repo.changed_files(str(old.commit), str(new.commit), CLUSTERS_ROOT)
-    files = {path: (before(path), after(path)) for path in differing}
-    return compare(old.state, new.state, files)
+    texts = [
+        {path: text for path in differing if (text := read(path)) is not None} for read, _ in sides
+    ]
+    releases = [planned_releases(state) for _, state in sides]
+    return preview(releases[0], releases[1], texts[0], texts[1])
 
 
-def _row(release: ReleaseDifference) -> dict[str, Any]:
-    return {
-        "name": release.name,
-        "what": release.description,
-        "file": release.path,
-        "details": list(release.details),
-    }
-
-
-def _release_lines(releases: Iterable[ReleaseDifference], others: Iterable[str]) -> Iterator[str]:
+def release_lines(releases: Iterable[ReleaseChange], word: str = "") -> Iterator[str]:
+    """Yield releases that differ, as text."""
     for release in releases:
-        yield f"{SIGNS[release.change]} release {release.name} ({release.description})"
+        yield f"{SIGNS[release.change]} {word}{release.name} ({release.description})"
         yield from (f"    {detail}" for detail in release.details)
-    yield from (f"~ file {path}" for path in others)
 
 
-def _entries(
-    changes: Iterable[EntryChange], old: dict[str, Any], new: dict[str, Any]
-) -> dict[str, Any]:
-    """Return the whole entries that were added, removed or changed, by name."""
-    entries: dict[str, dict[str, Any]] = {"added": {}, "removed": {}, "changed": {}}
-    for entry in changes:
-        sides = {"before": old.get(entry.name), "after": new.get(entry.name)}
-        whole = {"added": sides["after"], "removed": sides["before"], "changed": sides}
-        entries[entry.change][entry.name] = _plain(whole[entry.change])
-    return entries
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
+def entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
+    """Yield entries of the bookkeeping that differ, as text."""
     for entry in entries:
         who = "" if entry.change == "changed" else f" for {', '.join(entry.requesters)}"
-        yield f"{_SIGN_OF[entry.change]} {entry.kind} {entry.name}{who}"
+        yield f"{SIGNS[entry.change]} {entry.kind} {entry.name}{who}"
         yield from (f"    - {fact}" for fact in entry.lost)
         yield from (f"    + {fact}" for fact in entry.gained)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
 from typing import Any
@@ -11,7 +10,8 @@ from typing import Any
 import click
 from rich.table import Table
 
-from demandops.cli.output import console, output_option, print_json, state_repo_option
+from demandops.cli.json_output import commit_data, output_option, print_json
+from demandops.cli.output import console, state_repo_option
 from demandops.errors import StateRepoError
 from demandops.runtime import REAL
 from demandops.staterepo import reader
@@ -22,18 +22,12 @@ from demandops.staterepo.reader import Reader
 _BY_HAND = "by-hand"
 
 
-@dataclass(frozen=True, slots=True)
-class _Filters:
-    """What a commit must match. None matches every commit."""
-
-    requester: str | None
-    application: str | None
-    connection: str | None
-    node: str | None
-    demand: str | None
-    operation: str | None
-    since: datetime | None
-    until: datetime | None
+_TRAILERS = {
+    "requester": "Requester",
+    "application": "Application",
+    "connection": "Connection",
+    "demand": "Demand-Id",
+}
 
 
 class _Time(click.ParamType):  # type: ignore[type-arg]
@@ -106,9 +100,9 @@ def log(
     """
     with reader.opened(state_repo) as repo:
         commits = _walked(repo, commit_range, given.pop("release"))
-        entries = list(islice(_matching(repo, commits, _Filters(**given)), max_count))
+        entries = list(islice(_matching(repo, commits, **given), max_count))
     if output == "json":
-        print_json([_row(entry) for entry in entries])
+        print_json([commit_data(entry) for entry in entries])
         return
     if not entries:
         console().print("no commit matches")
@@ -130,26 +124,27 @@ def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iter
     return repo.commits_changing(path, commit_range)
 
 
-def _matching(repo: Reader, entries: Iterable[LogEntry], given: _Filters) -> Iterable[LogEntry]:
-    trailers = {
-        "Requester": given.requester,
-        "Application": given.application,
-        "Connection": given.connection,
-        "Demand-Id": given.demand,
-    }
-    wanted = [(key, value) for key, value in trailers.items() if value is not None]
+def _matching(
+    repo: Reader,
+    entries: Iterable[LogEntry],
+    *,
+    node: str | None,
+    operation: str | None,
+    since: datetime | None,
+    until: datetime | None,
+    **trailers: str | None,
+) -> Iterable[LogEntry]:
+    """Return the commits that match all that is given; the trailers are those of ``_TRAILERS``."""
+    wanted = [(_TRAILERS[name], value) for name, value in trailers.items() if value is not None]
 
     def matches(entry: LogEntry) -> bool:
-        if any(value not in entry.trailers.get(key, ()) for key, value in wanted):
-            return False
-        operation = entry.first("Operation") or _BY_HAND
-        if given.operation is not None and operation != given.operation:
-            return False
-        if given.since is not None and entry.time < given.since:
-            return False
-        if given.until is not None and entry.time > given.until:
-            return False
-        return given.node is None or repo.changes_node(entry.commit, given.node)
+        return (
+            all(value in entry.trailers.get(key, ()) for key, value in wanted)
+            and operation in (None, entry.first("Operation") or _BY_HAND)
+            and (since is None or entry.time >= since)
+            and (until is None or entry.time <= until)
+            and (node is None or repo.changes_node(entry.commit, node))
+        )
 
     return filter(matches, entries)
 
@@ -168,20 +163,3 @@ def _table(entries: Iterable[LogEntry]) -> Table:
             entry.summary,
         )
     return table
-
-
-def _row(entry: LogEntry) -> dict[str, Any]:
-    return {
-        "commit": entry.commit,
-        "time": entry.time.isoformat(),
-        "author": entry.author,
-        "summary": entry.summary,
-        "operation": entry.first("Operation") or None,
-        "operation_id": entry.first("Operation-Id") or None,
-        "request_id": entry.first("Request-Id") or None,
-        "demand_ids": entry.trailers.get("Demand-Id", []),
-        "requesters": entry.trailers.get("Requester", []),
-        "applications": entry.trailers.get("Application", []),
-        "connections": entry.trailers.get("Connection", []),
-        "render_version": entry.first("Render-Version") or None,
-    }

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import click
 from rich.table import Table
 
-from demandops.cli.output import (
-    REV_HELP,
-    console,
+from demandops.cli.json_output import (
+    claim_data,
     output_option,
+    override_data,
     print_json,
-    progress,
-    state_repo_option,
+    release_data,
 )
-from demandops.config.override import ImagePin, format_time
+from demandops.cli.output import at_option, console, progress, state_repo_option
+from demandops.config.override import format_time
 from demandops.plan.views.override_report import Entry, override_report
 from demandops.runtime import REAL
 from demandops.staterepo import reader
@@ -23,7 +21,7 @@ from demandops.staterepo import reader
 
 @click.command()
 @state_repo_option
-@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; default: the newest commit.")
+@at_option
 @output_option
 def overrides(state_repo: str, at: str | None, output: str) -> None:
     """List the overrides and what each one does.
@@ -36,7 +34,17 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
     state = snapshot.state
     entries = override_report(state, REAL.now())
     if output == "json":
-        print_json([_row(entry) for entry in entries])
+        print_json(
+            [
+                {
+                    **override_data(entry.override),
+                    "state": entry.state,
+                    "releases": [release_data(release) for release in entry.releases],
+                    "claims": [claim_data(claim) for claim in entry.claims],
+                }
+                for entry in entries
+            ]
+        )
         return
     out = console()
     if not entries:
@@ -49,7 +57,7 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
             override.name,
             entry.state,
             "\n".join(_effects(entry)),
-            "\n".join([*entry.releases, *entry.claims]),
+            "\n".join(_affected(entry)),
             str(override.priority),
             override.owner,
             format_time(override.end) if override.end else "",
@@ -71,24 +79,6 @@ def _effects(entry: Entry) -> list[str]:
     return [f"{name} {values[name]}" if name in values else name for name in override.effects()]
 
 
-def _row(entry: Entry) -> dict[str, Any]:
-    override = entry.override
-    return {
-        "name": override.name,
-        "file": override.path,
-        "state": entry.state,
-        "effects": {name: _plain(getattr(override, name)) for name in override.effects()},
-        "releases": list(entry.releases),
-        "claims": list(entry.claims),
-        "priority": override.priority,
-        "owner": override.owner,
-        "until": format_time(override.end) if override.end else None,
-        "reason": override.reason,
-    }
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Return an effect as written in the file. A patch keeps its null values."""
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value
+def _affected(entry: Entry) -> list[str]:
+    claims = [f"{claim.subject} of {claim.demand}" for claim in entry.claims]
+    return [*(release.name for release in entry.releases), *claims]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import click
 from rich.table import Table
 
 from demandops import settings
-from demandops.cli.output import console, errors, output_option, print_json, state_repo_option
+from demandops.cli.json_output import output_option, print_json, time_data, time_text
+from demandops.cli.output import console, errors, state_repo_option
 from demandops.config.repo_settings import Proposals
 from demandops.errors import InvalidInput
 from demandops.forge import Forge, ForgeError, forge_for
@@ -47,7 +49,7 @@ def proposals(state_repo: str, output: str) -> None:
             row["branch"],
             ", ".join(row["demands"]),
             ", ".join(row["requesters"]),
-            row["since"][:19].replace("T", " "),
+            time_text(row["since"]).removesuffix(" UTC"),
             row["summary"],
             row["link"] or "",
         )
@@ -73,16 +75,7 @@ def _forge(configured: Proposals) -> Forge | None:
 
 
 def _row(proposal: PendingProposal, forge: Forge | None) -> dict[str, Any]:
-    return {
-        "branch": proposal.branch,
-        "commit": proposal.commit,
-        "demands": list(proposal.demands),
-        "requesters": list(proposal.requesters),
-        "since": proposal.since.isoformat(),
-        "summary": proposal.summary,
-        "operations": list(proposal.operations),
-        "link": _link(proposal, forge),
-    }
+    return asdict(proposal) | {"since": time_data(proposal.since), "link": _link(proposal, forge)}
 
 
 def _link(proposal: PendingProposal, forge: Forge | None) -> str | None:

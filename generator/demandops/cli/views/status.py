@@ -11,22 +11,14 @@ from typing import Any
 import click
 from rich.table import Table
 
-from demandops.cli.output import (
-    console,
-    errors,
-    output_option,
-    print_json,
-    progress,
-    state_repo_option,
-)
+from demandops.cli.json_output import output_option, print_json, release_data
+from demandops.cli.output import console, errors, progress, state_repo_option
 from demandops.cluster import access
 from demandops.cluster.health import Health, ObjectSelector, Target, health_reader
 from demandops.cluster.object_cache import ObjectCache
-from demandops.plan.release import Release, ServiceRelease
 from demandops.runtime import REAL
 from demandops.service import rollout_targets
 from demandops.staterepo import reader
-from demandops.staterepo.load.problem_report import Problem
 from demandops.staterepo.reader import Reader
 
 _SHORT = 10
@@ -56,31 +48,23 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
         targets = rollout_targets.targets_of_state(snapshot.state)
         stores = _read(clusters, [target for _, target in targets])
         commit = str(snapshot.commit)
-        rows = [_row(release, target, commit, stores, repo) for release, target in targets]
+        rows = [
+            release_data(release) | _state(target, commit, stores, repo)
+            for release, target in targets
+        ]
     if output == "json":
-        reported = [asdict(problem) for problem in problems]
-        print_json({"commit": commit, "releases": rows, "problems": reported})
+        faults = [{"code": "invalid", **asdict(problem)} for problem in problems]
+        print_json({"commit": commit, "releases": rows, "faults": faults})
         return
-    _print_problems(problems)
+    if problems:
+        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        console().print(f"{count}; of each file the last valid version is in effect:")
+    for problem in problems:
+        console().print(f"  {problem}", soft_wrap=True)
     console().print(_table(rows))
     console().print(f"desired: {commit}")
     if not clusters:
         errors.print("the state of the clusters is unknown: give --clusters FILE")
-
-
-def _print_problems(problems: Iterable[Problem]) -> None:
-    """Print the problems that the generator reported in the state repo."""
-    lines = [f"  {problem}" for problem in problems]
-    if lines:
-        console().print(
-            f"{_counted(len(lines))}; of each file the last valid version is in effect:"
-        )
-    for line in lines:
-        console().print(line, soft_wrap=True)
-
-
-def _counted(number: int) -> str:
-    return f"{number} problem{'s' if number > 1 else ''}"
 
 
 def _read(
@@ -105,20 +89,11 @@ def _read(
     return stores
 
 
-def _row(
-    release: Release,
-    target: Target,
-    commit: str,
-    stores: Mapping[str, ObjectCache],
-    repo: Reader,
+def _state(
+    target: Target, commit: str, stores: Mapping[str, ObjectCache], repo: Reader
 ) -> dict[str, Any]:
     health, seen, when = _seen(target, commit, stores, repo)
     return {
-        "release": target.name,
-        "what": _what(release),
-        "node": release.node.id,
-        "cluster": target.domain.cluster,
-        "domain": target.domain.name,
         "seen": seen or None,
         "health": health.state if seen or health.object else "unknown",
         "since": when or None,
@@ -150,19 +125,13 @@ def _seen(
     )
 
 
-def _what(release: Release) -> str:
-    if isinstance(release, ServiceRelease):
-        return release.key.service
-    return "connection"
-
-
 def _table(rows: Iterable[dict[str, Any]]) -> Table:
     table = Table("Release", "What", "Node", "Cluster", "Seen", "Health", "Since", "Reason")
     for row in rows:
         reason = f"{row['object']}: {row['reason']}" if row["object"] else row["reason"] or ""
         table.add_row(
-            row["release"],
-            row["what"],
+            row["name"],
+            row["what"].partition(" on ")[0],
             row["node"],
             row["cluster"],
             (row["seen"] or "")[:_SHORT],

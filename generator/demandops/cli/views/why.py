@@ -7,15 +7,8 @@ from typing import Any
 
 import click
 
-from demandops.cli.output import (
-    REV_HELP,
-    console,
-    output_option,
-    print_json,
-    progress,
-    state_repo_option,
-    warn_of,
-)
+from demandops.cli.json_output import output_option, print_json
+from demandops.cli.output import at_option, console, progress, state_repo_option, warn_of
 from demandops.cli.views import why_answer
 from demandops.errors import StateRepoError, quoted, suggestion
 from demandops.ledger import claim_file
@@ -45,7 +38,7 @@ class _Match:
 @click.command()
 @click.argument("name", metavar="RELEASE|CONNECTION|APPLICATION|PATH")
 @state_repo_option
-@click.option("--at", "at", metavar="REV|TIME", help=f"{REV_HELP}; default: the newest commit.")
+@at_option
 @click.option(
     "--kind",
     type=click.Choice(_KINDS),

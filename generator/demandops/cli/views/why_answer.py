@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
+from demandops.cli.json_output import (
+    claim_data,
+    commit_data,
+    override_data,
+    place_data,
+    release_data,
+    subject_data,
+    time_text,
+)
 from demandops.config.override import Override
 from demandops.demand.claim import Claim
-from demandops.ledger import claim_file
 from demandops.ledger.world import World
 from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import explanation
-from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
@@ -27,15 +34,14 @@ def release(snapshot: Snapshot, running: Release) -> dict[str, Any]:
     claims = explanation.claims_behind(without_suspended(world).ledger, running)
     return {
         "runs": True,
-        "what": running.description,
-        **_where(running),
+        **place_data(running),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
         "claims": [_claim(claim, world) for claim in claims],
         "shaped_by": [
             {"file": each.file, "entry": each.entry or None, "what": each.what}
             for each in explanation.shaping_files(running, world.config)
         ],
-        "overrides": [_override(by, effects) for by, effects in running.shaping.by],
+        "overrides": [override_data(*each) for each in running.shaping.by],
     }
 
 
@@ -43,9 +49,8 @@ def denied(stopped: Release, by: Override) -> dict[str, Any]:
     """Return why a release does not run although claims request it."""
     return {
         "runs": False,
-        "what": stopped.description,
-        **_where(stopped),
-        "denied_by": _override(by, ("deny",)),
+        **place_data(stopped),
+        "denied_by": override_data(by, ("deny",)),
     }
 
 
@@ -56,12 +61,10 @@ def subject(snapshot: Snapshot, claimed: Subject) -> dict[str, Any]:
     return {
         "runs": any(suspended_by(claim, world) is None for claim in claims),
         "what": str(claimed),
+        "subject": subject_data(claimed),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
         "claims": [_claim(claim, world) for claim in claims],
-        "releases": [
-            {"name": each.name, **_where(each), "file": path_of(each)}
-            for each in explanation.releases(world, claimed)
-        ],
+        "releases": [release_data(each) for each in explanation.releases(world, claimed)],
     }
 
 
@@ -76,60 +79,21 @@ def commits(repo: Reader, path: str, commit: str, most: int) -> dict[str, Any]:
     }
 
 
-def _where(release: Release) -> dict[str, Any]:
-    return {
-        "cluster": release.node.cluster,
-        "domain": release.domain.name,
-        "namespace": release.domain.namespace,
-        "node": release.node.id,
-    }
-
-
-def _override(override: Override, effects: Iterable[str]) -> dict[str, Any]:
-    return {
-        "file": override.path,
-        "effects": list(effects),
-        "priority": override.priority,
-        "owner": override.owner,
-        "reason": override.reason,
-        "until": override.end.isoformat() if override.end else None,
-    }
-
-
 def _claim(claim: Claim, world: World) -> dict[str, Any]:
-    lease = claim.lease
     suspended = suspended_by(claim, world)
     kept = explanation.keeping_override(claim, world.config)
-    return {
-        "subject": str(claim.subject),
-        "demand": claim.demand,
-        "request": claim.request,
-        "requesters": list(claim.requesters),
-        "since": claim.booked.isoformat(),
-        "lease": {"seconds": lease.seconds, "until": lease.until.isoformat()} if lease else None,
-        "file": claim_file.path_of(claim.key),
+    return claim_data(claim) | {
         "release_by": explanation.how_to_release(claim),
-        "kept_by": _override(kept, ("keep",)) if kept else None,
-        "suspended_by": _override(suspended, ("deny",)) if suspended else None,
+        "kept_by": override_data(kept, ("keep",)) if kept else None,
+        "suspended_by": override_data(suspended, ("deny",)) if suspended else None,
     }
 
 
 def _commit(repo: Reader, entry: LogEntry | None) -> dict[str, Any] | None:
     if entry is None:
         return None
-    return {
-        "commit": entry.commit,
-        "time": entry.time.isoformat(),
-        "author": entry.author,
-        "operation": entry.first("Operation") or None,
-        "requesters": entry.trailers.get("Requester", []),
-        "summary": entry.summary,
-        "why": entry.why or None,
-        "carries_out": [
-            {"commit": each.commit, "author": each.author, "summary": each.summary}
-            for each in repo.person_commits_behind(entry, _MOST_CARRIED_OUT)
-        ],
-    }
+    behind = repo.person_commits_behind(entry, _MOST_CARRIED_OUT)
+    return commit_data(entry) | {"carries_out": [commit_data(each) for each in behind]}
 
 
 def lines(answer: dict[str, Any]) -> Iterator[str]:
@@ -173,8 +137,8 @@ def lines(answer: dict[str, Any]) -> Iterator[str]:
 def _claims(answer: dict[str, Any]) -> Iterator[str]:
     yield "requested by"
     for claim in answer["claims"]:
-        since = claim["since"][:19].replace("T", " ")
-        yield f"  {', '.join(claim['requesters'])} since {since} UTC, for {claim['subject']}"
+        subject = f"{claim['subject']['kind']} '{claim['subject']['id']}'"
+        yield f"  {', '.join(claim['requesters'])} since {time_text(claim['since'])}, for {subject}"
         yield f"    demand {claim['demand']}, request '{claim['request']}'{_lease(claim)}"
         yield f"    {claim['file']}"
         if claim["suspended_by"]:
@@ -187,7 +151,7 @@ def _claims(answer: dict[str, Any]) -> Iterator[str]:
 
 
 def _override_text(override: dict[str, Any]) -> str:
-    until = f", until {override['until'][:19].replace('T', ' ')} UTC" if override["until"] else ""
+    until = f", until {time_text(override['until'])}" if override["until"] else ""
     return (
         f"{override['file']}: {', '.join(override['effects'])} (priority "
         f"{override['priority']}{until}), of {override['owner']}: {override['reason']}"
@@ -197,8 +161,8 @@ def _override_text(override: dict[str, Any]) -> str:
 def _lease(claim: dict[str, Any]) -> str:
     if claim["lease"] is None:
         return ""
-    until = claim["lease"]["until"][:19].replace("T", " ")
-    return f", lease of {claim['lease']['seconds']} s until {until} UTC"
+    lease = claim["lease"]
+    return f", lease of {lease['seconds']} s until {time_text(lease['until'])}"
 
 
 def _history(answer: dict[str, Any]) -> Iterator[str]:
@@ -217,9 +181,8 @@ def _history(answer: dict[str, Any]) -> Iterator[str]:
 
 
 def _commit_lines(entry: dict[str, Any], *, why: bool) -> Iterator[str]:
-    when = entry["time"][:19].replace("T", " ")
-    word = entry["operation"] or "by hand"
-    yield f"  {entry['commit'][:10]} {when} UTC  {word}, {entry['author']}: {entry['summary']}"
+    when, word = time_text(entry["time"]), entry["operation"] or "by hand"
+    yield f"  {entry['commit'][:10]} {when}  {word}, {entry['author']}: {entry['summary']}"
     if why and entry["why"]:
         yield f"    {entry['why']}"
     for each in entry["carries_out"]:

@@ -6,30 +6,28 @@ repo may switch controllers while rollouts are followed.
 
 from __future__ import annotations
 
-from demandops.cluster.health import argocd, flux
+from demandops.cluster.health.argocd import ArgoCd
+from demandops.cluster.health.flux import Flux
 from demandops.cluster.health.model import (
     ClusterDomain,
     Health,
-    HealthReader,
     History,
     Key,
     Level,
-    Object,
     ObjectName,
     Objects,
     ObjectSelector,
     Target,
     worst,
 )
+from demandops.cluster.health.release_health import HealthReader
 
 __all__ = [
     "ClusterDomain",
     "Health",
-    "HealthReader",
     "History",
     "Key",
     "Level",
-    "Object",
     "ObjectName",
     "ObjectSelector",
     "Objects",
@@ -39,6 +37,9 @@ __all__ = [
 ]
 
 
+_ARGOCD, _FLUX = ArgoCd(), Flux()
+
+
 def health_reader(domain: ClusterDomain) -> HealthReader:
     """Return the reader for the controller of a domain."""
-    return argocd if domain.application else flux
+    return _ARGOCD if domain.application else _FLUX

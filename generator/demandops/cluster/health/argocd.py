@@ -7,7 +7,7 @@ current spec: ``status.sync.comparedTo`` holds the source that it is about.
 
 from __future__ import annotations
 
-from demandops.cluster.health.deployment import client_health, condition, deployment_health
+from demandops.cluster.health.deployment import deployment_health
 from demandops.cluster.health.model import (
     ClusterDomain,
     Health,
@@ -18,79 +18,72 @@ from demandops.cluster.health.model import (
     ObjectSelector,
     Target,
 )
+from demandops.cluster.health.release_health import HealthReader, name_of
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
 """How many objects of a failed sync a reason lists."""
 
 
-def objects_to_watch(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-    """Return the objects that the health of a domain and its releases depends on."""
-    return ObjectSelector("Application", *_folder_application(domain)), *objects_to_confirm(domain)
+class ArgoCd(HealthReader):
+    """Reads Applications."""
 
+    service_kind = "Application"
 
-def objects_to_confirm(domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-    """Return the objects to read again before a release counts as healthy: owners come first."""
-    return ObjectSelector("Application", domain.namespace), ObjectSelector(
-        "Deployment", domain.namespace
-    )
+    def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+        """Return the Application of the domain's folder, and all objects of the namespace."""
+        folder = ObjectSelector("Application", *_folder_application(domain))
+        return folder, *self.objects_to_confirm(domain)
 
+    def domain_health(
+        self, domain: ClusterDomain, commit: str, objects: Objects, history: History
+    ) -> Health:
+        """Return how far the Application of a domain's folder has applied a commit."""
+        application = _folder_application(domain)
+        name = f"Application {application.namespace}/{application.name}"
+        app = objects.get(("Application", *application))
+        if app is None:
+            return Health("waiting", "does not exist; apply bootstrap/ to the cluster", name)
+        if any(history.includes(revision, commit) for revision in _applied_commits(app)):
+            return Health("reconciled")
+        waiting = "has not applied the commit yet"
+        message, revision = _failure(app)
+        if not message:
+            return Health("waiting", waiting, name)
+        if revision and not history.includes(revision, commit):
+            return Health("waiting", f"{waiting}; for {revision[:10]} it reports: {message}", name)
+        return Health("waiting", message, name, failing=True)
 
-def domain_health(domain: ClusterDomain, commit: str, objects: Objects, history: History) -> Health:
-    """Return how far the Application of a domain's folder has applied a commit."""
-    application = _folder_application(domain)
-    name = f"Application {application.namespace}/{application.name}"
-    app = objects.get(("Application", *application))
-    if app is None:
-        return Health("waiting", "does not exist; apply bootstrap/ to the cluster", name)
-    if any(history.includes(revision, commit) for revision in _applied_commits(app)):
-        return Health("reconciled")
-    waiting = "has not applied the commit yet"
-    message, revision = _failure(app)
-    if not message:
-        return Health("waiting", waiting, name)
-    if revision and not history.includes(revision, commit):
-        return Health("waiting", f"{waiting}; for {revision[:10]} it reports: {message}", name)
-    return Health("waiting", message, name, failing=True)
+    def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
+        """Return the commit that a domain's Application has applied."""
+        app = objects.get(("Application", *_folder_application(domain)))
+        return next(iter(_applied_commits(app)), "") if app else ""
 
+    def _service_health(
+        self, target: Target, item: Object, commit: str, objects: Objects, history: History
+    ) -> Health:
+        name = name_of(self._key(target))
+        if item["metadata"].get("deletionTimestamp"):
+            return Health("reconciled", "is being removed and will then be created again", name)
+        outdated = _why_outdated(target.domain, item, commit, objects, history)
+        if not outdated and _status(item, "sync").get("status") == "Synced":
+            return _synced_health(item, name, objects)
+        message, _ = _failure(item)
+        if message:
+            return Health("reconciled", message, name, failing=True)
+        running = str(_status(item, "operationState").get("message") or "is being synced")
+        return Health("reconciled", outdated or running, name)
 
-def release_health(target: Target, commit: str, objects: Objects, history: History) -> Health:
-    """Return how far an applied commit has started a release, or removed it if unwanted."""
-    if not target.wanted:
-        return _removal_health(target, objects)
-    if not target.by_helm:
-        return client_health(target, objects)
-    name = f"Application {target.domain.namespace}/{target.name}"
-    app = objects.get(("Application", target.domain.namespace, target.name))
-    if app is None:
-        return Health("reconciled", "does not exist yet", name)
-    if app["metadata"].get("deletionTimestamp"):
-        return Health("reconciled", "is being removed and will then be created again", name)
-    outdated = _why_outdated(target.domain, app, commit, objects, history)
-    if not outdated and _status(app, "sync").get("status") == "Synced":
-        return _synced_health(app, name, objects)
-    message, _ = _failure(app)
-    if message:
-        return Health("reconciled", message, name, failing=True)
-    running = str(_status(app, "operationState").get("message") or "is being synced")
-    return Health("reconciled", outdated or running, name)
+    def _service_state(self, status: Object) -> Object:
+        return status.get("health") or {}
 
+    def _made(self, target: Target, deployment: Object) -> bool:
+        annotations = deployment["metadata"].get("annotations") or {}
+        tracked = f"{target.domain.namespace}_{target.name}:"
+        return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
 
-def last_transition(target: Target, objects: Objects) -> str:
-    """Return when the state of a release last changed; empty if the cluster does not say."""
-    kind = "Application" if target.by_helm else "Deployment"
-    item = objects.get((kind, target.domain.namespace, target.name)) or {}
-    if target.by_helm:
-        state = _status(item, "health")
-    else:
-        state = condition(item.get("status") or {}, "Available")
-    return str(state.get("lastTransitionTime", ""))
-
-
-def applied_commit(domain: ClusterDomain, objects: Objects) -> str:
-    """Return the commit that a domain's Application has applied; empty if it is not known."""
-    app = objects.get(("Application", *_folder_application(domain)))
-    return next(iter(_applied_commits(app)), "") if app else ""
+    def _why_not_removed(self, item: Object) -> str:
+        return _error(item)
 
 
 def _folder_application(domain: ClusterDomain) -> ObjectName:
@@ -160,29 +153,6 @@ def _synced_health(app: Object, name: str, objects: Objects) -> Health:
         reported.get("message") or f"its health is {reported.get('status') or 'not known yet'}"
     )
     return Health("reconciled", reason, name, failing=reported.get("status") == "Degraded")
-
-
-def _removal_health(target: Target, objects: Objects) -> Health:
-    namespace = target.domain.namespace
-    kind = "Application" if target.by_helm else "Deployment"
-    name = f"{kind} {namespace}/{target.name}"
-    item = objects.get((kind, namespace, target.name))
-    if item is None and not (target.by_helm and _has_leftovers(target, objects)):
-        return Health("healthy")
-    message = _error(item or {}) if target.by_helm else ""
-    if message:
-        return Health("reconciled", f"is still being removed; {message}", name, failing=True)
-    return Health("reconciled", "is still being removed", name)
-
-
-def _has_leftovers(target: Target, objects: Objects) -> bool:
-    """Report whether a Deployment of a removed Application still exists."""
-    tracked = f"{target.domain.namespace}_{target.name}:"
-    return any(
-        str((item["metadata"].get("annotations") or {}).get(_TRACKED_BY, "")).startswith(tracked)
-        for (kind, namespace, _), item in objects.items()
-        if kind == "Deployment" and namespace == target.domain.namespace
-    )
 
 
 def _failure(app: Object) -> tuple[str, str]:

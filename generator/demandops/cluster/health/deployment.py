@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from demandops.cluster.health.model import Health, Object, Objects, Target
+from demandops.cluster.health.model import Health, Object
 
 
 def deployment_health(deployment: Object) -> Health:
@@ -20,15 +20,6 @@ def deployment_health(deployment: Object) -> Health:
             message = str(problem.get("message", ""))
             return Health("reconciled", message, name, failing=True)
     return Health("reconciled", f"{available} of {wanted} replicas are available", name)
-
-
-def client_health(target: Target, objects: Objects) -> Health:
-    """Return the health of a communication client, from its Deployment."""
-    namespace = target.domain.namespace
-    deployment = objects.get(("Deployment", namespace, target.name))
-    if deployment is None:
-        return Health("reconciled", "does not exist yet", f"Deployment {namespace}/{target.name}")
-    return deployment_health(deployment)
 
 
 def condition(status: Object, kind: str) -> Object:

@@ -90,38 +90,6 @@ class History(Protocol):
         ...
 
 
-class HealthReader(Protocol):
-    """Reads the health of releases from the objects of a GitOps controller."""
-
-    def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the objects that the health of a domain and its releases depends on."""
-        ...
-
-    def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the objects to read again, in this order, before a release counts as healthy."""
-        ...
-
-    def domain_health(
-        self, domain: ClusterDomain, commit: str, objects: Objects, history: History
-    ) -> Health:
-        """Return how far a domain has applied a commit."""
-        ...
-
-    def release_health(
-        self, target: Target, commit: str, objects: Objects, history: History
-    ) -> Health:
-        """Return how far an applied commit has started a release, or removed it if unwanted."""
-        ...
-
-    def last_transition(self, target: Target, objects: Objects) -> str:
-        """Return when the state of a release last changed; empty if the cluster does not say."""
-        ...
-
-    def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the commit that a domain has applied; empty if it is not known."""
-        ...
-
-
 def worst(healths: list[Health]) -> Health:
     """Return the least advanced health; of several, one that is failing."""
     return min(

@@ -12,9 +12,8 @@ from typing import Any
 from demandops.ledger.world import World
 from demandops.plan.connection_clients import connection_topics
 from demandops.plan.overrides.suspended_claims import suspended_claims, without_suspended
-from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
-from demandops.plan.release_keys import all_keys
+from demandops.plan.views import explanation
 from demandops.subject import SubjectKind
 
 
@@ -68,8 +67,7 @@ class Bookkeeping:
 def bookkeeping(world: World) -> Bookkeeping:
     """Return the requesters of each service and connection."""
     services = {}
-    for key in all_keys(world):
-        release = plan(world, key)
+    for release in explanation.releases(world):
         if isinstance(release, ServiceRelease):
             services[release.name] = ServiceEntry(
                 applications=release.applications,

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
 from demandops.config.override import Override, format_time
+from demandops.demand.claim import Claim
 from demandops.ledger.world import World
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.suspended_claims import suspended_by
 from demandops.plan.planner import denied_release, plan
+from demandops.plan.release import Release
 from demandops.plan.release_keys import all_keys
 
 State = Literal["in force", "expired", "matches nothing"]
@@ -23,8 +26,8 @@ class Entry:
 
     override: Override
     state: State
-    releases: tuple[str, ...]
-    claims: tuple[str, ...]
+    releases: tuple[Release, ...]
+    claims: tuple[Claim, ...]
 
 
 def override_report(world: World, now: datetime) -> list[Entry]:
@@ -33,15 +36,12 @@ def override_report(world: World, now: datetime) -> list[Entry]:
     claims = _claims(world)
     found = []
     for name, override in sorted(world.config.overrides.items()):
-        entry = (
-            tuple(sorted(releases.get(name, ()))),
-            tuple(sorted(claims.get(name, ()))),
-        )
-        state: State = "in force" if any(entry) else "matches nothing"
+        applied = sorted(releases[name], key=lambda one: one.name), claims[name]
+        state: State = "in force" if any(applied) else "matches nothing"
         expired = override.end is not None and override.end <= now
         if expired or override not in world.overrides:
-            state, entry = "expired", ((), ())
-        found.append(Entry(override, state, *entry))
+            state, applied = "expired", ([], [])
+        found.append(Entry(override, state, tuple(applied[0]), tuple(applied[1])))
     return found
 
 
@@ -59,27 +59,26 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
             yield override.path, "matches nothing now; if it should, correct select"
 
 
-def _releases(world: World) -> dict[str, set[str]]:
+def _releases(world: World) -> dict[str, list[Release]]:
     """Return override → the releases that it changes or denies."""
-    found: dict[str, set[str]] = {}
+    found = defaultdict[str, list[Release]](list)
     for key in all_keys(world):
         release = plan(world, key)
         if release is not None:
             for override, _ in release.shaping.by:
-                found.setdefault(override.name, set()).add(release.name)
+                found[override.name].append(release)
             continue
         stopped = denied_release(world, key)
         if stopped is not None:
-            found.setdefault(stopped[1].name, set()).add(stopped[0].name)
+            found[stopped[1].name].append(stopped[0])
     return found
 
 
-def _claims(world: World) -> dict[str, set[str]]:
+def _claims(world: World) -> dict[str, list[Claim]]:
     """Return override → the claims that it suspends or would keep."""
-    found: dict[str, set[str]] = {}
-    for claim in world.ledger:
+    found = defaultdict[str, list[Claim]](list)
+    for claim in sorted(world.ledger, key=lambda one: (str(one.subject), one.demand)):
         by = [suspended_by(claim, world), *kept_claims.keeping_overrides(claim, world)]
-        for override in by:
-            if override is not None:
-                found.setdefault(override.name, set()).add(f"{claim.subject} of {claim.demand}")
+        for name in {override.name for override in by if override is not None}:
+            found[name].append(claim)
     return found

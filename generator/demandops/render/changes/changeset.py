@@ -33,12 +33,18 @@ FileReader = Callable[[str], str | None]
 
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
-    """A release that starts, changes or stops, and the facts that change."""
+    """A release that starts, changes or stops, the facts that change, and its file."""
 
     name: str
     change: Change
     description: str
     details: tuple[str, ...]
+    path: str = ""
+
+    @property
+    def order(self) -> tuple[int, str]:
+        """Its place in a list of changes."""
+        return CHANGE_ORDER.index(self.change), self.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +103,7 @@ def build_changeset(
         if old or new:
             releases.append(describe_change(old, new, current is not None))
     check_files(files)
-    releases.sort(key=lambda change: (CHANGE_ORDER.index(change.change), change.name))
+    releases.sort(key=lambda change: change.order)
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
 
 
@@ -146,7 +152,7 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
     if new and existed:
         kind = "change"
     details = _differences(old, new) if kind == "change" else ()
-    return ReleaseChange(release.name, kind, release.description, details)
+    return ReleaseChange(release.name, kind, release.description, details, path_of(release))
 
 
 def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:

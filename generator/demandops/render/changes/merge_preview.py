@@ -1,7 +1,8 @@
-"""The effect of a changed configuration or ledger on all releases and files. Pure.
+"""The releases and files that differ between two commits, or before and after a merge. Pure.
 
 A demand's changeset covers only the releases that the demand touches. A change of the configuration
-may affect any release, so this compares all of them.
+may affect any release, so this compares all of them. The files decide whether a release differs,
+because the clusters follow the files. The plans of both sides describe the difference.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput
@@ -17,7 +19,7 @@ from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of
-from demandops.render.changes.changeset import CHANGE_ORDER, ReleaseChange, describe_change
+from demandops.render.changes.changeset import ReleaseChange, describe_change
 from demandops.render.changes.data_diff import leaf_differences, short_value
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
@@ -35,6 +37,13 @@ class FileChange:
     before: str | None
     after: str | None
 
+    @property
+    def change(self) -> Literal["added", "changed", "removed"]:
+        """How it changes."""
+        if self.before is None:
+            return "added"
+        return "removed" if self.after is None else "changed"
+
     def diff(self) -> Iterator[str]:
         """Yield the lines of a unified diff."""
         return difflib.unified_diff(
@@ -48,10 +57,14 @@ class FileChange:
 
 @dataclass(frozen=True, slots=True)
 class MergePreview:
-    """The releases that would start, change or stop, and the files that would change."""
+    """The releases that start, change or stop, and the files that change.
+
+    ``other_files`` are the files that are not of a release.
+    """
 
     releases: tuple[ReleaseChange, ...]
     files: tuple[FileChange, ...]
+    other_files: tuple[str, ...]
 
 
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
@@ -128,22 +141,36 @@ def preview(
         for path in sorted({*current, *files})
         if current.get(path) != files.get(path)
     )
-    changed_paths = {change.path for change in file_changes}
+    changed = {change.path for change in file_changes}
+    of_releases = set[str]()
     releases = []
-    for key in dict.fromkeys([*old, *new]):
-        before, after = old.get(key), new.get(key)
-        old_path = path_of(before) if before else None
-        new_path = path_of(after) if after else None
-        if old_path not in changed_paths and new_path not in changed_paths:
+    for before, after in _pairs(old, new):
+        old_path, new_path = (path_of(side) if side else "" for side in (before, after))
+        if not changed & {old_path, new_path}:
             continue
-        text = current.get(old_path or new_path or "")
+        of_releases |= {old_path, new_path}
+        text = current.get(old_path or new_path)
         change = describe_change(before, after, text is not None)
-        if change.change == "change" and not change.details:
-            facts = _facts(text or "", files.get(new_path or "", ""))
+        if change.change == "change" and old_path and old_path != new_path:
+            moved = (f"- {old_path}", f"+ {new_path}")
+            change = replace(change, details=(*moved, *change.details))
+        elif change.change == "change" and not change.details:
+            facts = _facts(text or "", files.get(new_path, ""))
             change = replace(change, details=tuple(facts))
         releases.append(change)
-    releases.sort(key=lambda change: (CHANGE_ORDER.index(change.change), change.name))
-    return MergePreview(tuple(releases), file_changes)
+    releases.sort(key=lambda change: change.order)
+    others = tuple(sorted(changed - of_releases))
+    return MergePreview(tuple(releases), file_changes, others)
+
+
+def _pairs(
+    old: Mapping[ReleaseKey, Release], new: Mapping[ReleaseKey, Release]
+) -> Iterator[tuple[Release | None, Release | None]]:
+    """Yield each release before and after; one that moved has another key and the same name."""
+    gone = {release.name: release for key, release in old.items() if key not in new}
+    for key, release in new.items():
+        yield old.get(key) or gone.pop(release.name, None), release
+    yield from ((release, None) for release in gone.values())
 
 
 def _facts(before: str, after: str) -> Iterator[str]:

@@ -1,0 +1,42 @@
+"""What the commands that change the ledger share: how they book, and how they show it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from demandops.cli.output import console, progress
+from demandops.cli.views.diff import release_lines
+from demandops.decision import Decision
+from demandops.service import Generator
+
+
+@contextmanager
+def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
+    """Yield a generator that is closed at the end."""
+    with progress("reading the ledger") as report:
+        generator = Generator(
+            state_repo, start_offline=False, signing_key=signing_key, progress=report
+        )
+    try:
+        yield generator
+    finally:
+        generator.close(timeout=0)
+
+
+def show_consequences(decision: Decision) -> None:
+    """Print the releases that a decision changes and the files that it writes or removes."""
+    out = console()
+    for line in release_lines(decision.releases):
+        out.print(f"  {line}")
+    for path, text in sorted(decision.files.items()):
+        out.print(f"  {'remove' if text is None else 'write '} {path}")
+
+
+def fault_lines(faults: Iterable[dict[str, Any]]) -> Iterator[str]:
+    """Yield faults in the form of JSON as text."""
+    for fault in faults:
+        parts = (fault["file"], fault["field"], fault["message"])
+        yield f"  {': '.join(part for part in parts if part)}"

@@ -1,0 +1,174 @@
+"""The JSON of all commands: one shape for each thing, as docs/json.md lists them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from datetime import datetime
+from functools import wraps
+from typing import Any
+
+import click
+
+from demandops.config.override import ImagePin, Override, format_time
+from demandops.demand.claim import Claim
+from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
+from demandops.ledger import claim_file
+from demandops.plan.release import Release
+from demandops.plan.views.bookkeeping_diff import EntryChange
+from demandops.render.changes.changeset import ReleaseChange
+from demandops.render.gitops.paths import path_of
+from demandops.staterepo.history.commit_log import LogEntry
+from demandops.subject import Subject
+
+Json = dict[str, Any]
+Command = Callable[..., Any]
+
+
+def output_formats(
+    *formats: str, description: str = "The output format."
+) -> Callable[[Command], Command]:
+    """Return the option ``--output``; with json, a command that fails prints its faults too."""
+    option = click.option(
+        "--output",
+        "output",
+        type=click.Choice(formats),
+        default="text",
+        show_default=True,
+        help=description,
+    )
+
+    def add(command: Command) -> Command:
+        @wraps(command)
+        def run(*args: Any, output: str, **given: Any) -> Any:  # noqa: ANN401
+            try:
+                return command(*args, output=output, **given)
+            except DemandOpsError as error:
+                if output == "json":
+                    print_json({"faults": faults_of(error)})
+                raise
+
+        return option(run)
+
+    return add
+
+
+output_option = output_formats("text", "json")
+
+
+def print_json(data: object) -> None:
+    """Print ``data`` as JSON."""
+    click.echo(json.dumps(data, indent=2, ensure_ascii=False))
+
+
+def faults_of(error: DemandOpsError) -> list[Json]:
+    """Return the faults of any error of the program."""
+    faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
+    return [fault_data(each) for each in faults]
+
+
+def fault_data(each: Fault) -> Json:
+    """Return a fault; ``file`` and ``field`` may be empty."""
+    return asdict(each)
+
+
+def time_data(moment: datetime | None) -> str | None:
+    """Return a time in UTC."""
+    return format_time(moment) if moment else None
+
+
+def time_text(time: str) -> str:
+    """Return a time of the JSON for people, in seconds."""
+    return f"{time[:19].rstrip('Z').replace('T', ' ')} UTC"
+
+
+def subject_data(subject: Subject) -> Json:
+    """Return a subject."""
+    return {"kind": subject.kind.value[:-1], "id": subject.id}
+
+
+def claim_data(claim: Claim) -> Json:
+    """Return a claim."""
+    lease = claim.lease
+    return {
+        "subject": subject_data(claim.subject),
+        "demand": claim.demand,
+        "request": claim.request,
+        "requesters": list(claim.requesters),
+        "since": time_data(claim.booked),
+        "lease": {"seconds": lease.seconds, "until": time_data(lease.until)} if lease else None,
+        "file": claim_file.path_of(claim.key),
+    }
+
+
+def place_data(release: Release) -> Json:
+    """Return what a release is and where it runs: a release without its name and file."""
+    return {
+        "what": release.description,
+        "cluster": release.node.cluster,
+        "domain": release.domain.name,
+        "namespace": release.domain.namespace,
+        "node": release.node.id,
+    }
+
+
+def release_data(release: Release) -> Json:
+    """Return a release."""
+    return {"name": release.name, **place_data(release), "file": path_of(release)}
+
+
+def release_change_data(release: ReleaseChange) -> Json:
+    """Return a release that starts, changes or stops."""
+    return {
+        "name": release.name,
+        "what": release.description,
+        "file": release.path,
+        "change": release.change,
+        "details": list(release.details),
+    }
+
+
+def entry_change_data(entry: EntryChange) -> Json:
+    """Return an entry of the bookkeeping that is added, changed or removed."""
+    return asdict(entry)
+
+
+def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
+    """Return an override with some of its effects; by default all."""
+    names = override.effects() if effects is None else effects
+    return {
+        "name": override.name,
+        "file": override.path,
+        "effects": {name: _plain(getattr(override, name)) for name in names},
+        "priority": override.priority,
+        "owner": override.owner,
+        "until": time_data(override.end),
+        "reason": override.reason,
+    }
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401
+    """Return an effect as written in the file. A patch keeps its null values."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value
+
+
+def commit_data(entry: LogEntry) -> Json:
+    """Return a commit, with what its message and trailers say."""
+    return {
+        "commit": entry.commit,
+        "time": time_data(entry.time),
+        "author": entry.author,
+        "summary": entry.summary,
+        "why": entry.why or None,
+        "operation": entry.first("Operation") or None,
+        "operation_id": entry.first("Operation-Id") or None,
+        "request": entry.first("Request-Id") or None,
+        "demands": entry.trailers.get("Demand-Id", []),
+        "requesters": entry.trailers.get("Requester", []),
+        "applications": entry.trailers.get("Application", []),
+        "connections": entry.trailers.get("Connection", []),
+        "render_version": entry.first("Render-Version") or None,
+    }
