@@ -11,7 +11,7 @@ from demandops.ledger.ledger import Ledger
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """What people wrote, and what is booked.
+    """The configuration and the claims.
 
     ``overrides`` are those that have not ended, in the order in which they apply.
     """

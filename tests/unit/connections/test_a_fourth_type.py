@@ -24,7 +24,7 @@ from demandops.connections.connection_type import Connections, ConnectionType
 from demandops.decision import Decision
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file
-from demandops.plan.views import explanation
+from demandops.plan.views import release_causes
 from demandops.subject import Subject, SubjectKind
 
 from tests.kit.connections import ROS_IMAGE, demand, routes, state
@@ -183,9 +183,9 @@ def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
     world, _ = booked()
     ledger = world.state.ledger
     subject = Subject(SubjectKind.CONNECTION, "c")
-    (release,) = explanation.releases(world.state, subject)
-    assert explanation.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
-    files = [(one.file, one.entry) for one in explanation.shaping_files(release, world.config)]
+    (release,) = release_causes.releases(world.state, subject)
+    assert release_causes.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
+    files = [(one.file, one.entry) for one in release_causes.shaping_files(release, world.config)]
     assert ("inventory/nodes.yaml", "edge.wan") in files
     assert ("registry/images.yaml", "images.relay") in files
 

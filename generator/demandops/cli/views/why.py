@@ -9,11 +9,11 @@ import click
 
 from demandops.cli.json_output import output_option, print_json
 from demandops.cli.output import at_option, console, progress, state_repo_option, warn_of
-from demandops.cli.views import why_answer
+from demandops.cli.views import why_output
 from demandops.errors import StateRepoError, quoted, suggestion
 from demandops.ledger import claim_file
 from demandops.plan.release import Release
-from demandops.plan.views import explanation
+from demandops.plan.views import release_causes
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo import reader
 from demandops.staterepo.load import ledger_files
@@ -71,18 +71,18 @@ def why(
         commit = str(snapshot.commit)
         answer: dict[str, Any] = {"commit": commit, "kind": match.kind, "name": match.name}
         if match.release is not None:
-            answer |= why_answer.release(snapshot, match.release)
+            answer |= why_output.release(snapshot, match.release)
         elif match.subject is not None:
-            answer |= why_answer.subject(snapshot, match.subject)
+            answer |= why_output.subject(snapshot, match.subject)
         else:
             answer |= {"runs": False, **_denied(snapshot, match)}
         answer["file"] = match.path
-        answer |= why_answer.commits(repo, match.path, commit, most)
+        answer |= why_output.commits(repo, match.path, commit, most)
     if output == "json":
         print_json(answer)
         return
     out = console()
-    for line in why_answer.lines(answer):
+    for line in why_output.lines(answer):
         out.print(line, soft_wrap=True)
 
 
@@ -105,7 +105,7 @@ def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Ma
         return _by_path(repo, snapshot, name)
     world = snapshot.state
     known = {
-        *(release.name for release in explanation.releases(world)),
+        *(release.name for release in release_causes.releases(world)),
         *repo.stopped_release_names(str(snapshot.commit)),
     }
     known |= {id for each in SubjectKind for id in world.ledger.subjects(each)}
@@ -115,10 +115,10 @@ def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Ma
 def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> list[_Match]:
     world = snapshot.state
     matches = []
-    release = explanation.release_named(world, name)
+    release = release_causes.release_named(world, name)
     path = path_of(release) if release else repo.release_path(name, str(snapshot.commit))
     if path is None:  # a release that an override denies may never have run
-        stopped = explanation.denied_release_named(world, name)
+        stopped = release_causes.denied_release_named(world, name)
         path = path_of(stopped[0]) if stopped else None
     if path is not None:
         matches.append(_Match("release", name, path, release))
@@ -137,7 +137,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> _Match:
     if key is not None:
         return _Match("claim", key.demand, path, subject=key.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    release = explanation.release_named(snapshot.state, name)
+    release = release_causes.release_named(snapshot.state, name)
     if release is not None and path_of(release) == path:
         return _Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
@@ -152,8 +152,8 @@ def _denied(snapshot: Snapshot, match: _Match) -> dict[str, Any]:
     if match.kind != "release":
         return {}
     name = match.path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    stopped = explanation.denied_release_named(snapshot.state, name)
-    return why_answer.denied(*stopped) if stopped else {}
+    stopped = release_causes.denied_release_named(snapshot.state, name)
+    return why_output.denied(*stopped) if stopped else {}
 
 
 def _is_claimed(snapshot: Snapshot, match: _Match) -> bool:

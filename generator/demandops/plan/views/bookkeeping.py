@@ -13,7 +13,7 @@ from demandops.ledger.world import World
 from demandops.plan.connection_clients import connection_topics
 from demandops.plan.overrides.suspended_claims import suspended_claims, without_suspended
 from demandops.plan.release import ServiceRelease
-from demandops.plan.views import explanation
+from demandops.plan.views import release_causes
 from demandops.subject import SubjectKind
 
 
@@ -67,7 +67,7 @@ class Bookkeeping:
 def bookkeeping(world: World) -> Bookkeeping:
     """Return the requesters of each service and connection."""
     services = {}
-    for release in explanation.releases(world):
+    for release in release_causes.releases(world):
         if isinstance(release, ServiceRelease):
             services[release.name] = ServiceEntry(
                 applications=release.applications,

@@ -19,7 +19,7 @@ from demandops.demand.claim import Claim
 from demandops.ledger.world import World
 from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
 from demandops.plan.release import Release
-from demandops.plan.views import explanation
+from demandops.plan.views import release_causes
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
@@ -31,7 +31,7 @@ _MOST_CARRIED_OUT = 5
 def release(snapshot: Snapshot, running: Release) -> dict[str, Any]:
     """Return why a release runs."""
     world = snapshot.state
-    claims = explanation.claims_behind(without_suspended(world).ledger, running)
+    claims = release_causes.claims_behind(without_suspended(world).ledger, running)
     return {
         "runs": True,
         **place_data(running),
@@ -39,7 +39,7 @@ def release(snapshot: Snapshot, running: Release) -> dict[str, Any]:
         "claims": [_claim(claim, world) for claim in claims],
         "shaped_by": [
             {"file": each.file, "entry": each.entry or None, "what": each.what}
-            for each in explanation.shaping_files(running, world.config)
+            for each in release_causes.shaping_files(running, world.config)
         ],
         "overrides": [override_data(*each) for each in running.shaping.by],
     }
@@ -64,7 +64,7 @@ def subject(snapshot: Snapshot, claimed: Subject) -> dict[str, Any]:
         "subject": subject_data(claimed),
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
         "claims": [_claim(claim, world) for claim in claims],
-        "releases": [release_data(each) for each in explanation.releases(world, claimed)],
+        "releases": [release_data(each) for each in release_causes.releases(world, claimed)],
     }
 
 
@@ -81,9 +81,9 @@ def commits(repo: Reader, path: str, commit: str, most: int) -> dict[str, Any]:
 
 def _claim(claim: Claim, world: World) -> dict[str, Any]:
     suspended = suspended_by(claim, world)
-    kept = explanation.keeping_override(claim, world.config)
+    kept = release_causes.keeping_override(claim, world.config)
     return claim_data(claim) | {
-        "release_by": explanation.how_to_release(claim),
+        "release_by": release_causes.how_to_release(claim),
         "kept_by": override_data(kept, ("keep",)) if kept else None,
         "suspended_by": override_data(suspended, ("deny",)) if suspended else None,
     }
