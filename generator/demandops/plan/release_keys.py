@@ -38,7 +38,7 @@ def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator
 def keys_of_claims(
     world: World, claims: Iterable[Claim], *, strict: bool = False
 ) -> Iterator[ReleaseKey]:
-    """Yield the keys of the releases that these claims of ``ledger`` need, each once."""
+    """Yield the keys of the releases that these claims need in ``world``, each once."""
     keys = (
         key
         for claim in claims
