@@ -56,7 +56,7 @@ _OUTCOMES: dict[str, Outcome] = {
     "renew": "booked",
     "rollback": "restored",
 }
-"""By operation; the others release."""
+"""Operation → verb; all other operations release."""
 
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 """Yields a fault if a request comes too soon after others of its requesters."""

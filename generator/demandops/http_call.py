@@ -1,8 +1,8 @@
 """HTTP calls to other services: the only module that imports httpx.
 
-The system's certificates are trusted, or those of ``SSL_CERT_FILE``, and the usual variables name a
-proxy. No redirect is followed, because credentials must not reach another host. An answer may not
-be too long or take too long. No error contains the URL or a header, which may hold secrets.
+A call trusts the certificates of ``SSL_CERT_FILE``, else the system's; the usual variables name a
+proxy. It follows no redirect, because credentials must not reach another host. The answer's length
+and duration are limited. No error contains the URL or a header, because they may hold secrets.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def _too_slow(timeout: float) -> str:
 
 
 def _cause(error: httpx.TransportError) -> str:
-    """Return why there is no answer; the text holds nothing that was sent."""
+    """Return why there is no answer, without any part of the request."""
     if type(error).__name__ in ("LocalProtocolError", "UnsupportedProtocol"):
         return "the URL or a header is not valid; check them"
     text = str(error) or type(error).__name__

@@ -1,9 +1,9 @@
 """Time, chance and threads: the only module that asks the machine for them.
 
-The service and the cluster's watchers are handed a :class:`Runtime`, so that another one can run
-them: with a clock that it moves, numbers from a seed, and threads that take turns. What holds a
-state repo takes that of the repository. What belongs to this machine in any case uses
-:data:`REAL`: commands, git's processes and locks, HTTP, ROS's executors.
+The service and the cluster's watchers take a :class:`Runtime`. A test can pass its own, with a
+clock that it moves, numbers from a seed, and threads that take turns. An object with a state repo
+uses the repo's runtime. Commands, git's processes and locks, HTTP and ROS's executors always use
+:data:`REAL`.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ Thread = threading.Thread
 
 
 class Runtime:
-    """The runtime of this machine; another one overrides what it replaces."""
+    """The runtime of this machine; a subclass overrides the methods that it replaces."""
 
     def now(self) -> datetime:
-        """Return the time in UTC, by a clock that a person may set."""
+        """Return the time in UTC; a person may set this clock."""
         return datetime.now(timezone.utc)
 
     def monotonic(self) -> float:
-        """Return the seconds of a clock that nobody sets; only differences have a meaning."""
+        """Return the seconds of a clock that nobody can set; only differences have a meaning."""
         return time.monotonic()
 
     def sleep(self, seconds: float) -> None:
@@ -34,11 +34,11 @@ class Runtime:
         time.sleep(seconds)
 
     def uniform(self, low: float, high: float) -> float:
-        """Return a random number between two others; not for security."""
+        """Return a random number in a range; not for security."""
         return random.uniform(low, high)  # noqa: S311 - see above
 
     def fresh_id(self) -> str:
-        """Return an id that nobody else has."""
+        """Return a unique id."""
         return str(uuid.uuid4())
 
     def lock(self) -> threading.Lock:
@@ -50,7 +50,7 @@ class Runtime:
         return threading.Event()
 
     def condition(self) -> threading.Condition:
-        """Return a lock whose holders may wait for a change. A wait may end without one."""
+        """Return a lock whose holders may wait for a change; a wait may end without a change."""
         return threading.Condition()
 
     def start_thread(self, name: str, target: Callable[[], object]) -> Thread:

@@ -79,7 +79,7 @@ def time_data(moment: datetime | None) -> str | None:
 
 
 def time_text(time: str) -> str:
-    """Return a time of the JSON for people, in seconds."""
+    """Return a time of the JSON as text for people, without fractions of a second."""
     return f"{time[:19].rstrip('Z').replace('T', ' ')} UTC"
 
 
@@ -103,7 +103,7 @@ def claim_data(claim: Claim) -> Json:
 
 
 def place_data(release: Release) -> Json:
-    """Return what a release is and where it runs: a release without its name and file."""
+    """Return the data of a release without its name and file."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,
@@ -135,7 +135,7 @@ def entry_change_data(entry: EntryChange) -> Json:
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
-    """Return an override with some of its effects; by default all."""
+    """Return an override with the given effects; by default all."""
     names = override.effects() if effects is None else effects
     return {
         "name": override.name,
@@ -156,7 +156,7 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
 
 
 def commit_data(entry: LogEntry) -> Json:
-    """Return a commit, with what its message and trailers say."""
+    """Return a commit with the data from its message and trailers."""
     return {
         "commit": entry.commit,
         "time": time_data(entry.time),

@@ -78,7 +78,7 @@ class ObjectCache:
         return ""
 
     def read_once(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read these objects once, without a watch; sets ``read_error`` if that fails."""
+        """Read these objects once, without a watch; set ``read_error`` if that fails."""
         selectors = list(wanted)
         for selector in selectors:
             try:

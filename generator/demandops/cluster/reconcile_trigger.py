@@ -25,7 +25,7 @@ log = logging.getLogger("demandops")
 _TIMEOUT_S = 5.0
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
-"""With two fetches within a second, source-controller was seen to make a broken artifact."""
+"""Seconds between fetches: two within a second can make source-controller break an artifact."""
 _REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
 _REFRESH = "argocd.argoproj.io/refresh"
 

@@ -56,7 +56,7 @@ def without(problem_of: Callable[[str], str]) -> AfterValidator:
 
 
 def readable_by(parse: Callable[[str], object]) -> AfterValidator:
-    """Return a validator that rejects text that ``parse`` cannot read, and keeps the others."""
+    """Return a validator that rejects text that ``parse`` cannot read, and keeps other text."""
 
     def check(value: str) -> str:
         parse(value)

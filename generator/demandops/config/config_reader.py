@@ -45,7 +45,7 @@ class ConfigReader:
     def read_list(
         self, file: str, whole: type[BaseModel], field: str, item: type[Model], key: str
     ) -> dict[str, Model]:
-        """Return the valid items of a file that lists items, by name; add the others' faults."""
+        """Return the valid items of a file's list, by name; add the faults of invalid ones."""
         items: dict[str, Model] = {}
         positions: dict[str, str] = {}
         raw = self._collection(file, whole, field, list)
@@ -70,7 +70,7 @@ class ConfigReader:
     def read_mapping(
         self, file: str, whole: type[BaseModel], field: str, item: type[Model]
     ) -> dict[str, Model]:
-        """Return the valid items of a file that maps names to items; add the others' faults."""
+        """Return the valid items of a file's map, by name; add the faults of invalid ones."""
         items: dict[str, Model] = {}
         raw = self._collection(file, whole, field, dict)
         for name, entry in (raw or {}).items():
@@ -95,11 +95,11 @@ class ConfigReader:
         return self._positions[file][name]
 
     def is_missing(self, file: str, name: str) -> bool:
-        """Return whether a file surely has no such item; False if an invalid item could be it."""
+        """Return whether a file lacks an item; False if an invalid item may be the one."""
         return file not in self._incomplete and name not in self._positions[file]
 
     def check_reference(self, file: str, field: str, name: str, known_in: str) -> None:
-        """Add a fault if the file ``known_in`` surely has no item of the name in ``field``."""
+        """Add a fault if :meth:`is_missing` holds for ``name`` in the file ``known_in``."""
         if self.is_missing(known_in, name):
             where = known_in.removeprefix("inventory/")
             known = suggestion(name, self._positions[known_in])

@@ -206,7 +206,7 @@ class OverrideFile(FileModel):
 
     @property
     def end(self) -> datetime | None:
-        """The time from which it no longer applies."""
+        """The time at which the override ends."""
         return parse_time(self.expires) if self.expires else None
 
 

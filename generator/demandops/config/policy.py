@@ -100,7 +100,7 @@ class LeasePolicy(CamelModel):
             if value is not None and seconds_of(value) < 1:
                 raise ValueError(f"{name} is zero; leave it out for no limit")
         if self.deployment_requests and self.default is None:
-            raise ValueError("deploymentRequests needs a default: such a demand names no lease")
+            raise ValueError("deploymentRequests needs a default lease; add default")
         if self.default and self.longest and seconds_of(self.default) > seconds_of(self.longest):
             raise ValueError(f"default {self.default} is above longest {self.longest}")
         return self

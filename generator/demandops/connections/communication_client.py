@@ -62,7 +62,7 @@ class Client(ABC):
 
     @abstractmethod
     def facts(self) -> list[str]:
-        """Return one line for each fact about it; commit messages show the changed lines."""
+        """Return the client's properties as lines; commit messages show the changed ones."""
 
     @abstractmethod
     def configuration(self) -> dict[str, Any]:
@@ -77,7 +77,7 @@ class Client(ABC):
         return configuration
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Return (file, entry, what it decides) for entries of the configuration that shape it."""
+        """Return (file, entry, effect) for each configuration entry that shapes the client."""
         return ()
 
 

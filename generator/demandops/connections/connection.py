@@ -33,7 +33,7 @@ class Connection:
 
     @property
     def subject(self) -> Subject:
-        """Which connection it is."""
+        """The subject of a claim on this connection."""
         return Subject(SubjectKind.CONNECTION, self.id)
 
     @property
@@ -48,26 +48,26 @@ class Connection:
 
     @property
     def known_type(self) -> ConnectionType:
-        """Its type; the caller knows that it is chosen."""
+        """Its type; only for a connection whose type is chosen."""
         assert self.type is not None, self.id  # noqa: S101
         return self.type
 
     def route(self, source: str) -> Route | None:
-        """Return the route of a source topic that a claim has, or ``None``."""
+        """Return the route of a source topic, or ``None``; only for a claimed connection."""
         place = bisect_left(self.topics, source, key=attrgetter("source"))
         found = self.topics[place : place + 1]
         return found[0] if found and found[0].source == source else None
 
     def needs(self, node: str) -> bool:
-        """Return whether it depends on a node."""
+        """Return whether the connection depends on a node."""
         return node in (self.source, self.target, self.broker)
 
     def booked(self) -> Connection:
-        """Return it as a claim holds it."""
+        """Return the connection as a claim holds it."""
         return replace(self, topics=merged_routes(self.topics))
 
     def extended(self, more: Connection) -> Connection:
-        """Return ``more`` with the topics and the broker that this one has as well."""
+        """Return ``more`` with this connection's topics and broker added."""
         topics, broker = (*self.topics, *more.topics), more.broker or self.broker
         return replace(more, topics=topics, broker=broker)
 
@@ -94,7 +94,7 @@ class Connection:
         return remaining, [f"topic {topic}" for topic in missing]
 
     def without_node(self, node: str) -> Connection | None:
-        """Return it without a node; ``None`` if an end is lost. Another broker may replace one."""
+        """Return the connection without a node: ``None`` for an end; a broker is chosen again."""
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:

@@ -1,7 +1,7 @@
 """The interface of a connection type: how clients carry a connection.
 
-A type is one module with one subclass of :class:`ConnectionType`, and with its clients. It says
-what it supports and needs, which clients a connection has, and what each of them is.
+Each type has one module with a subclass of :class:`ConnectionType` and its clients. The subclass
+defines what the type supports and needs, and plans the clients of each connection.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from demandops.connections.route import Route
 from demandops.errors import Fault, Refused, fault
 
 UNSUPPORTED = "unsupported-connection-type"
-"""The code of a fault: inventory or registry lack what a type needs."""
+"""The code of a fault: a type needs an entry that inventory or registry lack."""
 
 AnyEnd = TypeVar("AnyEnd", bound=End)
 
@@ -39,10 +39,10 @@ class Connections(Protocol):
 
 
 class ConnectionType(ABC):
-    """How clients carry a connection. There is one value of each subclass."""
+    """How clients carry a connection. Each subclass has one instance."""
 
     name: ClassVar[str]
-    """Its name in capitals. In files, and in names of templates and clients, it is ``word``."""
+    """Its name in messages; files, templates and clients use ``word`` instead."""
     number: ClassVar[int]
     """Its number in ``DeploymentRequest``."""
     image: ClassVar[str]

@@ -52,7 +52,7 @@ class Mqtt(ConnectionType):
             yield fault("images", message).within(IMAGES_FILE)
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield a fault if there is no broker; unless one is named, the ends decide which it is."""
+        """Yield a fault if the connection has no broker (:func:`choose_broker`)."""
         if (
             not connection.broker
             and not {connection.source, connection.target} <= config.nodes.keys()

@@ -39,7 +39,7 @@ class Ros(ConnectionType):
     options = frozenset({"reliability", "durability", "queue", "rate"})
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield that no end can be reached."""
+        """Yield a fault if neither end has a reachable address."""
         known = {connection.source, connection.target} <= config.nodes.keys()
         if known and _listener(connection, config) is None:
             yield fault(
@@ -52,7 +52,7 @@ class Ros(ConnectionType):
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield that a message type is unknown, or that a QoS policy is missing."""
+        """Yield a fault if the message type is unknown, and one if a QoS policy is missing."""
         if sender in config.nodes and not message_type(route, sender, config):
             yield fault(
                 f"{where}.type",
@@ -179,7 +179,7 @@ class RosEnd(End):
         }
 
     def needs_restart(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """Return all except the list of topics."""
+        """Return the configuration without the list of topics."""
         return {name: value for name, value in configuration.items() if name != "allowlist"}
 
 
@@ -190,12 +190,12 @@ def dds_type(ros_type: str) -> str:
 
 
 def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
-    """Return the routes that let only one participant send to the other."""
+    """Return the router's routes from ``sender`` to ``receiver`` only."""
     return [{"src": sender, "dst": [receiver]}, {"src": receiver}]
 
 
 def _qos(route: Route, *, reads: bool) -> dict[str, Any]:
-    """Return a topic's settings; the end that reads the topic limits its rate, before the link."""
+    """Return a topic's settings; the sending end limits the rate, before the link."""
     qos: dict[str, Any] = {}
     if route.reliability:
         qos["reliability"] = route.reliability == "reliable"

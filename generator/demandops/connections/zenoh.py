@@ -37,7 +37,7 @@ class Zenoh(ConnectionType):
     options = frozenset({"rate"})
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield every second bridge on one host."""
+        """Yield a fault for each further bridge on a host that has one."""
         hosts: dict[tuple[object, ...], str] = {}
         for node in config.nodes.values():
             host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
@@ -53,7 +53,7 @@ class Zenoh(ConnectionType):
         return any(node.zenoh for node in config.nodes.values())
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield that a node has no bridge, or that neither bridge can reach the other."""
+        """Yield a fault if a node has no bridge, or if neither bridge can reach the other."""
         source, target = config.nodes.get(connection.source), config.nodes.get(connection.target)
         if source is None or target is None:
             return
@@ -151,8 +151,8 @@ def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
 class Bridge(Client):
     """The desired state of a node's Zenoh bridge.
 
-    ``publishers`` are the topics that it reads from the node's ROS graph, ``subscribers`` those
-    that it publishes there. ``rates`` limits the messages per second of a topic that it reads.
+    The bridge reads ``publishers`` from the node's ROS graph and publishes ``subscribers``
+    there. ``rates`` limits the messages per second of a topic that it reads.
     """
 
     publishers: tuple[str, ...]

@@ -45,7 +45,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def subject(self) -> Subject:
-        """Which application it is."""
+        """The subject of a claim on this application."""
         return Subject(SubjectKind.APPLICATION, self.id)
 
     @property
@@ -72,25 +72,25 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def needs(self, node: str) -> bool:
-        """Return whether it depends on a node."""
+        """Return whether the application depends on a node."""
         return self.node == node or any(topic.source == node for _, topic in self.all_inputs())
 
     def needed_nodes(self) -> set[str]:
-        """Return the nodes that it depends on."""
+        """Return the nodes that the application depends on."""
         return {self.node, *(topic.source for _, topic in self.all_inputs())}
 
     def booked(self) -> Application:
-        """Return it as a claim holds it: sorted, each input once."""
+        """Return the application as a claim holds it: inputs sorted, each once."""
         inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items()) if topics}
         return self.with_inputs(inputs)
 
     def with_inputs(self, inputs: Mapping[str, tuple[InputTopic, ...]]) -> Application:
-        """Return it with other inputs; roles without a topic are left out."""
+        """Return the application with other inputs, without roles that have no topic."""
         kept = {role: topics for role, topics in inputs.items() if topics}
         return replace(self, inputs=MappingProxyType(kept))
 
     def extended(self, more: Application) -> Application:
-        """Return ``more`` with the inputs and parameters that this one has as well."""
+        """Return ``more`` with this application's inputs and parameters added."""
         roles = {*self.inputs, *more.inputs}
         inputs = {role: (*self.inputs.get(role, ()), *more.inputs.get(role, ())) for role in roles}
         parameters = MappingProxyType({**self.parameters, **more.parameters})
@@ -127,7 +127,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return (self.with_inputs(left) if any(left.values()) else None), missing
 
     def without_node(self, node: str) -> Application | None:
-        """Return it without a node and the node's inputs; ``None`` if nothing is left."""
+        """Return the application without a node's inputs; ``None`` if it has no others."""
         if self.node == node:
             return None
         left = {
@@ -149,7 +149,7 @@ def _exact(values: Mapping[str, object]) -> str:
 
 
 def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
-    """Merge topics by (topic, source); a later type fills in one that is missing."""
+    """Merge topics by (topic, source); a later type replaces a missing one."""
     types: dict[tuple[str, str], str] = {}
     for topic in topics:
         key = (topic.topic, topic.source)

@@ -38,19 +38,19 @@ class Claim:
 
     @property
     def application(self) -> Application:
-        """The held application; the caller knows that it is one."""
+        """The held application; only for a claim on an application."""
         assert isinstance(self.held, Application), self.subject  # noqa: S101
         return self.held
 
     @property
     def connection(self) -> Connection:
-        """The held connection; the caller knows that it is one."""
+        """The held connection; only for a claim on a connection."""
         assert isinstance(self.held, Connection), self.subject  # noqa: S101
         return self.held
 
     @property
     def subject(self) -> Subject:
-        """Which application or connection it is on."""
+        """The subject that it holds."""
         return self.held.subject
 
     @property

@@ -27,7 +27,7 @@ class Place:
     field: str
 
     def at(self, path: str) -> str:
-        """Return the goal's field for a field below it (``inputs.ego_data[2].source``)."""
+        """Return the goal's name for a field of the item (``inputs.ego_data[2].source``)."""
         return f"{self.field}.{path}"
 
 
@@ -43,13 +43,13 @@ class Demanded:
     """How to carry an application's inputs from other nodes: a type's word, ``auto``, ``none``."""
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
-        """Return a fault of a field below it."""
+        """Return a fault of a field of this item."""
         return fault(self.place.at(path), message, code=code)
 
 
 @dataclass(frozen=True, slots=True)
 class DemandRequest:
-    """A whole request, which is booked or refused as a whole.
+    """A request; it is booked or refused as a whole.
 
     ``demand`` is the demand's id. The reference's requests carry none; there
     :func:`demandops.demand.claim.demand_id` makes one for each subject. ``own_requesters`` are the
@@ -74,7 +74,7 @@ class DemandRequest:
         return tuple(dict.fromkeys((*self.own_requesters, *listed)))
 
     def subjects(self) -> tuple[Subject, ...]:
-        """Return the applications and connections that it lists, each once."""
+        """Return the subjects of the listed applications and connections, each once."""
         return tuple(dict.fromkeys(one.held.subject for one in self.demanded))
 
 
@@ -143,7 +143,7 @@ class Decommission(DemandRequest):
 
 
 def faults(request: DemandRequest) -> Iterator[Fault]:
-    """Yield every fault of a request that needs neither configuration nor ledger."""
+    """Yield the faults of a request that show without configuration and ledger."""
     if request.id and request.id != request.demand:  # without an id, it is the demand's
         yield from _id("id" if request.is_reference else "request", request.id)
     if not request.is_reference:

@@ -70,7 +70,7 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
             rules = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
             message = (
                 f"no rule of access domain '{domain.name}' is for '{requester}', only {rules}; "
-                "have policy/ changed"
+                "ask for a change of policy/"
             )
         else:
             reasons = "; ".join(
@@ -78,7 +78,7 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
                 f"{kind} {' '.join(getattr(rule, kind))}, not '{value}'"
                 for rule, (kind, value) in zip(own, filter(None, misses), strict=True)
             )
-            message = f"{reasons}; request what is allowed, or have policy/ changed"
+            message = f"{reasons}; request what is allowed, or ask for a change of policy/"
         yield one.fault(f"requesters[{index}]", message, code="not-allowed")
 
 

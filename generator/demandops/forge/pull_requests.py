@@ -121,7 +121,7 @@ def _json(body: bytes) -> tuple[Any, bool]:
 
 
 def _reason(answer: Mapping[str, Any]) -> str:
-    """Return a forge's reason for a refusal: its ``message``, and those of ``errors``."""
+    """Return a forge's reason for a refusal: its ``message`` and the messages in ``errors``."""
     details = answer.get("errors")
     texts = [answer.get("message"), *(details if isinstance(details, list) else ())]
     texts = [text.get("message") if isinstance(text, dict) else text for text in texts]

@@ -52,7 +52,7 @@ class ClaimChange:
 
     @property
     def key(self) -> ClaimKey:
-        """Which claim it is."""
+        """The key of the changed claim."""
         claim = self.after or self.before
         assert claim is not None  # noqa: S101 - a change has at least one side
         return claim.key

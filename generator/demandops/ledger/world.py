@@ -21,6 +21,6 @@ class World:
     overrides: tuple[Override, ...] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Find the overrides that apply."""
+        """Set the overrides that apply."""
         active = by_rank(still_active(self.config.overrides, self.ledger.ended))
         object.__setattr__(self, "overrides", active)

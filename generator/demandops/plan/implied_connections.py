@@ -23,7 +23,7 @@ from demandops.plan.release import ServiceKey
 
 
 class _InputPlace(Place):
-    """The input that needs a connection: faults of the connection are faults of the input."""
+    """The input that needs a connection; faults of the connection name its field."""
 
     def at(self, path: str) -> str:
         """Return the input's field, also for a fault of the connection; requesters keep theirs."""
@@ -124,7 +124,7 @@ def foreign_inputs(app: Application, config: Config) -> list[ForeignInput]:
 
 
 def _connection(app: Application, type: str, topic: InputTopic, ledger: Ledger) -> Connection:
-    """Return the connection that brings a topic to an application, with this topic alone."""
+    """Return the connection that brings a topic to an application, with only this topic."""
     ends, name = (topic.source, app.node), topic.topic
     for id in ledger.connections_bringing(app.node, name):
         for claim in ledger.connection_claims(id):

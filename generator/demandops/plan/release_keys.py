@@ -81,9 +81,9 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
 
 
 def _role(world: World, application: str, key: ServiceKey) -> str | None:
-    """Return the role whose inputs have one instance each of an application's service.
+    """Return the role that gives a service one instance for each of its inputs.
 
-    The text is empty if there is one instance for the application. ``None`` means that ``key`` is
+    The role is empty if the application has one instance. ``None`` means that ``key`` is
     not a service of the application, for example because it moved or changed its definition.
     """
     first = world.ledger.application(application)
@@ -119,7 +119,7 @@ def affected_keys(
 
 
 def _differing(change: ClaimChange) -> tuple[Claim | None, Claim | None]:
-    """Return a changed claim before and after; if only inputs differ, with these inputs alone."""
+    """Return a claim before and after a change; if only inputs differ, with only these inputs."""
     before, after = change.before, change.after
     if before is None or after is None or not before.is_on_application:
         return before, after
@@ -142,7 +142,7 @@ def _with_inputs_not_in(app: Application, other: Application) -> Application:
 
 
 def _decided_alike(before: Ledger, after: Ledger, subject: Subject) -> bool:
-    """Return whether an application runs at the same place and is the same in both ledgers."""
+    """Return whether an application has the same node and definition in both ledgers."""
     if subject.kind is not SubjectKind.APPLICATION:
         return True
     one, other = before.application(subject.id), after.application(subject.id)

@@ -10,8 +10,8 @@
 | done | is answered | |
 
 A method writes to the journal, then changes the state, then wakes the worker, all under one lock.
-So a demand is withdrawn before it is committed or not at all. Any thread may let a demand arrive or
-withdraw it; the other changes belong to the worker's thread.
+So a committed demand can no longer be withdrawn. Any thread may submit or withdraw a demand. Only
+the worker's thread makes the other changes.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _NEXT: dict[State, tuple[State, ...]] = {
 class Demands:
     """The demands without an answer, and the journal.
 
-    ``blocked`` is why no demand can be published now, or empty; it is part of the error when too
-    many wait.
+    ``blocked`` is why no demand can be published now, or empty; a :class:`QueueFull` contains
+    it.
     """
 
     def __init__(self, journal: Journal, limit: int, runtime: Runtime) -> None:
@@ -81,12 +81,12 @@ class Demands:
 
     @property
     def has_waiting(self) -> bool:
-        """Whether a demand waits to be taken."""
+        """Whether a demand waits for the worker."""
         return bool(self._arrived or self._waiting)
 
     @property
     def must_not_wait(self) -> bool:
-        """Whether there is something to do that must not wait for a fetch."""
+        """Whether the worker has work that must not wait for a fetch."""
         return self.has_waiting or self._closed
 
     # ---- waiting for demands ----
@@ -98,7 +98,7 @@ class Demands:
             self._changed.notify()
 
     def wake(self) -> None:
-        """End a wait although no demand came; from any thread."""
+        """End the worker's wait without a demand; from any thread."""
         with self._changed:
             self._woken = True
             self._changed.notify()
@@ -124,7 +124,7 @@ class Demands:
             return self._journal_arrived()
 
     def take(self, batch: list[Ticket], limit: int) -> None:
-        """Journal all that arrived, and move demands into ``batch``, up to ``limit`` in all."""
+        """Journal all arrived demands, and fill ``batch`` with up to ``limit`` demands."""
         with self._changed:
             self._journal_arrived()
             room = min(limit - len(batch), len(self._waiting))
@@ -152,7 +152,7 @@ class Demands:
             self._changed.notify()
 
     def _journal_arrived(self) -> list[Ticket]:
-        """Journal what arrived; if that fails, answer it with the error."""
+        """Journal the arrived demands; if that fails, answer them with the error."""
         arrived, self._arrived = self._arrived, []
         new = [
             ticket
@@ -171,7 +171,7 @@ class Demands:
         return new
 
     def commit(self, ticket: Ticket) -> bool:
-        """Refuse further withdrawals of a demand; return False if it was withdrawn before."""
+        """Refuse further withdrawals of a demand; return False if it is already withdrawn."""
         with self._changed:
             return _change(ticket, "committed")
 
@@ -188,7 +188,7 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Let demands wait again that no longer need approval."""
+        """Return demands that no longer need approval to the state waiting."""
         with self._changed:
             for ticket in tickets:
                 self._journal.append([ticket.journal_entry()])
@@ -198,7 +198,7 @@ class Demands:
             self._changed.notify()
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand; return False if it is too late or impossible."""
+        """Withdraw a demand; return False if that is not possible any longer."""
         with self._changed:
             ticket = self._tickets.get(operation)
             if ticket is None or not _may_become(ticket, "withdrawn"):
@@ -211,7 +211,7 @@ class Demands:
         return True
 
     def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
-        """Withdraw demands that await approval; a restart knows it as well."""
+        """Withdraw demands that await approval, and journal the withdrawal."""
         with self._changed:
             for ticket in tickets:
                 if ticket.state == "proposed":
@@ -232,7 +232,7 @@ class Demands:
     def answer_withdrawn(self, batch: list[Ticket]) -> None:
         """Answer the demands that were withdrawn before a commit, and remove them from a batch.
 
-        A withdrawn proposal is answered later: its branch is deleted first.
+        The demands of a proposal are answered after its branch is deleted.
         """
         with self._changed:
             withdrawn, self._taken_back = self._taken_back, []
@@ -273,7 +273,7 @@ def _may_become(ticket: Ticket, state: State) -> bool:
 
 
 def _change(ticket: Ticket, state: State) -> bool:
-    """Change a demand's state; return False, and leave it, if that one may not follow."""
+    """Change a demand's state; return False if the new state may not follow the current one."""
     if _may_become(ticket, state):
         ticket.state = state
     return ticket.state == state

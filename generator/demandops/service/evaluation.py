@@ -50,7 +50,7 @@ class Evaluator:
         """Decide a demand, commit it on the commit batch and return its result.
 
         Args:
-            published: what :meth:`published_before` returned for the batch.
+            published: the result of :meth:`published_before` for the batch.
 
         Returns:
             Its receipt or error; if it needs approval, the decision, which is not committed.
@@ -98,9 +98,9 @@ class Evaluator:
     def published_before(
         self, start: Snapshot, batch: list[Ticket]
     ) -> dict[str, commit_log.RecordedOutcome]:
-        """Return, by operation id, the demands that are published although nobody was answered.
+        """Return the demands that are published but not answered, by operation id.
 
-        The connection was cut, or the process was killed, after the remote accepted the push.
+        This happens if the connection or the process ends after the remote accepted the push.
         """
         bases = {ticket.base for ticket in batch if ticket.maybe_published}
         published: dict[str, commit_log.RecordedOutcome] = {}

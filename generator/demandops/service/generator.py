@@ -42,7 +42,7 @@ class Generator:
         progress: Progress = lambda done, total: None,
         runtime: Runtime = REAL,
     ) -> None:
-        """Open the state repo, start the worker and resume what is in the journal.
+        """Open the state repo, start the worker and resume the demands in the journal.
 
         Args:
             state_repo: a folder with a bare repository, or a URL that git clones.
@@ -54,7 +54,7 @@ class Generator:
                 that a repository on this disk is checked every minute.
             signing_key: an SSH key that signs the commits (:mod:`demandops.staterepo.git.signing`).
             progress: called with (files read, files in all) while the ledger is loaded.
-            runtime: tells the time and runs the threads.
+            runtime: provides the time and the threads.
 
         Raises:
             StateRepoError, InvalidInput: if the state repo or the key cannot be used.
@@ -172,7 +172,7 @@ class Generator:
         """Refuse further demands, finish the queued ones and stop; returns at once.
 
         Args:
-            timeout: seconds to wait for a remote that cannot be reached. What is left then stays
+            timeout: seconds to wait for a remote that cannot be reached. Unpublished demands stay
                 in the journal for the next start, and its futures raise ``ShuttingDown``.
 
         Returns:

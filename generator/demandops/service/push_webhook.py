@@ -1,6 +1,6 @@
 """The inbound webhook: a Git server reports a push, and the generator fetches at once.
 
-Notifications are untrusted: nothing of them is read except whether the sender knows the secret.
+Notifications are untrusted: only the signature is checked, and the content is not read.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ log = logging.getLogger("demandops")
 
 PATH = "/push"
 _MAX_BODY = 25 << 20
-"""GitHub sends no more than this; a body is hashed and not stored."""
+"""The most that GitHub sends; the body is hashed, not stored."""
 _WARN_EVERY_S = 60.0
 
 _SIGNATURES = ("X-Hub-Signature-256", "X-Gitea-Signature", "X-Forgejo-Signature")

@@ -1,7 +1,7 @@
 """A rollback as a goal: plain data that passes through queue and journal like a demand.
 
-Only the command line makes it: no action and no request file has this form. It is evaluated on the
-newest tip, so it works while others write; what they booked meanwhile counts as newer.
+Only the command line makes one; actions and request files cannot contain it. It is evaluated on the
+newest tip, so it works while others write. Claims booked meanwhile count as newer.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _KIND = "Rollback"
 
 
 def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dict[str, Any]:
-    """Return the goal to go back to a commit; ``who`` is the person's name and e-mail address."""
+    """Return the goal to roll back to a commit; ``who`` is the person's name and e-mail."""
     return {
         "apiVersion": API_VERSION,
         "kind": _KIND,

@@ -1,7 +1,7 @@
 """The HTTP server: routes of one application, served by uvicorn in a thread of its own.
 
-Anyone who reaches the address may connect. So the number of open connections is bounded, and each
-is cut off after some seconds, even if its sender is very slow.
+Anyone who reaches the address may connect. So the server limits the number of open connections, and
+cuts each off after some seconds, even if its sender is very slow.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ _STOP_TIMEOUT_S = 1
 
 
 class WebApp:
-    """A running server; it answers ``/`` with ok, for health checks, and its other routes."""
+    """A running server; it answers ``/`` with ok, for health checks, and serves its routes."""
 
     def __init__(self, address: str, routes: Sequence[BaseRoute], *, local_only: bool) -> None:
         """Start the server.
 
         Args:
             address: ``host:port``; port 0 picks a free port.
-            routes: what it answers beside ``/``.
-            local_only: whether only this machine may reach it, because nobody has to sign.
+            routes: its routes in addition to ``/``.
+            local_only: whether only this machine may reach it, because requests are not signed.
 
         Raises:
             InvalidInput: if it cannot or must not listen on the address.
@@ -69,7 +69,7 @@ class WebApp:
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection that is refused if there are too many, and cut off at the time limit."""
+    """A connection; the server refuses it if there are too many, and cuts it off in time."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)

@@ -1,7 +1,7 @@
 """The worker: follows the state repo, and publishes the demands as commits.
 
-Belongs to one thread, the only one that writes to the state repo. Demands go first: a fetch stops
-when one arrives, because its push shows what is new too.
+It runs in one thread, the only one that writes to the state repo. Demands go first: a fetch stops
+when a demand arrives, because the demand's push finds new commits too.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Worker:
     # ---- the loop ----
 
     def run(self) -> None:
-        """Work until no demand is accepted and none waits."""
+        """Work until demands are closed and none waits."""
         if self._demands.proposed:  # they may be decided already; stopping at once must not skip it
             self._work()
         while self._demands.wait(self._seconds_until_due()):
@@ -144,7 +144,7 @@ class Worker:
 
         Raises:
             ShuttingDown: after :meth:`stop_retrying`; the demands are still in the batch.
-            DemandOpsError: if the state repo cannot be used; likewise.
+            DemandOpsError: if the state repo cannot be used; the demands are still in the batch.
         """
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
@@ -208,7 +208,7 @@ class Worker:
     def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
         """Publish a commit batch; return False if another writer was first.
 
-        If the remote rejects the push for another reason, that is the answer of all its demands.
+        If the remote rejects the push for another reason, all demands get that error as the answer.
         """
         try:
             published = commits.publish()
@@ -248,7 +248,7 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        """Fetch if it is time to, carry out what others pushed, and end overrides.
+        """Fetch if a fetch is due, carry out the commits of others, and end overrides.
 
         A repository on this disk is read each time, because that is cheap.
         """
@@ -267,7 +267,7 @@ class Worker:
             self._override_expiry.postpone(self._runtime.now())
 
     def _check_proposals(self) -> None:
-        """Check the demands that await approval against the newest main, if it is time to."""
+        """Check the demands that await approval against the newest main, if a check is due."""
         if not self._approvals.is_due(str(self.snapshot.commit)):
             return
         try:
@@ -288,7 +288,7 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish what follows from people's changes up to the fetched tip; return if anything did.
+        """Publish the effects of people's changes up to the fetched tip; return if there were any.
 
         Does not fetch first.
         """
@@ -316,7 +316,7 @@ class Worker:
         return commits
 
     def _log_problems(self, problems: Iterable[Fault]) -> None:
-        """Log each fault once, and each file once that is valid again."""
+        """Log each fault once; log each file once when it is valid again."""
         current = list(dict.fromkeys(problems))
         for problem in current:
             if problem not in self._logged:

@@ -1,4 +1,4 @@
-"""The files of a new state repo: the skeleton, the appdefs and what they render."""
+"""The files of a new state repo: the skeleton, the appdefs and the rendered files."""
 
 from __future__ import annotations
 

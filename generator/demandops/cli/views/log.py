@@ -134,7 +134,7 @@ def _matching(
     until: datetime | None,
     **trailers: str | None,
 ) -> Iterable[LogEntry]:
-    """Return the commits that match all that is given; the trailers are those of ``_TRAILERS``."""
+    """Return the commits that match every given filter; ``_TRAILERS`` lists the trailers."""
     wanted = [(_TRAILERS[name], value) for name, value in trailers.items() if value is not None]
 
     def matches(entry: LogEntry) -> bool:

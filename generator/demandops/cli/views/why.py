@@ -87,10 +87,10 @@ def why(
 
 
 def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Match:
-    """Return what a name means.
+    """Return the object that a name identifies.
 
     Raises:
-        StateRepoError: it means nothing, or several things.
+        StateRepoError: the name fits no object, or several.
     """
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)

@@ -173,7 +173,7 @@ def _failure(app: Object) -> tuple[str, str]:
 
 
 def _sync_message(operation: Object) -> str:
-    """Return the message of a failed sync, with those of failed objects that it leaves out."""
+    """Return the message of a failed sync; add messages of failed objects that it omits."""
     message = str(operation.get("message", ""))
     failed = [
         item

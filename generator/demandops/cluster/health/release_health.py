@@ -21,7 +21,7 @@ class HealthReader(ABC):
     """Reads the health of releases from the objects of a GitOps controller."""
 
     service_kind: str
-    """The kind of the object that stands for a service."""
+    """The kind of the object that represents a service."""
 
     @abstractmethod
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:

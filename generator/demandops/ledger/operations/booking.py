@@ -27,7 +27,7 @@ def book(
         one: what to book.
         request: the id of the request.
         key: the key of the claim.
-        current: the demand's claim on it before the request.
+        current: the demand's claim on the same subject before the request.
         now: when the request was received; a claim that only renews keeps its booking time.
         extend: whether to keep what the current claim holds.
     """

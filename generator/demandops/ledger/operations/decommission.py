@@ -1,8 +1,8 @@
 """Decommissioning: a node or a requester leaves for good; its claims are released or reduced.
 
-For a node, its applications, the inputs from it and the connections that end at it are released,
-even if others requested them. For a requester, all its claims are released, as by a shutdown. That
-includes shared claims: if they stayed for the other requesters alone, nobody would release them.
+Decommissioning a node releases its applications, the inputs from it and the connections that end at
+it, whoever requested them. Decommissioning a requester releases all its claims, like a shutdown.
+This includes shared claims, because the other requesters alone would not release them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from demandops.subject import Subject, SubjectKind
 
 
 def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
-    """Release all that a node or a requester holds.
+    """Release all claims of a node or a requester.
 
     Raises:
         Refused: if it holds nothing.

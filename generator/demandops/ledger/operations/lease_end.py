@@ -1,4 +1,4 @@
-"""The end of a lease: its claims are released."""
+"""The end of a lease: the generator releases its claims."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The owners of a demand that has an id: the requesters of its claims.
 
-A request that names none of them is refused. So a demand id that two choose by chance does no harm.
+A request that names no owner is refused, so two requesters may choose the same id without harm.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""A restoration: the claims of an earlier commit are booked again.
+"""A restoration books the claims of an earlier commit again.
 
-Claims that were booked since are released only if the request says so. A lease that comes back runs
-for its full term from now on, because its old end may have passed. Claims that an
-override keeps belong to no demand: :mod:`demandops.plan.overrides.kept_claims` updates them then,
-as after every change.
+It releases newer claims only if the request says so. A restored lease runs for its full term from
+now on, because its old end may have passed. Claims that an override keeps belong to no demand;
+:mod:`demandops.plan.overrides.kept_claims` updates them after every change.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ _SHOWN = 20
 class Restoration(DemandRequest):
     """A request to restore the ledger of an earlier commit.
 
-    ``to`` is the commit, ``made`` its time and ``claims`` its ledger. ``by`` and ``email`` name who
-    asks for it.
+    ``to`` is the commit, ``made`` its time and ``claims`` its ledger. ``by`` and ``email`` name the
+    person who requests it.
     """
 
     to: str = ""
@@ -47,7 +46,7 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
     """Return the ledger with the claims of the earlier commit, and the changes.
 
     Raises:
-        Refused: if that drops or undoes newer claims, and ``drop_newer`` is not set.
+        Refused: if the restoration undoes newer claims and ``drop_newer`` is not set.
     """
     changes = _changes(ledger, request)
     if not request.drop_newer:
@@ -125,7 +124,7 @@ class _Claim(Place):
 
 
 def _request_for(claim: Claim) -> Put:
-    """Return the request that would book a claim today."""
+    """Return a request that books this claim."""
     return Put(
         id=claim.request,
         demanded=(Demanded(claim.held, claim.requesters, _Claim("")),),

@@ -1,4 +1,4 @@
-"""A shutdown: which claims it matches, and what remains of them."""
+"""A shutdown releases the claims that it matches, or parts of them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from demandops.ledger.ledger import Changes, Ledger, claim_changes
 
 
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Release what a shutdown lists.
+    """Release the applications, connections and topics that a shutdown lists.
 
     Raises:
-        Refused: if none of it is held.
+        Refused: if the requesters hold none of them.
     """
     start = ledger
     keys: list[ClaimKey] = []

@@ -65,7 +65,7 @@ def _denied_field(override: Override, one: Demanded, services: list[Traits], con
 
 
 def _matched_field(selector: Selector, one: Demanded, config: Config) -> str:
-    """Return the field that a selector matches; of several, the most specific one."""
+    """Return the most specific field that a selector matches."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:

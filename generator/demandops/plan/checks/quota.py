@@ -65,7 +65,7 @@ def _exceeded(domain: AccessDomain, quota: str, most: int, usage: str) -> Fault:
     return fault(
         "",
         f"{usage}, and quotas.{quota} of access domain '{domain.name}' allows {most}; release "
-        "something first, or have policy/ changed",
+        "something first, or ask for a change of policy/",
         code="quota",
     )
 

@@ -1,6 +1,6 @@
 """Trial demands: the releases of every appdef, and of every override that applies to it.
 
-They show mistakes in a configuration before a real demand arrives. Returns releases; renders none.
+They show mistakes in a configuration before a real demand arrives. Nothing is rendered here.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _services(appdef: ApplicationDefinition, node: str, config: Config) -> Itera
 def overridden_releases(
     override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
-    """Yield those trial releases of an appdef that an override may select, with its effects."""
+    """Yield the trial releases of an appdef that an override may select, with its effects."""
     for release in trials:
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
         if effects and any(

@@ -1,4 +1,4 @@
-"""``keep``: the override has a claim of its own, so a subject runs without a demand.
+"""``keep``: an override holds its own claim, so a subject runs without a demand.
 
 When the last claim on a subject is released, a claim with the same content is booked for the
 override's owner. It is removed when a demand asks for the subject again. Because it is a claim,
@@ -30,7 +30,7 @@ def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
 def with_kept_claims(
     before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, Changes]:
-    """Return a booking with the kept claims updated on everything that it touched."""
+    """Return a booking with the kept claims updated on the subjects that it changed."""
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
     ledger, more = update_kept_claims(before, after, touched, now)

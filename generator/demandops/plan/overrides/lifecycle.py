@@ -42,7 +42,7 @@ def update_ledger(
 
     Args:
         before, after: the world before and after the change.
-        subjects: those whose claims a person changed.
+        subjects: the subjects whose claims a person changed.
         markers: the current markers, path → text.
         now: new overrides that end by then do not apply.
     """

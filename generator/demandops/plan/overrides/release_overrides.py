@@ -1,6 +1,6 @@
 """The effects of overrides on a planned release: version, node, replicas, images, or denial.
 
-The rendering patches values, because a template makes them.
+Patches of Helm values are applied later, because a template makes the values.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class SuspendedEntry:
 class Bookkeeping:
     """The whole view: services by release name, connections by id, both sorted.
 
-    ``suspended`` are the claims that an override suspends; they are in neither.
+    ``suspended`` are the claims that an override suspends; they are in neither list.
     """
 
     services: dict[str, ServiceEntry]

@@ -24,7 +24,7 @@ from demandops.subject import Subject
 
 @dataclass(frozen=True, slots=True)
 class ShapingFile:
-    """A file that people write, its entry that shapes a release, and what the entry decides."""
+    """A configuration file, its entry that shapes a release, and what the entry decides."""
 
     file: str
     entry: str
@@ -71,7 +71,7 @@ def how_to_release(claim: Claim) -> str:
 
 
 def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
-    """Return people's files that decide what a release is and where it runs."""
+    """Return the entries of the configuration that shape a release."""
     images = [image for image in release.images if image in config.images]
     node, domain = release.node, release.domain
     entries = [

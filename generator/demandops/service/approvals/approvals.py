@@ -1,8 +1,8 @@
 """The proposals that await approval, and how each one ends.
 
-Belongs to the worker thread. A proposal is complete once main has its claims, however they got
-there. Until then its branch is kept up to date: merging it must give what main would render. A
-:class:`Proposal` says what becomes of it; this module carries that out.
+Runs in the worker thread. A proposal is complete once main has its claims, by any kind of merge.
+Until then the branch is kept up to date, so that merging it gives what main would render. A
+:class:`Proposal` decides its verdict; this module carries it out.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Approvals:
         with_targets: bool,
         token_file: Path | None,
     ) -> None:
-        """Find the proposals of an earlier run again; ``state`` is main's."""
+        """Find the proposals of an earlier run again; ``state`` is the state of main."""
         self._repository, self._runtime = repository, repository.runtime
         self._demands = demands
         self._with_targets = with_targets
@@ -115,8 +115,8 @@ class Approvals:
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
         """Remove the proposals that demands of the batch release, before these are evaluated.
 
-        Once its branch is deleted, nobody can merge a proposal. If it was merged before, it is on
-        the tip on which the demands are evaluated next.
+        Nobody can merge a proposal without its branch. If it was merged earlier, the demands are
+        evaluated on a tip that has the merge.
 
         Raises:
             RemoteAway, PushDenied: if the branch could not be deleted.
@@ -135,9 +135,9 @@ class Approvals:
         """Withdraw the earlier demands of a batch that a demand releases before they are proposed.
 
         Args:
-            earlier: their results; those of withdrawn ones are replaced.
-            by: the demand that comes after them.
-            state: the state that it is evaluated on.
+            earlier: their results; results of withdrawn demands are replaced.
+            by: the demand that may release them.
+            state: the state on which ``by`` is evaluated.
         """
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier if request else ()):
@@ -243,7 +243,7 @@ class Approvals:
         self._rest_until = ended + _PAUSE_FACTOR * (ended - self._check_began)
 
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
-        """Carry out what becomes of a proposal."""
+        """Carry out the verdict on a proposal."""
         objects, tip = self._repository.objects, str(snapshot.commit)
         on_main = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
         proposal.searched_to = tip

@@ -20,7 +20,7 @@ from demandops.settings import MAIN_BRANCH
 log = logging.getLogger("demandops")
 
 POLL_S = 30.0
-"""The interval between queries for pull requests; a branch does not show that one was closed."""
+"""The interval between queries; only the forge knows that a pull request was closed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """A proposal: demands that wait together on one branch for a person's approval.
 
-What becomes of it now, as a pure function; the requests that release it; and the texts that
-describe it to people.
+This module decides its verdict as a pure function, finds the requests that release it, and writes
+the texts that describe it.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _PREFIX = "awaiting approval: "
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What becomes of the demands of a proposal.
+    """The verdict on the demands of a proposal, some with their decision on the current main.
 
-    ``booked``: main has them, each with what it would do on main now. ``failed``: they were
-    withdrawn, turned down, or cannot be booked any more. ``free``: they need no approval any more.
-    ``rebuild``: they wait on, each with what it would do on main.
+    ``booked``: main has their claims. ``failed``: they were withdrawn or turned down, or can no
+    longer be booked. ``free``: they no longer need approval. ``rebuild``: they still wait for
+    approval.
     """
 
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
@@ -46,9 +46,9 @@ class Verdict:
 class Proposal:
     """Demands with one key.
 
-    ``reasons`` is what asks for approval. No commit of main up to ``searched_to`` has a demand of
-    it. ``checked_at`` is the commit of main at its last check. ``edited``: a person committed to
-    the branch.
+    ``reasons`` name what requires approval. No commit of main up to ``searched_to`` has one of the
+    demands. ``checked_at`` is the commit of main at the last check. ``edited``: a person committed
+    to the branch.
     """
 
     key: Key
@@ -78,13 +78,13 @@ class Proposal:
         head: str,
         pull_request: PullRequest | None,
     ) -> Verdict:
-        """Return what becomes of its demands.
+        """Return the verdict on its demands.
 
         A demand is booked if the history of main has its operation id, or if the ledger has its
         claims: a squash merge may lose the trailer.
 
         Args:
-            decisions: each demand with what it would do on main.
+            decisions: each demand with its decision on main.
             on_main: the operation ids of the new commits on main.
             head: the commit of the branch; empty if there is none.
             pull_request: the pull request, if it is known.
@@ -152,7 +152,7 @@ def key_of(request: DemandRequest) -> Key:
 
 
 def decide_or_fault(state: State, ticket: Ticket, read: FileReader) -> Decision | InvalidInput:
-    """Return what a demand would do in a state, or why it cannot."""
+    """Return the decision on a demand in a state, or the error that refuses it."""
     try:
         return decide(state, ticket.goal, ticket.received, read)
     except InvalidInput as error:
@@ -163,7 +163,7 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
     """Decide demands one after the other, with leases that start at the approval.
 
     Returns:
-        What each demand does after those before it, and those that cannot be booked then.
+        The decision on each demand after the earlier ones, and the demands that are refused.
     """
     written: dict[str, str | None] = {}
     steps, failed = Decided(), Failed()
@@ -186,7 +186,7 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
 
 
 def name_of(goal: object) -> str:
-    """Return the id that a goal gives itself, even if it is not valid any more."""
+    """Return the id in a goal, even if the goal is no longer valid."""
     fields = goal if isinstance(goal, dict) else {}
     keys = ("id", "request", "demand", "name")
     return str(next((fields[key] for key in keys if fields.get(key)), ""))
@@ -223,7 +223,7 @@ def parse_waiting_text(text: str) -> dict[str, str]:
 def pull_request_body(message: str, reasons: Iterable[str]) -> str:
     """Return the text of a pull request with a commit's message.
 
-    The message is fenced, because it has ids that anyone may choose: none must become a link.
+    A fence keeps the ids in the message, which anyone may choose, from becoming links.
     """
     fence = _fence(message, 3)
     why = ", ".join(reasons) or "an access policy"
@@ -245,5 +245,5 @@ def push_option_description(message: str, reasons: Iterable[str]) -> str:
 
 
 def _fence(text: str, shortest: int) -> str:
-    """Return backticks that fence a text, which may have backticks itself."""
+    """Return enough backticks to fence a text that may contain backticks."""
     return "`" * max([shortest, *(len(run) + 1 for run in re.findall(r"`+", text))])

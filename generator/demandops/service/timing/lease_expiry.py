@@ -1,8 +1,8 @@
 """Which leases have ended, by a clock that a person may set.
 
 A clock that is set back only delays a release. A clock that jumps forward would end leases that
-were renewed in time, so after a jump every lease gets its full term again. A machine that
-was asleep looks the same, so its leases get their full term too.
+were renewed in time, so after a jump every lease gets its full term again. The sleep of a machine
+looks like a jump and has the same effect.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class LeaseClock:
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next check: at least one, at most ``longest``.
 
-        Never zero: a lease that has ended and is still in the ledger could not be released, or was
+        Never zero, because an ended lease stays in the ledger if its release failed or if it was
         granted more time.
         """
         end = ledger.next_lease_end()
@@ -74,7 +74,7 @@ class LeaseClock:
 
 
 class LeaseExpiry:
-    """Makes the demands that release what has ended."""
+    """Makes the demands that release claims whose lease has ended."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime

@@ -24,7 +24,7 @@ class OverrideExpiry:
         self._not_before: datetime | None = None
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
-        """Commit the end of each expired override; one whose end fails is tried again later."""
+        """Commit the end of each expired override; retry failed ones later."""
         for override in expired_overrides(commits.head.state, now):
             tried = self._failed.get((override.name, override.end or now))
             if tried is not None and now < tried + _RETRY:

@@ -1,6 +1,6 @@
 """When to fetch from the state repo while no demand comes.
 
-Knows no Git: its user reports the end of each fetch.
+It does not call Git; its user reports the end of each fetch.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class PollTimer:
 
         Args:
             interval: seconds between two fetches; 0: only on :meth:`request`.
-            runtime: tells the time.
+            runtime: provides the time.
             embedded: whether the repository is on this disk.
         """
         self._interval = min(interval, _EMBEDDED_S) if embedded else interval
@@ -68,7 +68,7 @@ class PollTimer:
         return due
 
     def finished(self, *, reached: bool) -> None:
-        """Plan the next fetch after a fetch or a push, which shows what is new as well."""
+        """Plan the next fetch after a fetch or a push, because a push finds new commits too."""
         longest = max(_LONGEST_BACKOFF_S, self._interval)
         self._last = self._runtime.monotonic()
         if self._next is not None:

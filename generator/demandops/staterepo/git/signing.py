@@ -22,7 +22,7 @@ _PROBE = b"demandops: can this key sign?\n"
 
 
 class SigningFailed(StateRepoError):
-    """Raised when a commit cannot be signed, and so is not made."""
+    """Raised instead of making a commit that cannot be signed."""
 
 
 class Signer:

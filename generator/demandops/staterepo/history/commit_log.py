@@ -97,7 +97,7 @@ def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> It
 def person_commits(
     repo: Repository, tip: str | Oid, until: str | Oid | None = None
 ) -> Iterator[Commit]:
-    """Yield those of :func:`commits` that no generator made, on any machine."""
+    """Yield the commits of :func:`commits` that people made."""
     return (commit for commit, entry in commits(repo, tip, until) if not entry.by_generator)
 
 

@@ -72,14 +72,14 @@ def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHi
 
 
 def stopped_release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
-    """Return the path of the last stopped release of a name, or None."""
+    """Return the path of the last stopped release with this name, or None."""
     if not _NAME.fullmatch(name):
         return None
     return next(iter(_removed(repo, tip, f"{name}.yaml", "-1")), None)
 
 
 def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    """Return the names of all releases that were ever stopped; reads all of history."""
+    """Return the names of all releases that ever stopped; reads the whole history."""
     removed = _removed(repo, tip, "*.yaml")
     return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
 
@@ -91,7 +91,7 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
 
 
 def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -> list[str]:
-    """Return the output of ``git log`` for a path, which is the last of ``query``."""
+    """Return the output of ``git log`` for the path that ``query`` ends with."""
     *options, path = query
     commits = [str(commit_of(repo, tip).id), *([f"^{until}"] if until else [])]
     with git.Repo(repo.path) as opened:
@@ -100,6 +100,6 @@ def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -
 
 
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
-    """Return the path of the release of a name in a commit, or None."""
+    """Return the path of the release with this name in a commit, or None."""
     files = trees.blobs(commit_of(repo, tip).tree, (CLUSTERS_ROOT,))
     return next((path for path, _ in files if path.endswith(f"/{name}.yaml")), None)

@@ -1,8 +1,8 @@
 """The configuration at a commit, and its last valid version if a file is not valid.
 
-An invalid file is replaced by its last valid version. So are the other files of the commits that
-changed it, because half a commit is not what was merged, and the other files of its application
-definition. All other changes apply. If the result is not valid either, no change applies.
+The last valid version replaces an invalid file, the other files of its application definition, and
+the other files of the commits that changed it: a commit applies whole or not at all. All other
+changes apply. If the result is not valid either, no change applies.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def load_last_valid_config(
     """Return the configuration of a commit, with the last valid versions of invalid files.
 
     Args:
-        before: what was in effect before.
+        before: the source of the configuration that was in effect.
         last_valid_commit: the newest commit where all files were valid.
         to: the commit.
         load: makes a configuration from texts, or raises ``InvalidInput``.
@@ -144,7 +144,7 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
-    """Return these files, those of the same commits, and those of the same definition."""
+    """Return these files, and all files of the same commits or the same definition."""
     together = set(broken)
     merges = [
         {path for path, _ in trees.differences(commit.parents[0].tree, commit.tree, CONFIG_ROOTS)}

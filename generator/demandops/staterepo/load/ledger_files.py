@@ -75,9 +75,9 @@ def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
 def last_valid_claims(
     repo: Repository, last_valid_commit: Oid, to: Oid, paths: Iterable[str]
 ) -> dict[str, Claim | None]:
-    """Return path → the claim as the generator last wrote it, even after a person's edit.
+    """Return path → the claim as the generator last wrote it, without manual edits.
 
-    If it wrote none since the newest commit where all files were valid, that commit's claim counts.
+    If it wrote none since the newest commit with only valid files, return that commit's claim.
     """
     tree = trees.commit_of(repo, last_valid_commit).tree
     claims = {path: claim_at(tree, path) for path in paths}

@@ -35,8 +35,8 @@ class Accepted:
 class Judgement:
     """People's changes, and the faults of subjects with the new and with the old configuration.
 
-    If a subject cannot be planned with either, its claims are at fault. If only the new
-    configuration fails, that configuration is at fault.
+    If a subject cannot be planned with either configuration, its claims are at fault. If it cannot
+    be planned with the new one only, the new configuration is at fault.
     """
 
     repo: Repository
@@ -55,7 +55,7 @@ class Judgement:
         return self._without(Accepted(self.advance.snapshot, self.advance.subjects), faults)
 
     def with_old_config(self, faults: Iterable[Fault]) -> Accepted:
-        """Return the state in effect if ``faults`` rule out the new configuration."""
+        """Return the state in effect if the new configuration has ``faults``."""
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
         snapshot = replace(
@@ -93,7 +93,7 @@ class Judgement:
 
 
 def judge(repo: Repository, advance: Advance, before: Snapshot, tree: Tree) -> Judgement:
-    """Return which of the subjects that people changed cannot be planned.
+    """Return the subjects that people changed and that cannot be planned.
 
     Args:
         before: the state in effect before.

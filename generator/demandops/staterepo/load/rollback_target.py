@@ -20,7 +20,7 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
 
     Args:
         to: the commit.
-        more: the other fields of :class:`Restoration`.
+        more: further fields of :class:`Restoration`.
 
     Raises:
         InvalidInput: every fault of that commit's claim files.

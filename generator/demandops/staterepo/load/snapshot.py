@@ -52,7 +52,7 @@ class Snapshot:
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot of a new commit by this program, whose state is known."""
+        """Return the snapshot of a commit that this program made with a known state."""
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
@@ -66,7 +66,7 @@ class Advance:
     config_changed: bool
 
     def followed_by(self, further: Advance) -> Advance:
-        """Return this advance and the next one, ``further``, as one."""
+        """Return one advance for this one and ``further``, which follows it."""
         return Advance(
             further.snapshot,
             tuple(dict.fromkeys((*self.subjects, *further.subjects))),
@@ -114,7 +114,7 @@ def advance(
 ) -> Advance:
     """Advance a snapshot to another commit, reading only what differs.
 
-    What is not valid stays as it was and is listed in the new snapshot's problems.
+    Invalid changes are not applied; the new snapshot's problems list them.
 
     Args:
         recorded: the source of the configuration in effect at ``to``, if that is known.
@@ -187,10 +187,10 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Keeps what was read after the published snapshot, until a commit is published on it.
+    """Keeps the advance beyond the published snapshot until a commit is published on it.
 
-    So an attempt reads only what is new. If it read everything again, faster writers could always
-    be ahead of it.
+    So each attempt reads only new commits. If it read all of them again, faster writers could
+    always publish first.
     """
 
     def __init__(self) -> None:

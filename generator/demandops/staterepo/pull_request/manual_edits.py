@@ -75,7 +75,7 @@ def _fits(release: Release | None, other: Release) -> bool:
 
 
 def _unused_path(name: str, used: set[str]) -> str:
-    """Return the path of an override that does not exist yet."""
+    """Return an unused path for a new override."""
     for number in range(1, len(used) + 2):
         path = f"{OVERRIDES_ROOT}/{name}{f'-{number}' if number > 1 else ''}.yaml"
         if path not in used:

@@ -113,7 +113,7 @@ class CommitBatch:
         return str(made)
 
     def note_settled(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
-        """Have the next commit, if any, name a demand that changed nothing.
+        """Name a demand that changed nothing in the next commit, if any.
 
         If the process dies before it answers, a restart must not evaluate that demand again after
         a later release.
@@ -123,8 +123,8 @@ class CommitBatch:
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
         """Apply people's changes: render, and commit the files that differ, if any.
 
-        What cannot be planned or rendered (a claim's node was removed from the inventory) stays
-        as it was and is listed in the head's problems.
+        A claim or file that cannot be planned or rendered (its node left the inventory) stays
+        unchanged and is listed in the head's problems.
         """
         followed = self._followed(advance, before, now)
         self.head = followed.snapshot

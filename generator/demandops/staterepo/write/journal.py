@@ -4,9 +4,9 @@ It has one JSON line for each demand received and one for each demand done. A de
 fsynced before it is evaluated. After a restart, demands that are not done are evaluated again;
 their operation ids show whether a commit was already published.
 
-The last key of a line is a digest of the line and of the digest before it. So a changed, missing or
-moved line is noticed (docs/decisions/0020-journal.md). The first version wrote no digests; its
-journals are read as well.
+The last key of a line is a digest of the line and of the digest before it. So a reader
+detects a changed, missing or moved line (docs/decisions/0020-journal.md). It also reads journals of
+the first version, which have no digests.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SEALED = re.compile(rb'(\{.*), "digest": "([0-9a-f]{64})"\}')
 
 
 class DamagedJournal(StateRepoError):
-    """Raised if an entry of a journal was changed, or one before it is missing."""
+    """Raised if a journal has a changed entry, or an entry is missing."""
 
     def __init__(self, path: Path, line: int) -> None:
         super().__init__(
@@ -63,7 +63,7 @@ class JournalEntry:
 class Journal:
     """The journal of one process. Not thread-safe: the caller locks.
 
-    The file is rewritten when it has twice the size that it had then, and more than 1 MiB.
+    It rewrites the file when the size has doubled since the last time and exceeds 1 MiB.
     """
 
     def __init__(self, path: Path) -> None:
@@ -90,9 +90,9 @@ class Journal:
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Remove demands that are published, refused or withdrawn.
 
-        Only if ``durably`` are they removed for sure, and is a failure raised. Otherwise the
-        :meth:`append` of a later demand makes it sure, and before that it is harmless to replay
-        them.
+        If ``durably``, the removal is fsynced and a failure raised. Otherwise the next
+        :meth:`append` makes the removal durable. Until then, a replay of the demands is
+        harmless.
 
         Raises:
             StateRepoError: if ``durably``, and it cannot be written; then they stay.
@@ -197,7 +197,7 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
 
 
 def readable_entries(path: Path) -> list[JournalEntry]:
-    """Return the demands that can be read in a journal, damaged or not, and are not done."""
+    """Return the pending demands that can be read in a journal, even if it is damaged."""
     pending: dict[str, JournalEntry] = {}
     for line in path.read_bytes().split(b"\n"):
         found = _SEALED.fullmatch(line)
@@ -216,7 +216,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _sealed(records: Iterable[dict[str, Any]], chain: str) -> tuple[bytes, str]:
-    """Return the lines of records that follow the digest ``chain``, and the last one's digest."""
+    """Return the lines of records that follow the digest ``chain``, and the last digest."""
     lines = []
     for record in records:
         body = json.dumps(record, ensure_ascii=True)

@@ -103,7 +103,7 @@ class ProposalBranches:
     def _set(
         self, branch: str, commit: Oid | None, expected: str, options: Sequence[str] = ()
     ) -> str:
-        """Move or delete a branch; if a push fails, check whether it is as wanted nevertheless."""
+        """Move or delete a branch; if the push fails, check whether it took effect nevertheless."""
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
             self._set_here(reference, commit, expected)

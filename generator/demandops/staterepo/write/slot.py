@@ -56,8 +56,8 @@ class Slot:
     def _adopt_orphans(self, root: Path) -> None:
         """Take over the journals of dead processes.
 
-        An entry is written here before it is removed there. A crash between the two leaves it
-        twice, but its operation id makes it count once.
+        An entry is written to this journal before it is removed from the old one. A crash between
+        leaves both, but with the same operation id they count once.
         """
         for journal in sorted(root.glob(f"slot-*/{_JOURNAL}")):
             lock = _lock(journal.parent) if journal.parent != self.folder else None
@@ -76,7 +76,7 @@ class Slot:
 class FoundJournal:
     """A journal on this machine, and its demands that are not done.
 
-    ``damage`` is the error that it raises, or empty; ``set_aside`` is where the file is now.
+    ``damage`` is the error of reading it, or empty; ``set_aside`` is where the file is now.
     """
 
     file: Path
