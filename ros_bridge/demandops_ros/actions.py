@@ -63,7 +63,7 @@ class DeploymentRequestAdapter:
         return str(goal.id)
 
     def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return None, because the message has no field for it."""
+        """Return None, because the message has no field for the level."""
         return None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401

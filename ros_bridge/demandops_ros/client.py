@@ -37,10 +37,10 @@ StageListener = Callable[[str, str], None]
 
 _DEPTH = 100
 _RENEW_AFTER = 1 / 3
-"""The part of the lease after which it is renewed; two more attempts fit before its end."""
+"""The fraction of a lease after which to renew it; two more attempts fit before its end."""
 _RETRY_S = 5.0
 _UNHEARD_S = 5.0
-"""A goal is accepted within milliseconds; after this time it must have been lost."""
+"""Seconds until a goal counts as lost; a node accepts a goal within milliseconds."""
 
 
 class DemandError(Exception):
@@ -136,7 +136,7 @@ class DemandClient:
         request: str = "",
         on_stage: StageListener = lambda stage, text: None,
     ) -> Answer:
-        """Replace the content of a demand; return when that is published.
+        """Replace the content of a demand; return when the change is published.
 
         Args:
             demand: the demand's id.

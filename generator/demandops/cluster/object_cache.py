@@ -68,7 +68,7 @@ class ObjectCache:
             return dict(self._objects)
 
     def why_unknown(self, wanted: Iterable[ObjectSelector]) -> str:
-        """Return why some of these objects are not known at present; empty if all are."""
+        """Return why some of these objects are unknown now; empty if all are known."""
         with self._lock:
             for selector in wanted:
                 if selector in self._errors:

@@ -61,7 +61,7 @@ class ReconcileTrigger:
         self._due.set()
 
     def close(self) -> None:
-        """Do the wake for the last push, if it is still due, and stop."""
+        """Wake the clusters for the last push, if that is still due, and stop."""
         self._stopping = True
         self._stop.set()
         self._due.set()  # lets the thread run once more

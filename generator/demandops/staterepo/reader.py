@@ -42,7 +42,7 @@ class Reader:
     """An open state repo, at its newest commit."""
 
     def __init__(self, address: str) -> None:
-        """Open the state repo; if it is a URL, fetch into a clone that is kept.
+        """Open the state repo; a URL is fetched into a clone that is kept.
 
         Raises:
             StateRepoError: it cannot be read.
@@ -119,7 +119,7 @@ class Reader:
         return problem_report.read(self.file_reader()(problem_report.PATH))
 
     def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
-        """Return the problems reported at a commit, else those found when it was loaded."""
+        """Return the problems reported at a commit, else the problems found by loading it."""
         report = self.file_reader(str(snapshot.commit))(problem_report.PATH)
         return problem_report.read(report) or snapshot.problems
 
@@ -216,7 +216,7 @@ class Reader:
         return path_history.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
-        """Return the path of a release, or of the last stopped one of that name."""
+        """Return the path of a release, or of the last stopped release with this name."""
         current = path_history.release_path(self._objects, revision, name)
         return current or path_history.stopped_release_path(self._objects, revision, name)
 

@@ -61,7 +61,7 @@ def decommission(
 
 
 def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any] | None:
-    """Return what was released, or None if a known node holds nothing, which is not an error."""
+    """Return the result, or None if a known node holds nothing, which is not an error."""
     with started_generator(state_repo, signing_key) as generator:
         try:
             receipt = generator.submit(goal).future.result()

@@ -1,4 +1,4 @@
-"""What the commands that change the ledger share: how they book, and how they show it."""
+"""Shared parts of the commands that change the ledger: booking, and printing the changes."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ def _submitted(
 
 
 def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[dict[str, Any]]:
-    """Decide each request after the one before it, in memory only."""
+    """Decide the requests one after the other, in memory only."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         repo.refuse_other_render_version()

@@ -37,7 +37,7 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 
 @dataclass(frozen=True, slots=True)
 class _Target:
-    """The commit to go back to, and how."""
+    """The commit to roll back to, and the options."""
 
     to: str
     drop_newer: bool

@@ -117,7 +117,7 @@ def _applied_commits(app: Object) -> list[str]:
 def _why_outdated(
     domain: ClusterDomain, app: Object, commit: str, objects: Objects, history: History
 ) -> str:
-    """Return why a status is not about the current spec and commit; empty if it is."""
+    """Return why a status is older than the current spec or commit; empty if it is current."""
     sync, source = _status(app, "sync"), (app.get("spec") or {}).get("source") or {}
     if not sync:
         return "has not been compared yet"

@@ -79,7 +79,7 @@ Objects = Mapping[Key, Object]
 
 
 class History(Protocol):
-    """Questions about the state repo's commits."""
+    """Queries on the state repo's commits."""
 
     def includes(self, commit: str, other: str) -> bool:
         """Report whether ``commit`` is ``other`` or comes after it."""
@@ -91,7 +91,7 @@ class History(Protocol):
 
 
 def worst(healths: list[Health]) -> Health:
-    """Return the least advanced health; of several, one that is failing."""
+    """Return the least advanced health; if several are equal, prefer a failing one."""
     return min(
         healths,
         key=lambda health: (_ORDER[health.state], not health.failing),

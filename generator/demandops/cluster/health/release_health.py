@@ -1,4 +1,4 @@
-"""What the health of releases is for any GitOps controller; each controller adds its part. Pure."""
+"""The health of releases for any GitOps controller; each controller adds its part. Pure."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class HealthReader(ABC):
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return how far a service has started, whose object exists."""
+        """Return how far a service with an existing object has started."""
 
     @abstractmethod
     def _service_state(self, status: Object) -> Object:

@@ -183,7 +183,7 @@ class _Edit:
             raise InvalidInput(found or error.faults) from None
 
     def unversioned_charts(self, config: Config) -> Iterator[Fault]:
-        """Yield a fault for each chart that changed and still has its version."""
+        """Yield a fault for each chart that changed without a new version."""
         sources = {
             source.folder: (name, source)
             for name, chart in sorted(config.charts.items())

@@ -30,16 +30,16 @@ _SHALLOW = (
 
 @dataclass(frozen=True, slots=True)
 class Base:
-    """The commit that an edit started from. ``state`` is None if none was ever valid."""
+    """The commit that an edit started from. ``state`` is None if no commit was ever valid."""
 
     commit: str
     files: Mapping[str, str]
     state: State | None
     valid: bool
-    """Whether its files are valid; if not, ``state`` is from an earlier commit."""
+    """Whether the commit's files are valid; if not, ``state`` is from an earlier commit."""
 
     def releases(self) -> dict[ReleaseKey, Release]:
-        """Return the releases of its state."""
+        """Return the releases of ``state``."""
         if self.state is None:
             return {}
         return merge_preview.planned_releases(self.state)
