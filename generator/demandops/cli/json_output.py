@@ -1,4 +1,4 @@
-"""The JSON of all commands: one shape for each thing, as docs/json.md lists them."""
+"""The shapes that the JSON of all commands shares; docs/json.md lists them."""
 
 from __future__ import annotations
 

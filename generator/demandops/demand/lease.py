@@ -56,6 +56,10 @@ class Lease:
         """The time after which the claim may be released: the recorded end plus the slack."""
         return self.until + timedelta(seconds=self.slack)
 
+    def has_ended(self, now: datetime) -> bool:
+        """Return whether the claim may be released, as far as the recorded end tells."""
+        return self.expires_at < now
+
     def renewed(self, term: Term, now: datetime) -> Lease:
         """Return the lease after a renewal; the same lease if the slack covers it.
 

@@ -20,8 +20,8 @@ from demandops.demand.demand_request import (
 from demandops.ledger.ledger import Changes, Ledger
 from demandops.ledger.operations.decommission import decommission
 from demandops.ledger.operations.demand_release import release_demand
+from demandops.ledger.operations.expire import expire
 from demandops.ledger.operations.join import join
-from demandops.ledger.operations.lease_end import release_ended
 from demandops.ledger.operations.lease_renewal import renew_leases
 from demandops.ledger.operations.put import put
 from demandops.ledger.operations.restoration import Restoration, restore
@@ -55,7 +55,7 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
         case Renew():
             return renew_leases(ledger, request, now)
         case Expire():
-            return release_ended(ledger, request, now)
+            return expire(ledger, request, now)
         case Decommission():
             return decommission(ledger, request, now)
         case Restoration():

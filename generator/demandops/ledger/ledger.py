@@ -179,7 +179,7 @@ class Ledger:
             (claim.lease.expires_at, claim)
             for minute in over
             for claim in self._claims(_ENDS, minute)
-            if claim.lease and claim.lease.expires_at < now
+            if claim.lease and claim.lease.has_ended(now)
         ]
         return tuple(claim for _, claim in sorted(ended, key=lambda pair: pair[0]))
 

@@ -14,7 +14,7 @@ from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoErr
 from demandops.service import rollback_goal
 from demandops.service.approvals.approvals import Approvals
 from demandops.service.approvals.proposal import is_release, name_of
-from demandops.service.demands import TAKEN_BACK, Demands
+from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import Receipt, Ticket, receipt_of
 from demandops.service.timing.rate_limit import RateLimit

@@ -11,7 +11,7 @@ from demandops import settings
 from demandops.config.config import Config
 from demandops.runtime import REAL, Runtime
 from demandops.service.approvals.approvals import Approvals
-from demandops.service.demands import Demands
+from demandops.service.demand_lifecycle import Demands
 from demandops.service.remote_status import StateRepoStatus
 from demandops.service.ticket import Listener, Ticket, new_ticket
 from demandops.service.worker import Worker

@@ -25,7 +25,7 @@ Stage = Literal["away", "admitted", "booked", "committed", "proposed", "pushed"]
 Listener = Callable[[Stage, str], None]
 
 State = Literal["arrived", "waiting", "committed", "proposed", "withdrawn", "done"]
-"""See :mod:`demandops.service.demands`, which alone changes it."""
+"""See :mod:`demandops.service.demand_lifecycle`, which alone changes it."""
 
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 

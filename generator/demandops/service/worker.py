@@ -13,7 +13,7 @@ from demandops.config.config import Config
 from demandops.decision import Decision
 from demandops.errors import DemandOpsError, Fault, ShuttingDown, StateRepoError
 from demandops.service.approvals.approvals import Approvals, Result
-from demandops.service.demands import Demands
+from demandops.service.demand_lifecycle import Demands
 from demandops.service.evaluation import Evaluator
 from demandops.service.remote_status import RemoteMonitor
 from demandops.service.ticket import Receipt, Ticket

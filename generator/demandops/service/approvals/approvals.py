@@ -39,7 +39,7 @@ from demandops.service.approvals.proposal import (
     push_option_description,
     waiting_text,
 )
-from demandops.service.demands import TAKEN_BACK, Demands
+from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import ProposalRecord, Receipt, Ticket, receipt_of
 from demandops.staterepo.git.repository import PushDenied, StateRepository

@@ -1,6 +1,7 @@
 """The state repo behind a URL: a bare clone, fetched and pushed by git.
 
-Explains why a fetch or a push failed: remote unreachable, or push rejected.
+Explains why a fetch or a push failed: remote unreachable, or push rejected. What follows from it
+is decided in :mod:`demandops.service.worker`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The trailers are a contract: an auditor without this program finds everything with
 ``git log --format='%(trailers:key=Requester)'``. Ids hold no line breaks, so none can forge a
-trailer.
+trailer. :mod:`demandops.staterepo.load.state_in_effect` adds those about quarantined files.
 """
 
 from __future__ import annotations
