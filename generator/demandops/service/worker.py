@@ -89,7 +89,7 @@ class Worker:
     # ---- the loop ----
 
     def run(self) -> None:
-        """Work until demands are closed and none waits."""
+        """Publish demands until no more are accepted and none waits."""
         if self._demands.proposed:  # they may be decided already; stopping at once must not skip it
             self._work()
         while self._demands.wait(self._seconds_until_due()):

@@ -50,7 +50,7 @@ class PollTimer:
         self._requested = runtime.event()
 
     def request(self) -> None:
-        """Make a fetch due now; requests before it starts lead to one fetch."""
+        """Make the next fetch due now; several requests before it starts make one fetch."""
         self._requested.set()
 
     def seconds_until_due(self) -> float | None:
