@@ -17,8 +17,8 @@ from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.runtime import REAL
 from demandops.service import Generator, push_webhook
+from demandops.service.http_server import HttpServer
 from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
-from demandops.service.web_app import WebApp
 from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
@@ -135,9 +135,9 @@ def serve(
         generator.on_publish(trigger)
         trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
         route = push_webhook.PushWebhook(secret, generator.fetch_now).route
-        web_app = WebApp(webhook, [route], local_only=not secret) if webhook else None
+        http_server = HttpServer(webhook, [route], local_only=not secret) if webhook else None
         status = RolloutWatcher(clusters, generator) if clusters else None
-        _run(generator, settings, status, web_app)
+        _run(generator, settings, status, http_server)
         trigger.close()
     finally:
         rclpy.try_shutdown()
@@ -193,7 +193,7 @@ def _run(
     generator: Generator,
     settings: dict[str, Any],
     status: RolloutWatcher | None,
-    web_app: WebApp | None,
+    http_server: HttpServer | None,
 ) -> None:
     node = DemandNode(
         generator,
@@ -218,11 +218,11 @@ def _run(
     spinner = REAL.start_thread("executor", executor.spin)
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
-    if web_app is not None:
-        node.get_logger().info(f"listening for pushes at {web_app.url}{push_webhook.PATH}")
+    if http_server is not None:
+        node.get_logger().info(f"listening for pushes at {http_server.url}{push_webhook.PATH}")
     signals.wait()
-    if web_app is not None:
-        web_app.close()
+    if http_server is not None:
+        http_server.close()
     _drain(executor, node, generator, status)
     executor.shutdown(timeout_sec=1)
     spinner.join(5)

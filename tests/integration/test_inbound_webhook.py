@@ -16,9 +16,9 @@ from urllib.parse import urlsplit
 
 import pytest
 from demandops.errors import InvalidInput
-from demandops.service import web_app
+from demandops.service import http_server
+from demandops.service.http_server import HttpServer
 from demandops.service.push_webhook import PushWebhook, read_secret
-from demandops.service.web_app import WebApp
 
 SECRET = b"s3cret-of-the-hook"
 BODY = b'{"ref": "refs/heads/main"}'
@@ -34,8 +34,8 @@ class Heard:
         self.times += 1
 
 
-def listen(address: str, secret: bytes, heard: Callable[[], None]) -> WebApp:
-    return WebApp(address, [PushWebhook(secret, heard).route], local_only=not secret)
+def listen(address: str, secret: bytes, heard: Callable[[], None]) -> HttpServer:
+    return HttpServer(address, [PushWebhook(secret, heard).route], local_only=not secret)
 
 
 @pytest.fixture
@@ -44,21 +44,21 @@ def heard() -> Heard:
 
 
 @pytest.fixture
-def signed(heard: Heard) -> Iterator[WebApp]:
+def signed(heard: Heard) -> Iterator[HttpServer]:
     hook = listen("127.0.0.1:0", SECRET, heard)
     yield hook
     hook.close()
 
 
 @pytest.fixture
-def unsigned(heard: Heard) -> Iterator[WebApp]:
+def unsigned(heard: Heard) -> Iterator[HttpServer]:
     hook = listen("127.0.0.1:0", b"", heard)
     yield hook
     hook.close()
 
 
 def send(
-    hook: WebApp,
+    hook: HttpServer,
     headers: dict[str, str] | None = None,
     *,
     method: str = "POST",
@@ -99,14 +99,14 @@ FORGED = {
 
 
 @pytest.mark.parametrize("server", GENUINE)
-def test_who_knows_the_secret_is_heard(signed: WebApp, heard: Heard, server: str) -> None:
+def test_who_knows_the_secret_is_heard(signed: HttpServer, heard: Heard, server: str) -> None:
     assert send(signed, GENUINE[server]) == (202, "fetching")
     assert heard.times == 1
 
 
 @pytest.mark.parametrize("case", FORGED)
 def test_who_does_not_is_refused_and_the_log_holds_nothing_of_it(
-    signed: WebApp, heard: Heard, case: str, caplog: pytest.LogCaptureFixture
+    signed: HttpServer, heard: Heard, case: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
     for _ in range(3):
@@ -119,14 +119,14 @@ def test_who_does_not_is_refused_and_the_log_holds_nothing_of_it(
 
 
 def test_without_a_secret_whoever_is_on_this_machine_is_heard(
-    unsigned: WebApp, heard: Heard
+    unsigned: HttpServer, heard: Heard
 ) -> None:
     assert send(unsigned) == (202, "fetching")
     assert send(unsigned, body=None, headers={"Content-Length": "0"})[0] == 202
     assert heard.times == 2
 
 
-def test_what_else_is_asked_is_answered_and_does_nothing(signed: WebApp, heard: Heard) -> None:
+def test_what_else_is_asked_is_answered_and_does_nothing(signed: HttpServer, heard: Heard) -> None:
     github = GENUINE["github"]
     assert send(signed, method="GET", path="/", body=None) == (200, "ok")
     assert send(signed, method="HEAD", path="/", body=None) == (200, "")
@@ -144,7 +144,7 @@ def test_what_else_is_asked_is_answered_and_does_nothing(signed: WebApp, heard: 
     [("26214401", 413), ("9" * 400, 400), ("-1", 400), ("many", 400), ("\u00b2", 400)],
 )
 def test_a_body_without_bounds_is_not_read(
-    signed: WebApp, heard: Heard, length: str, status: int
+    signed: HttpServer, heard: Heard, length: str, status: int
 ) -> None:
     head = "POST /push HTTP/1.1\r\nHost: x\r\n"
     with _connected(signed) as raw:
@@ -153,7 +153,7 @@ def test_a_body_without_bounds_is_not_read(
     assert heard.times == 0
 
 
-def test_a_body_of_unknown_length_is_read_up_to_the_bound(signed: WebApp, heard: Heard) -> None:
+def test_a_body_of_unknown_length_is_read_up_to_the_bound(signed: HttpServer, heard: Heard) -> None:
     head = "POST /push HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n"
     size = f"{len(BODY):x}\r\n".encode()
     with _connected(signed) as raw:
@@ -168,7 +168,7 @@ def test_a_body_of_unknown_length_is_read_up_to_the_bound(signed: WebApp, heard:
     assert heard.times == 1
 
 
-def test_every_answer_ends_its_connection(signed: WebApp) -> None:
+def test_every_answer_ends_its_connection(signed: HttpServer) -> None:
     with _connected(signed) as raw:
         raw.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 3)
         answer = b""
@@ -179,9 +179,9 @@ def test_every_answer_ends_its_connection(signed: WebApp) -> None:
 
 
 def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
-    signed: WebApp, heard: Heard, monkeypatch: pytest.MonkeyPatch
+    signed: HttpServer, heard: Heard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(web_app, "_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(http_server, "_TIMEOUT_S", 0.3)
     slow = [_connected(signed) for _ in range(40)]
     for number, raw in enumerate(slow):
         with suppress(ConnectionError):  # there are too many
@@ -193,7 +193,7 @@ def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
     assert heard.times == 1
 
 
-def test_there_are_only_so_many_connections(signed: WebApp) -> None:
+def test_there_are_only_so_many_connections(signed: HttpServer) -> None:
     held = [_connected(signed) for _ in range(16)]
     with _connected(signed) as one_more:
         assert _is_cut_off(one_more)
@@ -212,7 +212,7 @@ def test_a_close_waits_for_no_slow_sender(heard: Heard) -> None:
         _connected(hook)
 
 
-def test_many_at_once_are_all_answered(unsigned: WebApp, heard: Heard) -> None:
+def test_many_at_once_are_all_answered(unsigned: HttpServer, heard: Heard) -> None:
     answers: list[int] = []
     threads = [threading.Thread(target=lambda: answers.append(send(unsigned)[0])) for _ in range(8)]
     for thread in threads:
@@ -229,7 +229,7 @@ def _is_cut_off(raw: socket.socket) -> bool:
         return True
 
 
-def _connected(hook: WebApp) -> socket.socket:
+def _connected(hook: HttpServer) -> socket.socket:
     parts = urlsplit(hook.url)
     return socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=10)
 
@@ -258,7 +258,7 @@ def test_an_address_that_will_not_do_is_told(address: str, message: str) -> None
     assert str(error.value) == f"--webhook: {message}"
 
 
-def test_a_port_in_use_is_told(unsigned: WebApp) -> None:
+def test_a_port_in_use_is_told(unsigned: HttpServer) -> None:
     taken = urlsplit(unsigned.url).netloc
     with pytest.raises(InvalidInput, match=f"'{taken}' cannot be listened on: Address already"):
         listen(taken, b"", lambda: None)

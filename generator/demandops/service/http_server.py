@@ -27,7 +27,7 @@ _AT_ONCE = 16
 _STOP_TIMEOUT_S = 1
 
 
-class WebApp:
+class HttpServer:
     """A running server; it answers ``/`` with ok, for health checks, and serves its routes."""
 
     def __init__(self, address: str, routes: Sequence[BaseRoute], *, local_only: bool) -> None:
