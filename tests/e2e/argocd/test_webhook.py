@@ -102,6 +102,6 @@ def test_a_call_with_another_signature_or_none_is_refused(
 ) -> None:
     call = controller_webhook.argocd_call(rig.git_url(world.name), "", world.tip(), None)
     url = f"{rig.url(SERVER)}/api/webhook"
-    with pytest.raises(NoAnswer, match="^it answered 400$"):
+    with pytest.raises(NoAnswer, match=r"^it answered 400$"):
         controller_webhook.send(url, call, secret, 5)
     controller_webhook.send(url, call, WEBHOOK_SECRET.encode(), 5)
