@@ -135,7 +135,7 @@ def decide(
     ledger, changes = _book(state, request, now)
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
-    rendered = changeset.build_changeset(state, after, changes.claims, keys, state.engine, read)
+    rendered = changeset.build_changeset(state, after, changes, keys, state.engine, read)
     on_stage("booked")
     outcome: Outcome = "unchanged"
     if changes.claims:
@@ -151,6 +151,7 @@ def decide(
             *_missing_connections(request, after),
             *_already_bridged(request, state.config),
             *rendered.blocked,
+            *_repeat(changes),
             *denial.warnings(request, after),
         ),
         approval=approval_rule.approval_reasons(
@@ -228,7 +229,7 @@ def changeset_of_edit(
     """Return the changes to rendered files that follow when a person changes claims."""
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
-    return changeset.build_changeset(old, state, (), keys, state.engine, read)
+    return changeset.build_changeset(old, state, Changes(), keys, state.engine, read)
 
 
 def rendered_files(
@@ -271,6 +272,13 @@ def _missing_connections(request: DemandRequest, world: World) -> Iterator[str]:
                     f"application '{app.id}': no connection carries {foreign.name} {topic.topic} "
                     f"of '{topic.source}' to '{app.node}'"
                 )
+
+
+def _repeat(changes: Changes) -> Iterator[str]:
+    """Yield a warning if the same shutdown was carried out before."""
+    if changes.repeats is not None:
+        at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
+        yield f"the same shutdown was carried out at {at}; this one releases nothing more"
 
 
 def _already_bridged(request: DemandRequest, config: Config) -> Iterator[str]:

@@ -82,7 +82,14 @@ def _needed(
     for override in keeping_overrides(last, world):
         name = OVERRIDE_PREFIX + override.name
         return replace(
-            last, demand=name, request=name, requesters=(override.owner,), booked=now, lease=None
+            last,
+            demand=name,
+            request=name,
+            requesters=(override.owner,),
+            booked=now,
+            lease=None,
+            joined=False,
+            partial={},
         )
     return None
 

@@ -7,7 +7,7 @@ claim when it is read. So there is no second ledger to keep up to date.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 from demandops.config.override import Override
 from demandops.demand.claim import Claim, ClaimKey
@@ -56,7 +56,8 @@ def without_suspended(world: World) -> World:
     ledger = world.ledger
     if isinstance(ledger, UnsuspendedClaims) or not any(one.deny for one in world.overrides):
         return world
-    view = UnsuspendedClaims(ledger.claims, ledger.index, ledger.minutes, ledger.ended, world)
+    parts = (getattr(ledger, part.name) for part in fields(Ledger))
+    view = replace(UnsuspendedClaims(*parts), world=world)
     return replace(world, ledger=view)
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from demandops.errors import Refused
-from demandops.ledger import claim_file
-from demandops.ledger.ledger import ClaimChange
+from demandops.ledger import claim_file, recent_shutdowns
+from demandops.ledger.ledger import Changes
 from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
@@ -62,7 +62,7 @@ class Changeset:
 def build_changeset(
     before: World,
     after: World,
-    claims: Iterable[ClaimChange],
+    changes: Changes,
     keys: Iterable[ReleaseKey],
     engine: Engine,
     read: FileReader,
@@ -71,7 +71,7 @@ def build_changeset(
 
     Args:
         before, after: the world before and after; the configuration is the same.
-        claims: the claims that differ.
+        changes: what differs in the ledger.
         keys: the releases that may differ (:func:`demandops.plan.release_keys.affected`).
         engine: the engine of the configuration.
         read: returns a current file.
@@ -81,8 +81,13 @@ def build_changeset(
     """
     files: dict[str, str | None] = {
         claim_file.path_of(change.key): claim_file.text_of(change.after) if change.after else None
-        for change in claims
+        for change in changes.claims
     }
+    for digest in changes.shutdowns:
+        shutdown = after.ledger.shutdowns.by_digest.get(digest)
+        files[recent_shutdowns.path_of(digest)] = (
+            recent_shutdowns.text_of(shutdown) if shutdown else None
+        )
     releases = []
     shaped: set[str] = set()
     blocked: list[str] = []

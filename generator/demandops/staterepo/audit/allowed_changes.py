@@ -13,13 +13,15 @@ from pygit2 import Commit
 
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.demand.claim import OVERRIDE_PREFIX
-from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger import claim_file, ended_override_file, recent_shutdowns
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load import ledger_files
 
 _OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
+_RECORDING = ("shutdown", "join", "rollback")
+"""Operations that may record or forget recent shutdowns."""
 _ENDING = ("follow", "upgrade", "expire-override")
 """Operations that may add or remove the marker of an ended override."""
 
@@ -47,11 +49,25 @@ def _disallowed(commit: Commit, entry: LogEntry) -> Iterator[str]:
         elif path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
             if operation not in _ENDING or (blob and not _is_marker(commit, path)):
                 yield path
+        elif path.startswith(f"{recent_shutdowns.SHUTDOWNS_ROOT}/"):
+            if operation not in _RECORDING:
+                yield path
         elif path.rsplit("/", 1)[-1] in named:
             if blob and not _is_canonical(commit, path):
                 yield path
-        elif operation != "follow" or not _only_starts_lease(commit, path):
+        elif not (
+            (operation == "follow" and _only_starts_lease(commit, path))
+            or (operation == "upgrade" and _only_rewrites(commit, path))
+        ):
             yield path
+
+
+def _only_rewrites(commit: Commit, path: str) -> bool:
+    """Return whether a claim changed only in how it is written."""
+    before, after = (
+        ledger_files.valid_claim_at(one.tree, path) for one in (commit.parents[0], commit)
+    )
+    return before is not None and before == after and _is_canonical(commit, path)
 
 
 def _named(entry: LogEntry) -> set[str]:

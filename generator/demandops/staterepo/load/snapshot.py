@@ -17,8 +17,9 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, try_configuration
 from demandops.demand.claim import Claim
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file
+from demandops.ledger import claim_file, recent_shutdowns
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
@@ -92,7 +93,10 @@ def load(
     if found.faults:
         raise InvalidInput(found.faults)
     ended = last_valid_config.ended_overrides_at(commit.tree)
-    ledger = replace(found.ledger(), ended=ended)
+    shutdowns = recent_shutdowns.read_all(
+        trees.texts(commit.tree, (recent_shutdowns.SHUTDOWNS_ROOT,))
+    )
+    ledger = replace(found.ledger(), ended=ended, shutdowns=shutdowns)
     return Snapshot(commit.id, State.of(config, ledger), commit.id)
 
 
@@ -128,7 +132,7 @@ def advance(
     config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
     world_changed = config != state.config or ended != state.ledger.ended
     config_changed = world_changed or _has_manual_edit(repo, before.commit, to)
-    ledger = replace(state.ledger, ended=ended)
+    ledger = replace(state.ledger, ended=ended, shutdowns=_shutdowns(old, new, state.ledger))
     state = State.of(config, ledger) if known.config else replace(state, ledger=ledger)
     problems, claims, invalid = list(known.faults), dict[str, Claim | None](), list[str]()
     for path in sorted({*ledger_files.changed_files(old, new), *before.quarantined_files}):
@@ -155,6 +159,15 @@ def advance(
         known.source if known.faults or recorded else None,
     )
     return Advance(snapshot, tuple(dict.fromkeys(subjects)), config_changed)
+
+
+def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
+    shutdowns = ledger.shutdowns
+    for path, _ in trees.differences(old, new, (recent_shutdowns.SHUTDOWNS_ROOT,)):
+        text = trees.read_text(new, path)
+        shutdown = recent_shutdowns.read(text, path) if text is not None else None
+        shutdowns = shutdowns.replace(recent_shutdowns.digest_in(path), shutdown)
+    return shutdowns
 
 
 def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValidConfig:
