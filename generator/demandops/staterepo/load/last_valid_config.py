@@ -18,6 +18,7 @@ from demandops.config.load import load as load_config
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import ended_override_file
+from demandops.ledger.claim_file import RESERVED_FOLDERS
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
@@ -86,11 +87,16 @@ def ended_overrides_at(tree: Tree) -> dict[str, str]:
 
 
 def refuse_other_render_version(tree: Tree) -> None:
-    """Raise if the repo has another render version, because two versions undo each other's work.
+    """Raise if another version renders this repo, because two versions undo each other's work.
 
     Raises:
-        StateRepoError: names the version and the remedy.
+        StateRepoError: names the version or the file of a newer version, and the remedy.
     """
+    for folder in RESERVED_FOLDERS:
+        if trees.entry_id(tree, folder) is not None:
+            raise StateRepoError(
+                f"{folder}: only a newer generator writes this folder; update the generator"
+            )
     try:
         data = strict_yaml.load(trees.read_text(tree, ROOT_FILE) or "")
     except InvalidInput:
