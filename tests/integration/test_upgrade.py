@@ -457,4 +457,4 @@ def test_an_upgrade_that_is_reverted_gives_the_repo_back_to_the_older_program(
 def test_a_newer_program_lays_down_a_repo_of_its_own_version(newer: Run, tmp_path: Path) -> None:
     folder = tmp_path / "fleet"
     assert newer("init", str(folder)).code == 0
-    assert "renderVersion: 2\n" in (folder / ROOT_FILE).read_text()
+    assert "renderVersion: 3\n" in (folder / ROOT_FILE).read_text()
