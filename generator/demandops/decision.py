@@ -18,8 +18,6 @@ from demandops.config.config import Config
 from demandops.connections.connection import Connection
 from demandops.demand import (
     admission,
-    approval_rule,
-    connection_type_choice,
     decommission_goal,
     demand_goal,
     deployment_request_goal,
@@ -35,9 +33,9 @@ from demandops.ledger.operations.restoration import Restoration
 from demandops.ledger.world import World
 from demandops.plan import implied_connections
 from demandops.plan.checks import denial, quota
-from demandops.plan.connection_clients import is_bridged
-from demandops.plan.overrides import kept_claims
-from demandops.plan.overrides.suspended_claims import without_suspended
+from demandops.plan.overrides import claim_overrides
+from demandops.plan.overrides.claim_overrides import without_suspended
+from demandops.plan.planner import is_bridged
 from demandops.plan.release_keys import affected_keys, all_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
@@ -153,7 +151,7 @@ def decide(
             *rendered.blocked,
             *denial.warnings(request, after),
         ),
-        approval=approval_rule.approval_reasons(
+        approval=permission.approval_reasons(
             request, ((c.before, c.after) for c in changes.claims), state.config
         ),
         overrides=rendered.overrides,
@@ -167,13 +165,15 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
         Refused: if existing claims, an override or a quota forbid it.
     """
     subjects = request.subjects()
-    ledger, changes = apply(kept_claims.without_kept_claims(state.ledger, subjects), request, now)
+    ledger, changes = apply(
+        claim_overrides.without_kept_claims(state.ledger, subjects), request, now
+    )
     after = replace(state, ledger=ledger)
     refusals = list(denial.faults(request, after, changes))
     refusals = refusals or list(quota.faults(state, after, changes))
     if refusals:
         raise Refused(refusals)
-    return kept_claims.with_kept_claims(state.ledger, after, changes, subjects, now)
+    return claim_overrides.with_kept_claims(state.ledger, after, changes, subjects, now)
 
 
 def admit(
@@ -196,7 +196,7 @@ def admit(
         if wired is None:
             raise Refused(faults)
         request = permission.with_lease_terms(wired, config)
-    request = connection_type_choice.with_chosen_types(request, config, state.ledger.connection)
+    request = admission.with_chosen_types(request, config, state.ledger.connection)
     malformed = {found.field for found in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
     content = [*admission.faults(request, config), *permission.faults(request, config)]

@@ -17,11 +17,12 @@ from demandops import naming
 from demandops.config.config import BROKERS_FILE, IMAGES_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Broker
-from demandops.connections.communication_client import ClientKey, End
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
+    ClientKey,
     Connections,
     ConnectionType,
+    End,
     make_end,
     unplannable,
 )

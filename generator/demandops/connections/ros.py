@@ -15,12 +15,13 @@ from typing import Any
 from demandops import naming
 from demandops.config.config import NODES_FILE, Config
 from demandops.config.inventory import Node, Wan
-from demandops.connections.communication_client import ClientKey, End
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,
+    ClientKey,
     Connections,
     ConnectionType,
+    End,
     make_end,
     unplannable,
 )

@@ -17,10 +17,11 @@ from demandops import naming
 from demandops.config.config import NODES_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Node
-from demandops.connections.communication_client import Client, ClientKey
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,
+    Client,
+    ClientKey,
     Connections,
     ConnectionType,
     unplannable,

@@ -5,15 +5,15 @@ It uses appdefs, inventory, brokers and access domains, but not the ledger.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from demandops.config.config import Config
+from demandops.connections import connection_types
 from demandops.connections.connection import Connection
-from demandops.demand import connection_type_choice
 from demandops.demand import demand_request as shape
 from demandops.demand.application import Application
-from demandops.demand.demand_request import DemandRequest
+from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest
 from demandops.errors import Fault, fault, quoted, suggestion
 
 
@@ -79,11 +79,11 @@ def _connection(connection: Connection, config: Config) -> Iterator[Fault]:
     yield from _node("source", connection.source, config)
     yield from _node("target", connection.target, config)
     if connection.type is not None:
-        yield from connection_type_choice.type_faults(connection.type, connection, config)
-    elif {*connection.nodes} <= config.nodes.keys() and connection_type_choice.choose_type(
+        yield from connection_types.type_faults(connection.type, connection, config)
+    elif {*connection.nodes} <= config.nodes.keys() and connection_types.choose_type(
         connection, config
     ) is None:
-        yield connection_type_choice.no_type_fault(connection, config)
+        yield connection_types.no_type_fault(connection, config)
 
 
 def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
@@ -102,3 +102,22 @@ def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
             "policy/access-domains.yaml",
             code="no-access-domain",
         )
+
+
+def with_chosen_types(
+    request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
+) -> AnyRequest:
+    """Return ``request`` with a type for each connection that has none.
+
+    A claimed connection keeps its current type. A new one gets the first type that can carry it
+    (:func:`connection_types.type_faults`); if no type can, it still has none.
+    """
+
+    def chosen(one: Demanded) -> Demanded:
+        if not isinstance(one.held, Connection) or one.held.type is not None:
+            return one
+        claimed = current(one.held.id)
+        found = claimed.type if claimed else connection_types.choose_type(one.held, config)
+        return replace(one, held=replace(one.held, type=found))
+
+    return replace(request, demanded=tuple(map(chosen, request.demanded)))

@@ -17,8 +17,7 @@ import jsonschema_rs
 
 from demandops.config.base_model import field_path
 from demandops.config.config import IMAGES_FILE, Config
-from demandops.connections.communication_client import Client
-from demandops.connections.connection_type import unplannable
+from demandops.connections.connection_type import Client, unplannable
 from demandops.errors import InvalidInput, fault
 from demandops.render.engine import Engine
 from demandops.settings import data_folder

@@ -18,9 +18,8 @@ import yaml
 from demandops import naming, settings
 from demandops.config.config import NODES_FILE, Config
 from demandops.connections import connection_types
-from demandops.connections.communication_client import Client, ClientKey
 from demandops.connections.connection import Connection
-from demandops.connections.connection_type import Connections, ConnectionType
+from demandops.connections.connection_type import Client, ClientKey, Connections, ConnectionType
 from demandops.decision import Decision
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file

@@ -20,8 +20,8 @@ from demandops.config.override_conflict import (
 )
 from demandops.config.policy import matches
 from demandops.plan.checks import trial_demands
+from demandops.plan.overrides.claim_overrides import Traits, fits
 from demandops.plan.overrides.release_overrides import apply_effects, effects_on
-from demandops.plan.overrides.selectors import Traits, fits
 from demandops.plan.release import ServiceRelease
 from hypothesis import example, given
 from hypothesis import strategies as st

@@ -17,7 +17,7 @@ from demandops.cli.json_output import (
 from demandops.config.override import Override
 from demandops.demand.claim import Claim
 from demandops.ledger.world import World
-from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
+from demandops.plan.overrides.claim_overrides import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import release_causes
 from demandops.staterepo.history.commit_log import LogEntry

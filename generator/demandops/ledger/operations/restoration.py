@@ -2,7 +2,7 @@
 
 It releases newer claims only if the request says so. A restored lease runs for its full term from
 now on, because its old end may have passed. Claims that an override keeps belong to no demand;
-:mod:`demandops.plan.overrides.kept_claims` updates them after every change.
+:mod:`demandops.plan.overrides.claim_overrides` updates them after every change.
 """
 
 from __future__ import annotations

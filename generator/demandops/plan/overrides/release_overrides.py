@@ -12,8 +12,7 @@ from demandops.config.config import Config
 from demandops.config.override import Override, Shaping
 from demandops.demand.claim import Claim
 from demandops.ledger.world import World
-from demandops.plan.overrides.selectors import Traits, selects
-from demandops.plan.overrides.suspended_claims import denied_by
+from demandops.plan.overrides.claim_overrides import Traits, denied_by, selects
 from demandops.plan.release import Release, ServiceRelease, claims_of
 
 
