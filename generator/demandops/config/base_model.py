@@ -109,10 +109,15 @@ def field_path(location: tuple[int | str, ...]) -> str:
     return path if path.isprintable() else path.encode("unicode_escape").decode()
 
 
-def faults_of(error: ValidationError, model: type[BaseModel], file: str = "") -> list[Fault]:
-    """Return every fault of a failed validation."""
+def faults_of(
+    error: ValidationError,
+    model: type[BaseModel],
+    file: str = "",
+    place: tuple[int | str, ...] = (),
+) -> list[Fault]:
+    """Return every fault of a failed validation of the value at ``place`` in a file."""
     return [
-        fault(field_path(item["loc"]), _message(dict(item), model)).within(file)
+        fault(field_path((*place, *item["loc"])), _message(dict(item), model)).within(file)
         for item in error.errors(include_url=False)
     ]
 

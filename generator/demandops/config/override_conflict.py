@@ -113,30 +113,14 @@ def _shared(one: Selector, other: Selector, appdef: ApplicationDefinition) -> bo
 
 def patterns_overlap(one: str, other: str) -> bool:
     """Return whether any text matches both patterns (``*`` any characters, ``?`` one)."""
-    reached = {0}  # positions in ``other`` that the part of ``one`` read so far can match
-    reached |= _past_stars(other, reached)
-    for part in one:
-        if part == "*":  # it matches everything that follows in the other
-            reached = set(range(min(reached), len(other) + 1)) if reached else set()
-            continue
-        after = set()
-        for position in reached:
-            if position < len(other) and other[position] == "*":
-                after.add(position)
-            elif position < len(other) and (
-                part == other[position] or "?" in (part, other[position])
-            ):
-                after.add(position + 1)
-        reached = after | _past_stars(other, after)
-    return len(other) in reached
-
-
-def _past_stars(pattern: str, positions: set[int]) -> set[int]:
-    """Return the positions after the stars that follow, if each matches no characters."""
-    found = set()
-    for position in positions:
-        here = position
-        while here < len(pattern) and pattern[here] == "*":
-            here += 1
-            found.add(here)
-    return found
+    # whether what was read of ``one`` overlaps with each beginning of ``other``
+    row = [not other[:length].strip("*") for length in range(len(other) + 1)]
+    for a in one:
+        after = [row[0] and a == "*"]
+        for b, above, before in zip(other, row[1:], row, strict=False):
+            if "*" in (a, b):
+                after.append(above or after[-1])
+            else:
+                after.append(before and (a == b or "?" in (a, b)))
+        row = after
+    return row[-1]

@@ -21,13 +21,13 @@ from demandops.subject import SubjectKind
 class ServiceEntry:
     """One service: its requesters and its inputs (role → sorted topics)."""
 
-    applications: tuple[str, ...]
+    applications: list[str]
     service: str
     node: str
     source: str | None
     source_topic: str | None
     inputs: dict[str, list[str]]
-    requesters: tuple[str, ...]
+    requesters: list[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +36,8 @@ class ConnectionEntry:
 
     source: str
     target: str
-    topics: tuple[str, ...]
-    requesters: tuple[str, ...]
+    topics: list[str]
+    requesters: list[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class SuspendedEntry:
     kind: str
     id: str
     demand: str
-    requesters: tuple[str, ...]
+    requesters: list[str]
     override: str
     reason: str
 
@@ -61,7 +61,7 @@ class Bookkeeping:
 
     services: dict[str, ServiceEntry]
     connections: dict[str, ConnectionEntry]
-    suspended: tuple[SuspendedEntry, ...] = ()
+    suspended: list[SuspendedEntry]
 
 
 def bookkeeping(world: World) -> Bookkeeping:
@@ -70,7 +70,7 @@ def bookkeeping(world: World) -> Bookkeeping:
     for release in release_causes.releases(world):
         if isinstance(release, ServiceRelease):
             services[release.name] = ServiceEntry(
-                applications=release.applications,
+                applications=list(release.applications),
                 service=release.key.service,
                 node=release.node.id,
                 source=release.key.source,
@@ -79,7 +79,7 @@ def bookkeeping(world: World) -> Bookkeeping:
                     role: sorted({topic.topic for topic in topics})
                     for role, topics in release.inputs.items()
                 },
-                requesters=release.requesters,
+                requesters=list(release.requesters),
             )
     connections = {}
     active = without_suspended(world).ledger
@@ -90,27 +90,21 @@ def bookkeeping(world: World) -> Bookkeeping:
         connections[id] = ConnectionEntry(
             source=claims[0].connection.source,
             target=claims[0].connection.target,
-            topics=tuple(route.source for route in connection_topics(claims)),
-            requesters=tuple(sorted({who for claim in claims for who in claim.requesters})),
+            topics=[route.source for route in connection_topics(claims)],
+            requesters=sorted({who for claim in claims for who in claim.requesters}),
         )
-    return Bookkeeping(
-        services=dict(sorted(services.items())),
-        connections=connections,
-        suspended=tuple(_suspended(world)),
-    )
-
-
-def _suspended(world: World) -> Iterator[SuspendedEntry]:
-    for claim, override in suspended_claims(world):
-        kind = claim.subject.kind.value[:-1]
-        yield SuspendedEntry(
-            kind,
+    suspended = [
+        SuspendedEntry(
+            claim.subject.kind.value[:-1],
             claim.subject.id,
             claim.demand,
-            claim.requesters,
+            list(claim.requesters),
             override.path,
             override.reason,
         )
+        for claim, override in suspended_claims(world)
+    ]
+    return Bookkeeping(dict(sorted(services.items())), connections, suspended)
 
 
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
@@ -118,17 +112,10 @@ def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
 
     ``suspended`` is left out if it is empty.
     """
-    data = asdict(view)
-    for entry in data["services"].values():
-        entry["applications"] = list(entry["applications"])
-        entry["requesters"] = list(entry["requesters"])
-    for entry in data["connections"].values():
-        entry["topics"] = sorted(entry["topics"])
-        entry["requesters"] = list(entry["requesters"])
-    suspended = data.pop("suspended")
-    if suspended:
-        data["suspended"] = [one | {"requesters": list(one["requesters"])} for one in suspended]
-    return data | {"commit": commit}
+    data = asdict(view) | {"commit": commit}
+    if not view.suspended:
+        del data["suspended"]
+    return data
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +129,7 @@ class EntryChange:
     kind: Literal["service", "connection"]
     name: str
     change: Literal["added", "changed", "removed"]
-    requesters: tuple[str, ...]
+    requesters: list[str]
     lost: tuple[str, ...] = ()
     gained: tuple[str, ...] = ()
 
@@ -162,16 +149,15 @@ def _changes(
     kind: Literal["service", "connection"], old: dict[str, _Entry], new: dict[str, _Entry]
 ) -> Iterator[EntryChange]:
     for name in sorted({*old, *new}):
-        before, after = old.get(name), new.get(name)
-        if after is None and before is not None:
-            yield EntryChange(kind, name, "removed", before.requesters)
-        elif after is not None and before is None:
-            yield EntryChange(kind, name, "added", after.requesters)
-        elif before is not None and after is not None and before != after:
-            had, has = list(_facts(before)), list(_facts(after))
+        if name not in new:
+            yield EntryChange(kind, name, "removed", old[name].requesters)
+        elif name not in old:
+            yield EntryChange(kind, name, "added", new[name].requesters)
+        elif old[name] != new[name]:
+            had, has = list(_facts(old[name])), list(_facts(new[name]))
             lost = tuple(fact for fact in had if fact not in has)
             gained = tuple(fact for fact in has if fact not in had)
-            yield EntryChange(kind, name, "changed", after.requesters, lost, gained)
+            yield EntryChange(kind, name, "changed", new[name].requesters, lost, gained)
 
 
 def _facts(entry: _Entry) -> Iterator[str]:
