@@ -28,7 +28,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
             found = _application(one.held, config, request.adds_claims)
         else:
             found = _connection(one.held, config) if request.adds_claims else iter(())
-        yield from (replace(each, field=one.place.at(each.field)) for each in found)
+        yield from (replace(each, field=one.place(each.field)) for each in found)
 
 
 def _application(app: Application, config: Config, claiming: bool) -> Iterator[Fault]:

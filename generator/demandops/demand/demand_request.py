@@ -6,7 +6,7 @@ of their contents. How each is carried out: :mod:`demandops.ledger.apply`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
 
@@ -19,16 +19,13 @@ from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import id_problem, topic_problem
 from demandops.subject import Subject
 
+Place = Callable[[str], str]
+"""Maps a field of an application or connection (``inputs.ego_data[2].source``) to the goal's."""
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """The field of a goal that lists an application or a connection, to locate faults."""
 
-    field: str
-
-    def at(self, path: str) -> str:
-        """Return the goal's name for a field of the item (``inputs.ego_data[2].source``)."""
-        return f"{self.field}.{path}"
+def place_in(field: str) -> Place:
+    """Return the place of an item whose fields have the same names in the goal's ``field``."""
+    return lambda path: f"{field}.{path}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +41,7 @@ class Demanded:
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
         """Return a fault of a field of this item."""
-        return fault(self.place.at(path), message, code=code)
+        return fault(self.place(path), message, code=code)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,8 +152,8 @@ def faults(request: DemandRequest) -> Iterator[Fault]:
             code="empty",
         )
     for one in request.demanded:
-        yield from _id(one.place.at("id"), one.held.id)
-        yield from _requesters(one.place.at("requesters"), one.requesters)
+        yield from _id(one.place("id"), one.held.id)
+        yield from _requesters(one.place("requesters"), one.requesters)
         if isinstance(one.held, Application):
             yield from _application(one.place, one.held, request.adds_claims)
         else:
@@ -181,7 +178,7 @@ def _own_fields(request: DemandRequest) -> Iterator[Fault]:
 
 def _application(place: Place, app: Application, claiming: bool) -> Iterator[Fault]:
     if claiming or app.node:
-        yield from _id(place.at("node"), app.node)
+        yield from _id(place("node"), app.node)
     for role, topics in app.inputs.items():
         for position, topic in enumerate(topics):
             yield from _input(place, f"inputs.{role}[{position}]", topic, claiming)
@@ -190,30 +187,28 @@ def _application(place: Place, app: Application, claiming: bool) -> Iterator[Fau
 def _input(place: Place, path: str, topic: InputTopic, claiming: bool) -> Iterator[Fault]:
     problem = topic_problem(topic.topic)
     if problem:
-        yield fault(place.at(f"{path}.topic"), problem)
+        yield fault(place(f"{path}.topic"), problem)
     if claiming or topic.source:
-        yield from _id(place.at(f"{path}.source"), topic.source)
+        yield from _id(place(f"{path}.source"), topic.source)
     if topic.type:
-        yield from _id(place.at(f"{path}.type"), topic.type)
+        yield from _id(place(f"{path}.type"), topic.type)
 
 
 def _connection(place: Place, connection: Connection, claiming: bool) -> Iterator[Fault]:
     for end, node in (("source", connection.source), ("target", connection.target)):
         if claiming or node:
-            yield from _id(place.at(end), node)
+            yield from _id(place(end), node)
     if connection.broker:
-        yield from _id(place.at("broker"), connection.broker)
+        yield from _id(place("broker"), connection.broker)
     if claiming and not connection.topics:
-        yield fault(
-            place.at("topics"), "is empty; a connection carries at least one topic, list it"
-        )
+        yield fault(place("topics"), "is empty; a connection carries at least one topic, list it")
     for found in routes.faults("topics", connection.topics):
-        yield fault(place.at(found.field), found.message, code=found.code)
+        yield fault(place(found.field), found.message, code=found.code)
     same_place = connection.source and connection.source == connection.target
     for index, route in enumerate(connection.topics):
         if claiming and same_place and route.source == route.target:
             yield fault(
-                place.at(f"topics[{index}].target"),
+                place(f"topics[{index}].target"),
                 f"{quoted(route.target)} would feed itself, because source and target are both "
                 f"{quoted(connection.source)}; name another target node or topic",
             )
