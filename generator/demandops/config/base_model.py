@@ -184,5 +184,5 @@ def parse_file(model: type[Model], text: str, file: str) -> Model:
     data = strict_yaml.load(text, file)
     if not isinstance(data, dict):
         message = f"must be a mapping that starts with apiVersion: {API_VERSION}"
-        raise InvalidInput([fault("", message).within(file)])
+        raise InvalidInput.at("", message, file=file)
     return parse(model, data, file)

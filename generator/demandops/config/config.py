@@ -12,7 +12,7 @@ from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import Chart, Image
 from demandops.config.repo_settings import RepoSettings
-from demandops.errors import Refused, fault
+from demandops.errors import Refused
 
 CLUSTERS_FILE = "inventory/clusters.yaml"
 NODES_FILE = "inventory/nodes.yaml"
@@ -63,7 +63,7 @@ class Config:
                 f"demandops decommission {shlex.quote(id)}"
             )
             file = NODES_FILE if node is None else DOMAINS_FILE
-            raise Refused([fault("node", message, code="unknown-node").within(file)])
+            raise Refused.at("node", message, code="unknown-node", file=file)
         return node, domain
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:

@@ -22,7 +22,7 @@ from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
 from demandops.connections.connection import Connection
 from demandops.connections.route import Route
-from demandops.errors import Fault, Refused, fault
+from demandops.errors import Fault
 
 Side = Literal["source", "target"]
 
@@ -195,11 +195,6 @@ class ConnectionType(ABC):
             Refused: if connections contradict each other, or the configuration no longer has what
                 they need.
         """
-
-
-def unplannable(field: str, message: str, code: str = UNSUPPORTED) -> Refused:
-    """Return the error for a claimed connection that cannot be planned."""
-    return Refused([fault(field, message, code=code)])
 
 
 def make_end(

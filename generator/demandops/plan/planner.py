@@ -22,7 +22,7 @@ from demandops.connections.connection_types import route_faults
 from demandops.connections.route import Route
 from demandops.demand.application import InputTopic
 from demandops.demand.claim import Claim
-from demandops.errors import Refused, fault
+from demandops.errors import Refused
 from demandops.ledger.world import World
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
@@ -114,7 +114,7 @@ def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSo
         message = (
             f"demands that share {service.chart} request versions {versions}; request the same one"
         )
-        raise Refused([fault("version", message, code="conflict")])
+        raise Refused.at("version", message, code="conflict")
     return next(iter(charts.values()))
 
 
@@ -216,9 +216,8 @@ def _merged_parameters(
 def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> object:
     given = [claim.application.parameters[name] for claim in claims]
     if parameter.merge == "latest":
-        return max(claims, key=lambda claim: (claim.booked, claim.demand)).application.parameters[
-            name
-        ]
+        latest = max(claims, key=lambda claim: (claim.booked, claim.demand))
+        return latest.application.parameters[name]
     if parameter.merge == "union":
         items = [
             item for value in given for item in (value if isinstance(value, list) else [value])
@@ -233,31 +232,22 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
         ]
         if len(numbers) != len(given):
             odd = next(value for value in given if value not in numbers)
-            raise Refused(
-                [
-                    fault(
-                        f"parameters.{name}",
-                        f"{odd!r} is not a number, but the application "
-                        f"definition takes the {parameter.merge}",
-                    )
-                ]
+            message = (
+                f"{odd!r} is not a number, but the application definition takes the "
+                f"{parameter.merge}"
             )
+            raise Refused.at(f"parameters.{name}", message)
         return max(numbers) if parameter.merge == "max" else min(numbers)
     if any(value != given[0] for value in given):
         shown = " and ".join(
             f"{json.dumps(claim.application.parameters[name])} for {', '.join(claim.requesters)}"
             for claim in claims[:3]
         )
-        raise Refused(
-            [
-                fault(
-                    f"parameters.{name}",
-                    f"demands contradict each other: {shown}; agree, or have "
-                    "the application definition say how to merge them",
-                    code="conflict",
-                )
-            ]
+        message = (
+            f"demands contradict each other: {shown}; agree, or have the application definition "
+            "say how to merge them"
         )
+        raise Refused.at(f"parameters.{name}", message, code="conflict")
     return given[0]
 
 

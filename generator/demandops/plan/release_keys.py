@@ -14,7 +14,7 @@ from demandops.config.config import Config
 from demandops.connections.connection_type import ClientKey
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim
-from demandops.errors import Refused, fault
+from demandops.errors import Refused
 from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import without_suspended
@@ -172,13 +172,7 @@ def appdef_of(config: Config, name: str) -> ApplicationDefinition:
     """
     appdef = config.appdefs.get(name)
     if appdef is None:
-        raise Refused(
-            [
-                fault(
-                    "appdef",
-                    f"'{name}' is in use, but appdefs/{name} is gone; restore it",
-                    code="unknown-application",
-                ).within(f"appdefs/{name}/appdef.yaml")
-            ]
-        )
+        message = f"'{name}' is in use, but appdefs/{name} is gone; restore it"
+        file = f"appdefs/{name}/appdef.yaml"
+        raise Refused.at("appdef", message, code="unknown-application", file=file)
     return appdef
