@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -108,13 +109,26 @@ def short_repr(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "…"
 
 
+@contextmanager
+def _strict(file: str) -> Iterator[None]:
+    try:
+        yield
+    except yaml.YAMLError as error:
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+        where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        message = f"not valid YAML: {problem or str(error).splitlines()[0]}"
+        raise InvalidInput.at(where, message, file=file) from error
+    except _MISFITS as error:
+        raise InvalidInput.at("", _MISFIT, file=file) from error
+
+
 def load_all(text: str, file: str = "") -> Iterator[Any]:
     """Yield the documents of ``text``.
 
     Raises:
         InvalidInput: if it is not strict YAML; the fault names ``file``.
     """
-    try:
+    with _strict(file):
         depth = 0
         for event in yaml.parse(text, Loader=_Loader):
             depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
@@ -126,17 +140,6 @@ def load_all(text: str, file: str = "") -> Iterator[Any]:
                 message = "anchors and aliases (& and *) are not allowed; write the value out"
                 raise InvalidInput.at(where, message, file=file)
         yield from yaml.load_all(text, Loader=_StrictLoader)
-    except yaml.YAMLError as error:
-        raise _error_of(error, file) from error
-    except _MISFITS as error:
-        raise InvalidInput.at("", _MISFIT, file=file) from error
-
-
-def _error_of(error: yaml.YAMLError, file: str = "") -> InvalidInput:
-    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-    where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-    message = f"not valid YAML: {problem or str(error).splitlines()[0]}"
-    return InvalidInput.at(where, message, file=file)
 
 
 def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which models then parse
@@ -160,12 +163,8 @@ def load_rendered(text: str) -> Any:  # noqa: ANN401
     Raises:
         InvalidInput: if it is not valid YAML.
     """
-    try:
+    with _strict(""):
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
-    except yaml.YAMLError as error:
-        raise _error_of(error) from error
-    except _MISFITS as error:
-        raise InvalidInput.at("", _MISFIT) from error
 
 
 def dump(data: Mapping[str, Any]) -> str:

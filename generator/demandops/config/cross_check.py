@@ -19,7 +19,6 @@ from demandops.config.config import (
 from demandops.config.config_reader import ConfigReader
 from demandops.config.override import Override
 from demandops.config.override_conflict import check_override_conflicts
-from demandops.config.policy import matches
 from demandops.config.registry import ChartSource
 from demandops.connections import connection_types
 from demandops.errors import InvalidInput, suggestion
@@ -193,8 +192,7 @@ def _versions_for(override: Override, config: Config) -> set[str]:
         for appdef in config.appdefs.values()
         for name, service in appdef.services.items()
         for selector in override.select
-        if (not selector.services or matches(name, selector.services))
-        and (not selector.appdefs or matches(appdef.name, selector.appdefs))
+        if selector.takes(name, appdef.name)
     }
     return {
         known for chart in charts & {*config.charts} for known in config.charts[chart].versions()

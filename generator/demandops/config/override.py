@@ -26,6 +26,7 @@ from demandops.config.base_model import (
     without,
 )
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
+from demandops.config.policy import matches
 from demandops.config.registry import Digest, Image, Repository, Tag
 from demandops.errors import quoted
 from demandops.identifiers import id_problem
@@ -131,6 +132,12 @@ class Selector(FrozenModel):
                 f"nothing matches both connections and {others[0]}; write two selectors"
             )
         return self
+
+    def takes(self, service: str, appdef: str) -> bool:
+        """Return whether ``services`` and ``appdefs`` let a service of an appdef match."""
+        return (not self.services or matches(service, self.services)) and (
+            not self.appdefs or matches(appdef, self.appdefs)
+        )
 
 
 class ImagePin(FrozenModel):

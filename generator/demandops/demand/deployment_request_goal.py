@@ -145,20 +145,16 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
             known = ", ".join(known.label for known in by_number())
             message = f"{connection.type} is not a connection type; known: {known}"
             faults.append(fault(f"{where}.type", message, code="unknown-connection-type"))
-    # without a valid "shutdown", only the rules of both operations apply, which are a shutdown's
-    operation = Shutdown if goal.shutdown or "shutdown" in faulty else Join
-    request = operation(id=goal.id, demanded=tuple(demanded))
-    for index, connection in enumerate(goal.connections):
         sources, targets = len(connection.source_topics), len(connection.target_topics)
         if sources != targets:
-            faults.append(
-                fault(
-                    f"connections[{index}].target_topics",
-                    f"has {targets} names for {sources} in source_topics; source topic i goes to "
-                    "target topic i, so list as many of each",
-                )
+            message = (
+                f"has {targets} names for {sources} in source_topics; source topic i goes to "
+                "target topic i, so list as many of each"
             )
-    return request, faults
+            faults.append(fault(f"{where}.target_topics", message))
+    # without a valid "shutdown", only the rules of both operations apply, which are a shutdown's
+    operation = Shutdown if goal.shutdown or "shutdown" in faulty else Join
+    return operation(id=goal.id, demanded=tuple(demanded)), faults
 
 
 def form_faults(data: object) -> list[Fault]:
@@ -172,18 +168,12 @@ def _not_a_mapping() -> Fault:
     return fault("", "a request is a mapping with id, apps, connections and shutdown")
 
 
-def _wire_inputs(appdef: ApplicationDefinition | None) -> Mapping[str, str]:
-    """Return the appdef's mapping of the message's topic lists to roles."""
-    if appdef is None or appdef.deployment_request is None:
-        return {}
-    return {str(name): role for name, role in appdef.deployment_request.inputs.items()}
-
-
 def _application(
     where: str, app: WireApplication, appdef: ApplicationDefinition | None
 ) -> Demanded:
     body = app.object_detection_fusion_app
-    roles = _wire_inputs(appdef)
+    wire = appdef.deployment_request if appdef else None
+    roles = {str(name): role for name, role in wire.inputs.items()} if wire else {}
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for name in ("ego_data_topics", "pointcloud_topics"):
         topics: list[WireTopic] = getattr(body, name)

@@ -21,17 +21,13 @@ from demandops.connections.connection_type import ConnectionType
 from demandops.connections.connection_types import route_faults
 from demandops.connections.route import Route
 from demandops.demand.application import InputTopic
-from demandops.demand.claim import Claim
+from demandops.demand.claim import Claim, requesters_of
 from demandops.errors import Refused
 from demandops.ledger.world import World
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
-from demandops.plan.release_keys import (
-    ReleaseKey,
-    appdef_of,
-    claims_needing,
-)
+from demandops.plan.release_keys import ReleaseKey, appdef_of, claims_needing
 
 
 def plan(world: World, key: ReleaseKey) -> Release | None:
@@ -94,16 +90,11 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         parameters=MappingProxyType(values),
         replicas=_replicas(service.scaling, sum(map(len, inputs.values()))),
         applications=users,
-        requesters=_requesters(claims),
+        requesters=requesters_of(claims),
     )
 
 
 def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSource:
-    """Return the chart in the version that the claims request, or the default version.
-
-    Raises:
-        Refused: if applications that share the service ask for different versions.
-    """
     chart = config.charts[service.chart]
     wanted = {claim.application.version for claim in claims}
     charts = {version: chart.at(version) or chart for version in wanted}
@@ -118,10 +109,6 @@ def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSo
     return next(iter(charts.values()))
 
 
-def _requesters(claims: Iterable[Claim]) -> tuple[str, ...]:
-    return tuple(sorted({who for claim in claims for who in claim.requesters}))
-
-
 def _shared_input(claims: Iterable[Claim], role: str, key: ServiceKey) -> tuple[InputTopic, ...]:
     source, topic = str(key.source), str(key.topic)
     inputs = (one for claim in claims for one in claim.application.inputs_from(role, source, topic))
@@ -129,10 +116,7 @@ def _shared_input(claims: Iterable[Claim], role: str, key: ServiceKey) -> tuple[
 
 
 def _application_inputs(
-    config: Config,
-    appdef: ApplicationDefinition,
-    service: Service,
-    claims: tuple[Claim, ...],
+    config: Config, appdef: ApplicationDefinition, service: Service, claims: Iterable[Claim]
 ) -> dict[str, tuple[InputTopic, ...]]:
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for role, origin in sorted(service.inputs.items()):

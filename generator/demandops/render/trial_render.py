@@ -8,7 +8,6 @@ from datetime import datetime, timezone
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.config.policy import matches
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.demand_request import Demanded, Join
 from demandops.errors import Fault, InvalidInput
@@ -59,9 +58,7 @@ def overridden_releases(
     for release in trials:
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
         if effects and any(
-            not selector.connections
-            and (not selector.services or matches(release.key.service, selector.services))
-            and (not selector.appdefs or matches(appdef, selector.appdefs))
+            not selector.connections and selector.takes(release.key.service, appdef)
             for selector in override.select
         ):
             shaped = apply_effects(release, [(override, effects)], config)

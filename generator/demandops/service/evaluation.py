@@ -9,7 +9,7 @@ import logging
 from datetime import datetime
 
 from demandops.decision import Decision, Outcome, decide
-from demandops.demand import decommission_goal
+from demandops.demand.demand_request import Decommission
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
 from demandops.service.approvals.approvals import Approvals
@@ -125,7 +125,7 @@ def _receipt_of_published(
         message = "was refused, but the reason was lost with the connection; send it again"
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal
-    releases = is_release(goal) or decommission_goal.is_decommission(goal)
+    releases = is_release(goal) or Decommission.is_goal(goal)
     outcome: Outcome = "released" if releases else "booked"
     if rollback_goal.is_rollback(goal):
         outcome = "restored"

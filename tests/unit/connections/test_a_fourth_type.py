@@ -184,7 +184,7 @@ def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
     subject = Subject(SubjectKind.CONNECTION, "c")
     (release,) = release_causes.releases(world.state, subject)
     assert release_causes.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
-    files = [(one.file, one.entry) for one in release_causes.shaping_files(release, world.config)]
+    files = [each[:2] for each in release_causes.shaping_files(release, world.config)]
     assert ("inventory/nodes.yaml", "edge.wan") in files
     assert ("registry/images.yaml", "images.relay") in files
 

@@ -27,10 +27,13 @@ from demandops.subject import Subject
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """The values that a selector is compared with; only a service's release has a ``service``."""
+    """The values that a selector is compared with; only a service's release has a ``service``.
+
+    Without ``requesters``, those of a selector are ignored.
+    """
 
     nodes: tuple[str, ...]
-    requesters: tuple[str, ...]
+    requesters: tuple[str, ...] | None
     applications: tuple[str, ...] = ()
     appdefs: tuple[str, ...] = ()
     connections: tuple[str, ...] = ()
@@ -45,23 +48,21 @@ def traits_of(one: Claim | Demanded) -> Traits:
     return Traits(held.nodes, one.requesters, connections=(held.id,))
 
 
-def fits(
-    selector: Selector, traits: Traits, config: Config, *, any_requester: bool = False
-) -> bool:
-    """Return whether every field of a selector matches; ``any_requester`` ignores requesters."""
+def fits(selector: Selector, traits: Traits, config: Config) -> bool:
+    """Return whether every field of a selector matches."""
     fields = (
         (selector.applications, traits.applications),
         (selector.appdefs, traits.appdefs),
         (selector.services, (traits.service,) if traits.service else ()),
         (selector.connections, traits.connections),
         (selector.nodes, traits.nodes),
-        (None if any_requester else selector.requesters, traits.requesters),
+        (selector.requesters, traits.requesters),
     )
-    if any(
-        patterns is not None and not any(matches(value, patterns) for value in values)
-        for patterns, values in fields
-    ):
-        return False
+    for patterns, values in fields:
+        if patterns is None or values is None:
+            continue
+        if not any(matches(value, patterns) for value in values):
+            return False
     return not selector.labels or any(has_labels(selector, node, config) for node in traits.nodes)
 
 
@@ -72,13 +73,9 @@ def has_labels(selector: Selector, node: str, config: Config) -> bool:
     return all(labels.get(key) == value for key, value in (selector.labels or {}).items())
 
 
-def selects(
-    override: Override, traits: Traits, config: Config, *, any_requester: bool = False
-) -> bool:
+def selects(override: Override, traits: Traits, config: Config) -> bool:
     """Return whether one of an override's selectors matches."""
-    return any(
-        fits(selector, traits, config, any_requester=any_requester) for selector in override.select
-    )
+    return any(fits(selector, traits, config) for selector in override.select)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,9 +223,8 @@ def keeping_overrides(claim: Claim, world: World) -> list[Override]:
     A kept claim names the owner as its requester, so ``requesters`` of the selector is ignored: it
     was matched against the original claim.
     """
-    traits, any_requester = traits_of(claim), claim.keeping_override is not None
-    return [
-        one
-        for one in reversed(world.overrides)
-        if one.keep and selects(one, traits, world.config, any_requester=any_requester)
-    ]
+    traits = traits_of(claim)
+    if claim.keeping_override is not None:
+        traits = replace(traits, requesters=None)
+    keeping = (one for one in reversed(world.overrides) if one.keep)
+    return [one for one in keeping if selects(one, traits, world.config)]

@@ -15,7 +15,7 @@ from demandops.demand.claim import ClaimKey
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
-from demandops.plan.overrides import claim_overrides
+from demandops.plan.overrides.claim_overrides import kept_subjects, update_kept_claims
 from demandops.subject import Subject
 
 
@@ -64,12 +64,10 @@ def update_ledger(
         files |= _marker(override)
     after = replace(after, ledger=replace(after.ledger, ended=ended))
     kept = (
-        *claim_overrides.kept_subjects(before.ledger),
-        *claim_overrides.kept_subjects(after.ledger),
+        *kept_subjects(before.ledger),
+        *kept_subjects(after.ledger),
     )
-    ledger, keys = claim_overrides.update_kept_claims(
-        before.ledger, after, dict.fromkeys((*subjects, *kept)), now
-    )
+    ledger, keys = update_kept_claims(before.ledger, after, dict.fromkeys((*subjects, *kept)), now)
     files |= changed_claim_files(after.ledger, ledger, keys)
     return LedgerUpdate(ledger, tuple(keys), files)
 

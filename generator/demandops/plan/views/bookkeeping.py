@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
+from demandops.demand.claim import requesters_of
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import suspended_claims, without_suspended
 from demandops.plan.planner import connection_topics
@@ -91,7 +92,7 @@ def bookkeeping(world: World) -> Bookkeeping:
             source=claims[0].connection.source,
             target=claims[0].connection.target,
             topics=[route.source for route in connection_topics(claims)],
-            requesters=sorted({who for claim in claims for who in claim.requesters}),
+            requesters=list(requesters_of(claims)),
         )
     suspended = [
         SuspendedEntry(
