@@ -15,12 +15,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from demandops.config.config import Config
-from demandops.demand import (
-    admission,
-    demand_goal,
-    deployment_request_goal,
-    permission,
-)
+from demandops.demand import admission, demand_goal, deployment_request_goal, permission
 from demandops.demand.application import Application
 from demandops.demand.demand_request import Decommission, DemandRequest
 from demandops.errors import Fault, InvalidInput, Refused

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from demandops.config.appdef import ApplicationDefinition, Service
 from demandops.config.inventory import Broker, Cluster, Node
@@ -44,10 +44,6 @@ class Config:
     domain_of: Mapping[str, AccessDomain]
     files: Mapping[str, str]
     overrides: Mapping[str, Override] = field(default_factory=dict)
-
-    def without_overrides(self) -> Config:
-        """Return the configuration without any override."""
-        return replace(self, overrides={})
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
         """Return a node and its access domain.

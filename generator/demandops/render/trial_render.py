@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from datetime import datetime, timezone
 
 from demandops.config.appdef import ApplicationDefinition
@@ -33,7 +34,7 @@ def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
     node = next(iter(sorted(config.domain_of)), None)
     if node is None:
         return {}
-    plain = config.without_overrides()
+    plain = replace(config, overrides={})
     return {appdef.name: list(_services(appdef, node, plain)) for appdef in config.appdefs.values()}
 
 

@@ -63,10 +63,7 @@ def update_ledger(
     for override in expired:
         files |= _marker(override)
     after = replace(after, ledger=replace(after.ledger, ended=ended))
-    kept = (
-        *kept_subjects(before.ledger),
-        *kept_subjects(after.ledger),
-    )
+    kept = (*kept_subjects(before.ledger), *kept_subjects(after.ledger))
     ledger, keys = update_kept_claims(before.ledger, after, dict.fromkeys((*subjects, *kept)), now)
     files |= changed_claim_files(after.ledger, ledger, keys)
     return LedgerUpdate(ledger, tuple(keys), files)
