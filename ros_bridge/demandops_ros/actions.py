@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from application_manager_interfaces.action import DeploymentRequest
 from builtin_interfaces.msg import Duration
-from demandops.cluster.health import Level
+from demandops.cluster.health.release_health import Level
 from demandops.decision import refusal_text
 from demandops.errors import (
     DemandOpsError,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from demandops.cluster.health import Level
+from demandops.cluster.health.release_health import Level
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.errors import NotReached, QueueFull, ShuttingDown, Withdrawn
 from demandops.runtime import REAL

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from demandops.cluster.health import ClusterDomain, ObjectName, Target
+from demandops.cluster.health.release_health import ClusterDomain, ObjectName, Target
 from demandops.config.repo_settings import RepoSettings
 from demandops.decision import Decision, State
 from demandops.demand.demand_request import DemandRequest

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
-from demandops.cluster.health import Target
+from demandops.cluster.health.release_health import Target
 from demandops.decision import Decision, Outcome
 from demandops.errors import Refused, fault
 from demandops.ledger.ledger import ClaimChange
