@@ -15,9 +15,10 @@ import rclpy
 from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_watcher import RolloutWatcher
+from demandops.input_file import read_secret
 from demandops.runtime import REAL
-from demandops.service import Generator, push_webhook
-from demandops.service.http_server import HttpServer
+from demandops.service import Generator
+from demandops.service.push_webhook import PushWebhook
 from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
 from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from rcl_interfaces.msg import ParameterDescriptor
@@ -121,7 +122,7 @@ def serve(
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
         settings = _read_parameters(state_repo, fetch_interval)
-        secret = push_webhook.read_secret(webhook_secret_file) if webhook_secret_file else b""
+        secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
         with progress("reading the ledger") as report:
             generator = Generator(
@@ -134,10 +135,9 @@ def serve(
         trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
         generator.on_publish(trigger)
         trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
-        route = push_webhook.PushWebhook(secret, generator.fetch_now).route
-        http_server = HttpServer(webhook, [route], local_only=not secret) if webhook else None
+        push_webhook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
         status = RolloutWatcher(clusters, generator) if clusters else None
-        _run(generator, settings, status, http_server)
+        _run(generator, settings, status, push_webhook)
         trigger.close()
     finally:
         rclpy.try_shutdown()
@@ -193,7 +193,7 @@ def _run(
     generator: Generator,
     settings: dict[str, Any],
     status: RolloutWatcher | None,
-    http_server: HttpServer | None,
+    push_webhook: PushWebhook | None,
 ) -> None:
     node = DemandNode(
         generator,
@@ -218,11 +218,11 @@ def _run(
     spinner = REAL.start_thread("executor", executor.spin)
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
-    if http_server is not None:
-        node.get_logger().info(f"listening for pushes at {http_server.url}{push_webhook.PATH}")
+    if push_webhook is not None:
+        node.get_logger().info(f"listening for pushes at {push_webhook.url}")
     signals.wait()
-    if http_server is not None:
-        http_server.close()
+    if push_webhook is not None:
+        push_webhook.close()
     _drain(executor, node, generator, status)
     executor.shutdown(timeout_sec=1)
     spinner.join(5)
