@@ -13,7 +13,7 @@ from demandops.service.remote_status import StateRepoStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-PERIOD_S = 1.0
+_PERIOD_S = 1.0
 _MOST_PROBLEMS = 20
 
 
@@ -23,18 +23,14 @@ class Diagnostics:
     def __init__(self, node: Node, generator: Generator) -> None:
         self._node, self._generator = node, generator
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = node.create_timer(PERIOD_S, self._publish)
+        self._timer = node.create_timer(_PERIOD_S, self._publish)
 
     def _publish(self) -> None:
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        message.status = statuses(self._generator.state_repo_status, self._generator.address)
+        status, address = self._generator.state_repo_status, self._generator.address
+        message.status = [_of_state_repo(status, address), _of_configuration(status, address)]
         self._publisher.publish(message)
-
-
-def statuses(status: StateRepoStatus, address: str) -> list[DiagnosticStatus]:
-    """Return the two diagnostic statuses of a state repo."""
-    return [_of_state_repo(status, address), _of_configuration(status, address)]
 
 
 def _of_state_repo(status: StateRepoStatus, address: str) -> DiagnosticStatus:
@@ -58,16 +54,15 @@ def _of_state_repo(status: StateRepoStatus, address: str) -> DiagnosticStatus:
 
 
 def _of_configuration(status: StateRepoStatus, address: str) -> DiagnosticStatus:
-    problems = [str(problem) for problem in status.problems]
+    problems, count = status.problems[:_MOST_PROBLEMS], len(status.problems)
     level, text = DiagnosticStatus.OK, "all files are valid"
-    if problems:
-        level = DiagnosticStatus.WARN
-        text = f"{len(problems)} problems; the last valid version is in effect"
-    values = {
-        f"problem {number}": problem
-        for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1)
-    }
-    values = {"problems": str(len(problems))} | values
+    if count:
+        level, text = (
+            DiagnosticStatus.WARN,
+            f"{count} problems; the last valid version is in effect",
+        )
+    values = {f"problem {number}": str(each) for number, each in enumerate(problems, start=1)}
+    values = {"problems": str(count)} | values
     return _status("demandops: configuration", address, level, text, values)
 
 

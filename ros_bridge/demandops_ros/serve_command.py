@@ -27,11 +27,10 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from demandops_ros.actions import ANSWER_LEVELS
+from demandops_ros.messages import ANSWER_LEVELS
 from demandops_ros.node import AnswerSettings, DemandNode
 
-_OF_ANY_TYPE = ParameterDescriptor(dynamic_typing=True)
-_LEVELS = ("debug", "info", "warn", "error", "fatal")
+_LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 _POLL_S = 0.02
 _TASK_S = 5.0
 _FLUSH_S = 0.3
@@ -47,7 +46,7 @@ class _RosLogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log a record at the matching ROS level."""
-        text = self.format(record)
+        text = self.format(record)  # one call for each level, because rclpy wants it so
         if record.levelno >= logging.ERROR:
             self._log.error(text)
         elif record.levelno >= logging.WARNING:
@@ -145,25 +144,24 @@ def serve(
 
 def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
     """Read the node's parameters with a probe, because the generator starts before the node."""
+    defaults = {
+        "action_name": DEFAULT_ACTION_NAME,
+        "demand_action_name": DEFAULT_DEMAND_ACTION_NAME,
+        "answer": ANSWER_LEVELS[0],
+        "answer_timeout": 120.0,
+        "state_repo": state_repo or "",
+        "fetch_interval": fetch_interval or DEFAULT_INTERVAL,
+        "log_level": "info",
+    }
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
     try:
         values = {
-            "action_name": probe.declare_parameter("action_name", DEFAULT_ACTION_NAME).value,
-            "demand_action_name": probe.declare_parameter(
-                "demand_action_name", DEFAULT_DEMAND_ACTION_NAME
-            ).value,
-            "answer": probe.declare_parameter("answer", ANSWER_LEVELS[0]).value,
-            "answer_timeout": probe.declare_parameter("answer_timeout", 120.0).value,
-            "state_repo": probe.declare_parameter("state_repo", state_repo or "").value,
-            "fetch_interval": _as_text(
-                probe.declare_parameter(
-                    "fetch_interval", fetch_interval or DEFAULT_INTERVAL, _OF_ANY_TYPE
-                ).value
-            ),
-            "log_level": probe.declare_parameter("log_level", "info").value,
+            name: probe.declare_parameter(name, default, _descriptor(name)).value
+            for name, default in defaults.items()
         }
     finally:
         probe.destroy_node()
+    values["fetch_interval"] = _as_text(values["fetch_interval"])
     if not values["state_repo"]:
         raise click.UsageError(
             "no state repo given; use --state-repo URL_OR_DIR, DEMANDOPS_STATE_REPO or the ROS "
@@ -173,15 +171,17 @@ def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict
         parse_interval(values["fetch_interval"])
     except ValueError as error:
         raise click.UsageError(f"fetch interval: {error}") from None
-    if values["answer"] not in ANSWER_LEVELS:
-        raise click.UsageError(
-            f"parameter answer is '{values['answer']}'; it takes {', '.join(ANSWER_LEVELS)}"
-        )
-    if values["log_level"] not in _LEVELS:
-        raise click.UsageError(
-            f"parameter log_level is '{values['log_level']}'; it takes {', '.join(_LEVELS)}"
-        )
+    for name, choices in (("answer", ANSWER_LEVELS), ("log_level", _LOG_LEVELS)):
+        if values[name] not in choices:
+            raise click.UsageError(
+                f"parameter {name} is '{values[name]}'; it takes {', '.join(choices)}"
+            )
     return values
+
+
+def _descriptor(name: str, *, read_only: bool = False) -> ParameterDescriptor:
+    """Return a parameter's descriptor; a fetch interval may be of any type."""
+    return ParameterDescriptor(read_only=read_only, dynamic_typing=name == "fetch_interval")
 
 
 def _as_text(value: object) -> str:
@@ -204,9 +204,7 @@ def _run(
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
         # read only, because the parameters are read at the start
-        of_any_type = name == "fetch_interval"
-        descriptor = ParameterDescriptor(read_only=True, dynamic_typing=of_any_type)
-        node.declare_parameter(name, shown, descriptor)
+        node.declare_parameter(name, shown, _descriptor(name, read_only=True))
     set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
     library_log = logging.getLogger("demandops")
     library_log.handlers, library_log.propagate = [_RosLogHandler(node)], False
