@@ -48,26 +48,21 @@ class RemoteMonitor:
         self._address, self._runtime = address, runtime
         self.status = RemoteStatus()
 
-    @property
-    def is_unreachable(self) -> bool:
-        """Whether the last attempt to reach the remote failed."""
-        return bool(self.status.unreachable)
-
     def record_unreachable(self, reason: str) -> None:
         """Record that the remote cannot be reached; warn if it could be before."""
-        if not self.is_unreachable:
+        since = self.status.unreachable_since
+        if since is None:
             log.warning("%s; trying again until it is back", reason)
-            self.status = replace(self.status, unreachable_since=self._runtime.now())
         else:
             log.debug("%s", reason)
-        self.status = replace(self.status, unreachable=reason)
+        since = since or self._runtime.now()
+        self.status = replace(self.status, unreachable=reason, unreachable_since=since)
 
     def record_reached(self, *, pushed: bool = False) -> None:
         """Record that the remote was reached; log it if it could not be before."""
-        now = self._runtime.now()
-        before = self.status
-        if before.unreachable:
-            away = (now - (before.unreachable_since or now)).total_seconds()
+        now, before = self._runtime.now(), self.status
+        if before.unreachable_since is not None:
+            away = (now - before.unreachable_since).total_seconds()
             log.info("%s is back after %.0f s", self._address, away)
         self.status = RemoteStatus(
             push_denied="" if pushed else before.push_denied,

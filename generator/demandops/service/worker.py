@@ -18,8 +18,7 @@ from demandops.service.evaluation import Evaluator
 from demandops.service.remote_status import RemoteMonitor
 from demandops.service.ticket import Receipt, Ticket
 from demandops.service.timing.backoff import LIMIT_EMBEDDED, LIMIT_REMOTE, Backoff
-from demandops.service.timing.lease_expiry import LONGEST_WAIT_S, LeaseExpiry
-from demandops.service.timing.override_expiry import OverrideExpiry
+from demandops.service.timing.expiry import LONGEST_WAIT_S, LeaseExpiry, OverrideExpiry
 from demandops.service.timing.polling import PollTimer
 from demandops.staterepo.git.repository import (
     FetchInterrupted,
@@ -33,6 +32,7 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 log = logging.getLogger("demandops")
 
 _TIDY_EVERY = 300
+"""After how many commits to pack the repository; each adds about twenty loose objects."""
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
 
@@ -62,10 +62,8 @@ class Worker:
         self._timer = PollTimer(
             fetch_interval, repository.runtime, embedded=repository.always_current
         )
-        self._lease_expiry, self._override_expiry = (
-            LeaseExpiry(repository.runtime),
-            OverrideExpiry(),
-        )
+        self._lease_expiry = LeaseExpiry(repository.runtime)
+        self._override_expiry = OverrideExpiry()
         self._ahead = ReadAhead()
         self._batch_limit = LIMIT_EMBEDDED if repository.always_current else LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
@@ -107,7 +105,9 @@ class Worker:
                 self._publish(batch)
                 if self.snapshot.problems:  # a release may have made a change possible
                     self._try_to_carry_out_changes()
-                self._tidy()
+                if self._commits_since_tidy >= _TIDY_EVERY:
+                    self._commits_since_tidy = 0
+                    self._repository.tidy()
             else:
                 self._follow()
             self._check_proposals()
@@ -130,12 +130,6 @@ class Worker:
         seconds = self._override_expiry.seconds_until_due(state, self._runtime.now(), seconds)
         fetch = self._timer.seconds_until_due()
         return seconds if fetch is None else min(seconds, fetch)
-
-    def _tidy(self) -> None:
-        """Pack the repository every few hundred commits; each adds about twenty loose objects."""
-        if self._commits_since_tidy >= _TIDY_EVERY:
-            self._commits_since_tidy = 0
-            self._repository.tidy()
 
     # ---- publishing demands ----
 
@@ -174,7 +168,7 @@ class Worker:
             The seconds to wait before the next attempt, or None to continue at once.
         """
         # fetch first: a demand that was committed can no longer be withdrawn
-        if self._must_fetch or self.remote.is_unreachable:
+        if self._must_fetch or self.remote.status.unreachable:
             self._repository.refresh()
             self._must_fetch, self._tip_is_fresh = False, True
         self._demands.answer_withdrawn(batch)
@@ -236,9 +230,9 @@ class Worker:
         end = self._runtime.monotonic() + seconds
         to_notify = list(batch)
         while not self._stopped_retrying.is_set():
-            if self.remote.is_unreachable:
-                for ticket in to_notify:
-                    ticket.notify("away", f"waiting: {self.remote.status.unreachable}")
+            unreachable = self.remote.status.unreachable
+            for ticket in to_notify if unreachable else ():
+                ticket.notify("away", f"waiting: {unreachable}")
             self._demands.answer_withdrawn(batch)
             left = end - self._runtime.monotonic()
             if left <= 0:

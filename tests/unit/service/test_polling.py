@@ -105,7 +105,7 @@ def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCapt
     remote.record_reached()
     for _ in range(3):
         remote.record_unreachable("cannot be fetched: no route")
-    assert remote.is_unreachable and remote.status.unreachable == "cannot be fetched: no route"
+    assert remote.status.unreachable == "cannot be fetched: no route"
     clock.pass_(90)
     for _ in range(3):
         remote.record_reached(pushed=True)
@@ -113,13 +113,14 @@ def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCapt
         "cannot be fetched: no route; trying again until it is back",
         "https://git.example/state.git is back after 90 s",
     ]
-    assert not remote.is_unreachable and remote.status.last_push is not None
+    assert not remote.status.unreachable and remote.status.last_push is not None
 
 
 def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) -> None:
     remote = RemoteMonitor("somewhere", clock)
     remote.record_push_denied("takes no push: frozen")
     remote.record_reached()
-    assert remote.status.push_denied == "takes no push: frozen" and not remote.is_unreachable
+    assert remote.status.push_denied == "takes no push: frozen"
+    assert not remote.status.unreachable
     remote.record_reached(pushed=True)
     assert remote.status.push_denied == ""
