@@ -200,21 +200,6 @@ def _link(output: str) -> str:
     return next((link for link in links if "/merge_requests/" in link), "")
 
 
-def gitlab_options(title: str, description: str, labels: Iterable[str]) -> list[str]:
-    """Return the push options that make GitLab open a merge request.
-
-    Push options cannot hold line breaks, so the description has one line.
-    """
-    return [
-        "merge_request.create",
-        f"merge_request.target={MAIN_BRANCH}",
-        f"merge_request.title={title}",
-        f"merge_request.description={description}",
-        "merge_request.remove_source_branch",
-        *(f"merge_request.label={label}" for label in labels),
-    ]
-
-
 @dataclass(frozen=True, slots=True)
 class PendingProposal:
     """A proposal that awaits approval, described by its commits."""
