@@ -146,7 +146,8 @@ class Worker:
             try:
                 wait = self._attempt(batch, backoff)
             except RemoteAway as error:
-                _mark_maybe_published(batch, self.snapshot)
+                for ticket in batch:
+                    ticket.mark_maybe_published(str(self.snapshot.commit))
                 self._record_unreachable(error)
                 self._tip_is_fresh = self._repository.always_current
                 wait = backoff.unreachable()
@@ -188,19 +189,19 @@ class Worker:
             if self._repository.refresh() != commits.start.commit:
                 return None
         if self._publish_commits(commits, results):
-            self._answer(results)
             del batch[: len(part)]
             backoff.published()
             return None
         log.info("the state repo has moved; evaluating %d demands again", len(part))
-        _mark_maybe_published(part, commits.start)
+        for ticket in part:
+            ticket.mark_maybe_published(str(commits.start.commit))
         self._must_fetch = True
         return backoff.overtaken(
             len(part), evaluated - began, self._runtime.monotonic() - evaluated
         )
 
     def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
-        """Publish a commit batch; return False if another writer was first.
+        """Publish a commit batch and answer; return False if another writer was first.
 
         If the remote rejects the push for another reason, all demands get that error as the answer.
         """
@@ -209,21 +210,18 @@ class Worker:
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
             self.remote.record_push_denied(str(error))
-            return True
-        if not published:
-            return False
-        self._record_reached(pushed=not commits.is_empty)
-        self._set_snapshot(commits.head)
-        self._commits_since_tidy += len(results)
-        return True
-
-    def _answer(self, results: list[Result]) -> None:
-        """Answer the demands that have a final result; propose those that need approval."""
+        else:
+            if not published:
+                return False
+            self._record_reached(pushed=not commits.is_empty)
+            self._set_snapshot(commits.head)
+            self._commits_since_tidy += len(results)
         final = [(ticket, result) for ticket, result in results if not isinstance(result, Decision)]
         self._demands.answer(final)
         for ticket, result in results:
             if isinstance(result, Decision):
                 self._approvals.add(ticket, result)
+        return True
 
     def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
         """Wait; meanwhile journal new demands and report to them why they wait."""
@@ -336,8 +334,3 @@ class Worker:
         self._demands.blocked = str(error)
         self.remote.record_unreachable(str(error))
         self._timer.finished(reached=False)
-
-
-def _mark_maybe_published(batch: list[Ticket], start: Snapshot) -> None:
-    for ticket in batch:
-        ticket.mark_maybe_published(str(start.commit))

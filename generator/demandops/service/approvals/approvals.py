@@ -313,8 +313,8 @@ class Approvals:
 
     def _rebuild(self, proposal: Proposal, left: Decided, snapshot: Snapshot, head: str) -> bool:
         """Commit the demands on main and push the branch, unless it is up to date."""
-        read = CommitBatch(self._repository, snapshot).read
-        steps, failed = decide_in_turn(left, snapshot.state, read)
+        commits = CommitBatch(self._repository, snapshot)
+        steps, failed = decide_in_turn(left, snapshot.state, commits.read)
         self._demands.answer(failed)
         proposal.drop(failed)
         if not steps:
@@ -323,19 +323,22 @@ class Approvals:
         files = {path: text for _, step in steps for path, text in step.files.items()}
         if head and self._branches.is_up_to_date(tip, head, old.base, files):
             return True
-        demands = [(ticket.operation, ticket.received, step) for ticket, step in steps]
-        commit = self._branches.commit(proposal.branch, snapshot, demands, self._runtime.now())
-        commits = (head, str(commit)) if head else (str(commit),)
-        record = replace(old, commits=commits, base=str(tip))
+        now, branch = self._runtime.now(), proposal.branch
+        for ticket, step in steps:
+            if step.files:
+                commits.commit(step, ticket.operation, ticket.received, now, branch)
+        commit = commits.head.commit
+        newest = (head, str(commit)) if head else (str(commit),)
+        record = replace(old, commits=newest, base=str(tip))
         if not self._journal(proposal, record):
             return False
         forge, options = snapshot.state.config.repo_settings.proposals, []
         if forge.forge == "gitlab":
             message = self._branches.message(str(commit))
             options = push_options(message, proposal.reasons, forge.labels)
-        link = self._branches.put(proposal.branch, commit, head, options)
+        link = self._branches.put(branch, commit, head, options)
         self._journal(proposal, replace(record, pushed=True, link=link or old.link))
-        log.info("%s %s", proposal.branch, "was rebuilt" if head else "awaits approval")
+        log.info("%s %s", branch, "was rebuilt" if head else "awaits approval")
         return True
 
     def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:

@@ -48,10 +48,7 @@ class LeaseExpiry:
         demands = [demand for demand in ended if demand not in self._tried]
         self._tried |= dict.fromkeys(demands, now)
         requests = (Expire(id=demand, demand=demand) for demand in demands)
-        return [
-            Ticket(self._runtime.fresh_id(), request, now, lambda stage, text: None)
-            for request in requests
-        ]
+        return [Ticket(self._runtime.fresh_id(), request, now) for request in requests]
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
         """Return the time and the claims whose lease has ended, the first to end first.
