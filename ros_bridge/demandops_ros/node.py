@@ -10,7 +10,7 @@ from __future__ import annotations
 import uuid
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -35,18 +35,6 @@ DEEP_QOS = QoSProfile(depth=2000)
 """For the actions' services: with ROS's default of 10, goals that arrive at once are lost."""
 
 
-@dataclass(frozen=True, slots=True)
-class AnswerSettings:
-    """When to answer goals: at ``level`` if the goal names none, after ``timeout_s`` at the latest.
-
-    ``status`` watches rollouts; None without access to the clusters.
-    """
-
-    level: Level = "pushed"
-    timeout_s: float = 120.0
-    status: RolloutWatcher | None = None
-
-
 class DemandNode(Node):  # type: ignore[misc]
     """Serves ``DeploymentRequest`` and ``Demand`` for one state repo."""
 
@@ -55,12 +43,22 @@ class DemandNode(Node):  # type: ignore[misc]
         generator: Generator,
         action_name: str,
         demand_action_name: str,
-        answers: AnswerSettings,
-        **options: Any,  # noqa: ANN401
+        level: Level,
+        timeout_s: float,
+        status: RolloutWatcher | None,
     ) -> None:
-        super().__init__("demandops", **options)
+        """Start the servers.
+
+        Args:
+            generator: takes the demands.
+            action_name, demand_action_name: the names of the two actions.
+            level: when to answer a goal that names no level.
+            timeout_s: after how many seconds to answer in any case.
+            status: watches rollouts; None without access to the clusters.
+        """
+        super().__init__("demandops")
         self._generator = generator
-        self._answer_settings = answers
+        self._level, self._timeout_s, self._status = level, timeout_s, status
         self._open: dict[str, ServerGoalHandle] = {}
         self._events: deque[Callable[[], None]] = deque()
         self._stopping = False
@@ -155,20 +153,18 @@ class DemandNode(Node):  # type: ignore[misc]
             lambda future: self._from_worker(partial(done.set_result, future))
         )
         outcome = (await done).exception() or ticket.future.result()
-        level = adapter.answer_level(goal) or self._answer_settings.level
+        level = adapter.answer_level(goal) or self._level
         if not isinstance(outcome, Receipt) or level == "pushed":
             return self._finish(adapter, handle, outcome)
-        status = self._answer_settings.status
-        if status is None:
-            problem = "this node has no access to the clusters"
-        else:
+        status, problem = self._status, "this node has no access to the clusters"
+        if status is not None:
             problem = status.why_unreachable(target.domain for target in outcome.targets)
         if problem or status is None:
             warnings = (*outcome.warnings, f"answered at pushed: {problem}")
             return self._finish(adapter, handle, replace(outcome, warnings=warnings))
         rolled_out = Future(executor=self.executor)
         status.follow(
-            outcome.commit, outcome.targets, level, self._answer_settings.timeout_s, notify
+            outcome.commit, outcome.targets, level, self._timeout_s, notify
         ).add_done_callback(
             lambda future: self._from_worker(partial(rolled_out.set_result, future.result()))
         )

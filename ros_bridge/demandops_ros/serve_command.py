@@ -28,7 +28,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from demandops_ros.messages import ANSWER_LEVELS
-from demandops_ros.node import AnswerSettings, DemandNode
+from demandops_ros.node import DemandNode
 
 _LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 _POLL_S = 0.02
@@ -199,7 +199,9 @@ def _run(
         generator,
         settings["action_name"],
         settings["demand_action_name"],
-        AnswerSettings(settings["answer"], settings["answer_timeout"], status),
+        settings["answer"],
+        settings["answer_timeout"],
+        status,
     )
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
@@ -237,8 +239,7 @@ def _drain(
     """Send the results of all open goals before the node is destroyed."""
     node.stop_accepting()
     node.get_logger().info(f"stopping: finishing {node.open_goals} open goals")
-    finished = generator.stop()
-    published = finished.result()
+    published = generator.stop().result()
     if status is not None:
         status.close()  # answers the goals that wait for a rollout
     while node.open_goals:

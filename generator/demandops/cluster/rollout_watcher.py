@@ -183,9 +183,9 @@ class RolloutWatcher:
         if kind == "Deployment":
             namespace, _, deployment = name.partition("/")
             with suppress(Exception):
-                for target in rollout.targets:
-                    if target.domain.namespace == namespace:
-                        cache = self._caches[target.domain.cluster]
+                for domain in rollout.domains:
+                    if domain.namespace == namespace:
+                        cache = self._caches[domain.cluster]
                         reason = cache.why_unavailable(namespace, deployment)
                         if reason:
                             health = replace(health, reason=f"{health.reason}; {reason}")
@@ -210,8 +210,7 @@ class RolloutWatcher:
 
     @staticmethod
     def _report(rollout: _Rollout, health: Health) -> None:
-        reached = [level for level in ("reconciled", "healthy") if health.reaches(level)]
-        states = [(level, level) for level in reached]
+        states = [(level, level) for level in ("reconciled", "healthy") if health.reaches(level)]
         if health.failing:
             states.append(("failing", f"{health.object}: {health.reason}"))
         for state, text in states:

@@ -253,7 +253,7 @@ class Worker:
             new = override_is_due or self._repository.tip() != self.snapshot.commit
             self._record_reached(pushed=new and self._carry_out_changes())
         except FetchInterrupted:
-            self._timer.interrupted()
+            self._timer.request()  # it is still due
         except StateRepoError as error:
             self._record_unreachable(error)
             self._override_expiry.postpone(self._runtime.now())

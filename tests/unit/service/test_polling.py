@@ -60,14 +60,6 @@ def test_what_is_asked_for_many_times_is_one_look_and_one_after_it(clock: Clock)
     assert made.seconds_until_due() is None
 
 
-def test_a_look_that_was_cut_short_is_still_due(clock: Clock) -> None:
-    made = PollTimer(0, clock)
-    made.request()
-    assert made.start_if_due()
-    made.interrupted()
-    assert made.start_if_due()
-
-
 def test_a_repository_on_this_disk_is_looked_at_every_second(clock: Clock) -> None:
     made = PollTimer(30, clock, embedded=True)
     made.finished(reached=True)
