@@ -124,7 +124,7 @@ class DemandNode(Node):  # type: ignore[misc]
         reason = "shutting down" if self._stopping else ""
         if len(self._open) >= self._generator.queue_limit:
             reason = "too many are waiting"
-            unreachable = self._generator.state_repo_status.remote.unreachable
+            unreachable = self._generator.remote_status.unreachable
             reason += f" for the state repo: {unreachable}" if unreachable else ""
         if reason:
             self.get_logger().warning(f"goal '{adapter.name(goal)}' rejected: {reason}")

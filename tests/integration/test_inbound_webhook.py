@@ -11,12 +11,10 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 from demandops.errors import InvalidInput
-from demandops.input_file import read_secret
 from demandops.service import push_webhook
 from demandops.service.push_webhook import PushWebhook
 
@@ -265,14 +263,3 @@ def test_a_port_in_use_is_told(unsigned: PushWebhook) -> None:
 def test_with_a_secret_others_may_be_listened_to(heard: Heard) -> None:
     hook = PushWebhook("0.0.0.0:0", SECRET, heard)
     hook.close()
-
-
-def test_the_secret_comes_from_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "secret"
-    path.write_bytes(SECRET + b"\n")
-    assert read_secret(path) == SECRET
-    path.write_bytes(b" \n")
-    with pytest.raises(InvalidInput, match="is empty; put the secret there"):
-        read_secret(path)
-    with pytest.raises(InvalidInput, match="cannot be read: No such file"):
-        read_secret(tmp_path / "none")

@@ -15,7 +15,7 @@ from demandops.errors import Refused, fault
 from demandops.runtime import REAL, Runtime
 from demandops.service.approvals.approvals import Approvals
 from demandops.service.demand_lifecycle import Demands
-from demandops.service.remote_status import StateRepoStatus
+from demandops.service.remote_status import RemoteStatus
 from demandops.service.ticket import Listener, Ticket
 from demandops.service.worker import Worker
 from demandops.staterepo.git import repository_choice
@@ -100,15 +100,14 @@ class Generator:
         return self._worker.snapshot
 
     @property
-    def state_repo_status(self) -> StateRepoStatus:
-        """The status of the state repo; any thread may read it."""
-        snapshot = self.snapshot
-        return StateRepoStatus(
-            self._worker.remote.status,
-            snapshot.problems,
-            self._demands.unpublished,
-            str(snapshot.commit),
-        )
+    def remote_status(self) -> RemoteStatus:
+        """Whether the remote can be reached; any thread may read it."""
+        return self._worker.remote.status
+
+    @property
+    def unpublished(self) -> int:
+        """How many demands are in the journal and do not await approval; from any thread."""
+        return self._demands.unpublished
 
     @property
     def operations(self) -> tuple[str, ...]:

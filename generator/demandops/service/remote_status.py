@@ -1,4 +1,4 @@
-"""Whether the remote can be reached and the state repo is valid, for logs and diagnostics."""
+"""Whether the remote can be reached, for logs and diagnostics."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from demandops.errors import Fault
 from demandops.runtime import Runtime
 
 log = logging.getLogger("demandops")
@@ -25,20 +24,6 @@ class RemoteStatus:
     unreachable_since: datetime | None = None
     last_reached: datetime | None = None
     last_push: datetime | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class StateRepoStatus:
-    """The status of the state repo.
-
-    ``problems`` are the faults in its files, ``unpublished`` the number of demands in the journal
-    that do not await approval, ``commit`` the newest commit that the generator has read.
-    """
-
-    remote: RemoteStatus
-    problems: tuple[Fault, ...]
-    unpublished: int
-    commit: str
 
 
 class RemoteMonitor:

@@ -121,7 +121,6 @@ Write = Callable[[Path], object]
     ("write", "message"),
     [
         (lambda path: None, ": cannot be read: No such file or directory; put the secret there"),
-        (lambda path: path.write_text("\n"), ": is empty; put the secret there"),
         (lambda path: path.write_text("two\nlines"), " must hold a token: one line of plain text"),
         (lambda path: path.write_bytes(b"\xff\xfe"), " must hold a token: one line of plain text"),
     ],
