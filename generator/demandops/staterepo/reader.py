@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
 from pathlib import Path
 
@@ -17,19 +17,15 @@ from demandops.render.changes.changeset import FileReader
 from demandops.runtime import REAL
 from demandops.staterepo.audit import commit_signatures, verification
 from demandops.staterepo.audit.verification import Verdict
-from demandops.staterepo.git import repository_choice
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.address import is_url
-from demandops.staterepo.git.repository import StateRepository
-from demandops.staterepo.history import authorship, commit_log, path_history, revisions
+from demandops.staterepo.git.address import connect, is_url
+from demandops.staterepo.history import authorship, commit_log, revisions
 from demandops.staterepo.history.authorship import Person
-from demandops.staterepo.history.commit_log import LogEntry
-from demandops.staterepo.history.path_history import PathHistory
+from demandops.staterepo.history.commit_log import LogEntry, PathHistory
 from demandops.staterepo.load import (
     last_valid_config,
     ledger_files,
     problem_report,
-    rollback_target,
     state_in_effect,
 )
 from demandops.staterepo.load import snapshot as snapshots
@@ -53,8 +49,8 @@ class Reader:
             self._slot = Slot(settings.data_home(address) / "reader")
             folder = self._slot.folder
         try:
-            self._repository = repository_choice.connect(address, folder)
-            self._objects, self._tip = self._repository.objects, self._repository.refresh()
+            self.repository = connect(address, folder)
+            self._objects, self._tip = self.repository.objects, self.repository.refresh()
         except BaseException:
             self.close()
             raise
@@ -64,17 +60,8 @@ class Reader:
         if self._slot is not None:
             self._slot.close()
 
-    @property
-    def repository(self) -> StateRepository:
-        """The state repo itself, for a command that writes to it."""
-        return self._repository
-
     def refuse_other_render_version(self) -> None:
-        """Raise if the repo has another render version.
-
-        Raises:
-            StateRepoError: names the version and the remedy.
-        """
+        """Raise a StateRepoError with the remedy if the repo has another render version."""
         last_valid_config.refuse_other_render_version(self._tree())
 
     def commit(self, revision: str | None = None) -> str:
@@ -85,16 +72,7 @@ class Reader:
         """
         if not revision:
             return str(self._tip)
-        now = REAL.now()
-        return str(revisions.resolve(self._objects, self._tip, revision, now).id)
-
-    def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or a descendant."""
-        return self._repository.includes(commit, other)
-
-    def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` is equal in two commits."""
-        return self._repository.unchanged(commit, other, path)
+        return str(revisions.resolve(self._objects, self._tip, revision, REAL.now()).id)
 
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
@@ -111,18 +89,6 @@ class Reader:
             return state_in_effect.state_at(self._objects, commit, progress)
         return snapshots.load(self._objects, commit, progress)
 
-    def _tree(self, revision: str | None = None) -> Tree:
-        return trees.commit_of(self._objects, self.commit(revision)).tree
-
-    def problems(self) -> tuple[problem_report.Problem, ...]:
-        """Return the problems that the generator reports at the newest commit."""
-        return problem_report.read(self.file_reader()(problem_report.PATH))
-
-    def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
-        """Return the problems reported at a commit, else the problems found by loading it."""
-        report = self.file_reader(str(snapshot.commit))(problem_report.PATH)
-        return problem_report.read(report) or snapshot.problems
-
     def last_valid_snapshot(
         self, revision: str, progress: Progress = lambda done, total: None
     ) -> Snapshot:
@@ -137,6 +103,17 @@ class Reader:
             return self.snapshot(revision, progress)
         except InvalidInput:
             return state_in_effect.state_at(self._objects, revision, progress)
+
+    def problems(self, revision: str | None = None) -> tuple[problem_report.Problem, ...]:
+        """Return the problems that the generator reports at a commit."""
+        return problem_report.read(self.file_reader(revision)(problem_report.PATH))
+
+    def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
+        """Return the problems reported at a commit, else the problems found by loading it."""
+        return self.problems(str(snapshot.commit)) or snapshot.problems
+
+    def _tree(self, revision: str | None = None) -> Tree:
+        return trees.commit_of(self._objects, self.commit(revision)).tree
 
     def file_reader(self, revision: str | None = None) -> FileReader:
         """Return a function that returns the text of a file at a commit."""
@@ -157,18 +134,20 @@ class Reader:
         Raises:
             RemoteAway: the remote cannot be reached.
         """
-        return list(pending_proposals(self._repository))
+        return list(pending_proposals(self.repository))
 
-    def log(self, spec: str | None = None) -> Iterator[LogEntry]:
-        """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
-        since, until = self._sides(spec or "")
-        yield from commit_log.walk(self._objects, until, since)
+    def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
+        """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``.
 
-    def commits_changing(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
-        """Yield the commits of :meth:`log` that changed a file or folder."""
+        Args:
+            path: leave out the commits that did not change this file or folder.
+        """
         since, until = self._sides(spec or "")
-        for change in path_history.changes_to(self._objects, until, path, since):
-            yield change.entry
+        if path is None:
+            yield from commit_log.walk(self._objects, until, since)
+        else:
+            changes = commit_log.changes_to(self._objects, until, path, since)
+            yield from (change.entry for change in changes)
 
     def revisions(self, spec: str | None) -> list[str]:
         """Return the commits that ``REV`` or ``A..B`` names, oldest first.
@@ -213,21 +192,20 @@ class Reader:
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
         """Return the history of a file or folder up to a commit."""
-        return path_history.history_of(self._objects, revision, path, most)
+        return commit_log.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
         """Return the path of a release, or of the last stopped release with this name."""
-        current = path_history.release_path(self._objects, revision, name)
-        return current or path_history.stopped_release_path(self._objects, revision, name)
+        return commit_log.release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
         """Return the names of all releases that were ever stopped."""
-        return path_history.stopped_release_names(self._objects, revision)
+        return commit_log.stopped_release_names(self._objects, revision)
 
-    def changed_files(self, before: str, after: str, root: str) -> dict[str, bool]:
-        """Return the files of a folder that differ between two commits: path → exists after."""
-        changed = trees.differences(self._tree(before), self._tree(after), (root,))
-        return {path: blob is not None for path, blob in changed}
+    def changed_files(self, before: str, after: str, roots: Sequence[str]) -> list[str]:
+        """Return the files below these folders that differ between two commits, sorted."""
+        changed = trees.differences(self._tree(before), self._tree(after), roots)
+        return sorted(path for path, _ in changed)
 
     def changes_node(self, commit: str, node: str) -> bool:
         """Return whether a commit changed a release on a node, or a claim that names the node."""
@@ -243,11 +221,7 @@ class Reader:
 
     def restoration(self, to: str, **more: object) -> Restoration:
         """Return the request to roll back to a commit."""
-        return rollback_target.restoration(self._objects, to, **more)
-
-    def config_files_changed_since(self, commit: str) -> list[str]:
-        """Return the configuration files that changed since a commit."""
-        return rollback_target.config_files_changed_since(self._objects, commit, self._tip)
+        return ledger_files.restoration(self._objects, to, **more)
 
     def operator(self) -> Person:
         """Return the person who runs this program."""
@@ -257,8 +231,5 @@ class Reader:
 @contextmanager
 def opened(address: str) -> Iterator[Reader]:
     """Open a state repo for reading, and close it at the end."""
-    reader = Reader(address)
-    try:
+    with closing(Reader(address)) as reader:
         yield reader
-    finally:
-        reader.close()

@@ -94,12 +94,12 @@ def _warnings(checked: CheckResult) -> Iterator[str]:
 
 def _suggestions(checked: CheckResult) -> Iterator[str]:
     for suggestion in checked.suggestions:
-        body = f"Merge this as {code(suggestion.name)}:\n\n{fence(suggestion.text, 'yaml')}"
+        body = f"Merge this as {code(suggestion.file)}:\n\n{fence(suggestion.text, 'yaml')}"
         if suggestion.not_covered:
             body += f"\nNo override can change {', '.join(map(code, suggestion.not_covered))}.\n"
         if suggestion.other_releases:
             body += f"\nIt also applies to {', '.join(map(code, suggestion.other_releases))}.\n"
-        yield _folded(f"Instead of editing {_plain(suggestion.path)}", body)
+        yield _folded(f"Instead of editing {_plain(suggestion.instead_of)}", body)
 
 
 def _consequence(checked: CheckResult) -> Iterator[str]:
@@ -144,7 +144,7 @@ def _counted(releases: Iterable[ReleaseChange]) -> str:
 
 
 def _release(release: ReleaseChange) -> str:
-    lines = [f"\n- {_VERBS[release.change]} {code(release.name)}: {code(release.description)}"]
+    lines = [f"\n- {_VERBS[release.change]} {code(release.name)}: {code(release.what)}"]
     lines += [f"\n  - {code(detail)}" for detail in release.details]
     return "".join(lines)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import click
 from rich.table import Table
 
-from demandops.cli.json_output import output_option, print_json
-from demandops.cli.output import at_option, console, progress, state_repo_option, warn_of
+from demandops.cli.json_output import output_option, show
+from demandops.cli.output import at_option, progress, state_repo_option, warn_of
 from demandops.plan.views.bookkeeping import Bookkeeping, as_data
 from demandops.plan.views.bookkeeping import bookkeeping as derive
 from demandops.staterepo import reader
@@ -25,19 +25,13 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
             snapshot = repo.snapshot(at, report)
         warn_of(repo.problems() if at is None else ())
     books, commit = derive(snapshot.state), str(snapshot.commit)
-    if output == "json":
-        print_json(as_data(books, commit))
-        return
-    out = console()
-    out.print(services_table(books))
-    out.print(connections_table(books))
+    tables = [_services(books), _connections(books)]
     if books.suspended:
-        out.print(suspended_table(books))
-    out.print(f"at {commit}")
+        tables.append(_suspended(books))
+    show(output, as_data(books, commit), [*tables, f"at {commit}"])
 
 
-def services_table(books: Bookkeeping) -> Table:
-    """Return the services as a table."""
+def _services(books: Bookkeeping) -> Table:
     table = Table("Service", "Kind", "Node", "For", "Takes in", "Requesters", title="Services")
     for name, entry in books.services.items():
         inputs = [topic for topics in entry.inputs.values() for topic in topics]
@@ -54,8 +48,7 @@ def services_table(books: Bookkeeping) -> Table:
     return table
 
 
-def connections_table(books: Bookkeeping) -> Table:
-    """Return the connections as a table."""
+def _connections(books: Bookkeeping) -> Table:
     table = Table("Connection", "From", "To", "Topics", "Requesters", title="Connections")
     for id, entry in books.connections.items():
         table.add_row(
@@ -66,8 +59,7 @@ def connections_table(books: Bookkeeping) -> Table:
     return table
 
 
-def suspended_table(books: Bookkeeping) -> Table:
-    """Return the claims that overrides suspend, as a table."""
+def _suspended(books: Bookkeeping) -> Table:
     table = Table("Subject", "Demand", "Requesters", "By", "Reason", title="Suspended")
     for entry in books.suspended:
         subject = f"{entry.kind} {entry.id}"

@@ -11,15 +11,14 @@ from typing import Any
 import click
 from rich.table import Table
 
-from demandops.cli.json_output import output_option, print_json, release_data
-from demandops.cli.output import console, errors, progress, state_repo_option
+from demandops.cli.json_output import output_option, release_data, show
+from demandops.cli.output import errors, progress, state_repo_option
 from demandops.cluster import access
-from demandops.cluster.health import Health, ObjectSelector, Target, health_reader
+from demandops.cluster.health import Health, History, ObjectSelector, Target, health_reader
 from demandops.cluster.object_cache import ObjectCache
 from demandops.runtime import REAL
 from demandops.service import rollout_targets
 from demandops.staterepo import reader
-from demandops.staterepo.reader import Reader
 
 _SHORT = 10
 
@@ -49,21 +48,17 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
         stores = _read(clusters, [target for _, target in targets])
         commit = str(snapshot.commit)
         rows = [
-            release_data(release) | _state(target, commit, stores, repo)
+            release_data(release) | _state(target, commit, stores, repo.repository)
             for release, target in targets
         ]
-    if output == "json":
-        faults = [{"code": "invalid", **asdict(problem)} for problem in problems]
-        print_json({"commit": commit, "releases": rows, "faults": faults})
-        return
+    faults = [{"code": "invalid", **asdict(problem)} for problem in problems]
+    text: list[str | Table] = [f"  {problem}" for problem in problems]
     if problems:
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-        console().print(f"{count}; of each file the last valid version is in effect:")
-    for problem in problems:
-        console().print(f"  {problem}", soft_wrap=True)
-    console().print(_table(rows))
-    console().print(f"desired: {commit}")
-    if not clusters:
+        text.insert(0, f"{count}; of each file the last valid version is in effect:")
+    text += [_table(rows), f"desired: {commit}"]
+    show(output, {"commit": commit, "releases": rows, "faults": faults}, text)
+    if not clusters and output == "text":
         errors.print("the state of the clusters is unknown: give --clusters FILE")
 
 
@@ -90,9 +85,9 @@ def _read(
 
 
 def _state(
-    target: Target, commit: str, stores: Mapping[str, ObjectCache], repo: Reader
+    target: Target, commit: str, stores: Mapping[str, ObjectCache], history: History
 ) -> dict[str, Any]:
-    health, seen, when = _seen(target, commit, stores, repo)
+    health, seen, when = _seen(target, commit, stores, history)
     return {
         "seen": seen or None,
         "health": health.state if seen or health.object else "unknown",
@@ -104,7 +99,7 @@ def _state(
 
 
 def _seen(
-    target: Target, commit: str, stores: Mapping[str, ObjectCache], repo: Reader
+    target: Target, commit: str, stores: Mapping[str, ObjectCache], history: History
 ) -> tuple[Health, str, str]:
     store = stores.get(target.domain.cluster)
     if store is None:
@@ -115,14 +110,11 @@ def _seen(
         reason = f"cannot be read: {unread}"
         return Health("waiting", reason, f"cluster {store.name}"), "", ""
     objects = store.objects()
-    health = read.domain_health(target.domain, commit, objects, repo)
+    health = read.domain_health(target.domain, commit, objects, history)
     if health.state != "waiting":
-        health = read.release_health(target, commit, objects, repo)
-    return (
-        health,
-        read.applied_commit(target.domain, objects),
-        read.last_transition(target, objects),
-    )
+        health = read.release_health(target, commit, objects, history)
+    seen = read.applied_commit(target.domain, objects)
+    return health, seen, read.last_transition(target, objects)
 
 
 def _table(rows: Iterable[dict[str, Any]]) -> Table:

@@ -32,14 +32,14 @@ _REASON = "Say here why; this replaces a manual edit of a generated file"
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """An override that replaces a manual edit of ``path``.
+    """An override, to be merged as ``file``, that replaces a manual edit of ``instead_of``.
 
     ``not_covered`` lists the parts of the edit that the override does not make.
     ``other_releases`` lists other releases that need the same override.
     """
 
-    path: str
-    name: str
+    instead_of: str
+    file: str
     text: str
     not_covered: tuple[str, ...] = ()
     other_releases: tuple[str, ...] = ()

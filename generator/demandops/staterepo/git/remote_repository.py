@@ -23,7 +23,6 @@ from pygit2 import Oid, Repository
 from demandops.errors import StateRepoError
 from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
-from demandops.staterepo.git.address import without_secrets
 from demandops.staterepo.git.repository import (
     ENVIRONMENT,
     MAIN,
@@ -44,9 +43,17 @@ _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
 )
 
+_USER = re.compile(r"(://)[^/@\s]*@")
+
+HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
 Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")
+
+
+def without_secrets(text: str) -> str:
+    """Return ``text`` without the user part of its URLs, which may hold a password."""
+    return _USER.sub(r"\1", HAS_PASSWORD.sub(r"\1", text))
 
 
 class RemoteRepository(StateRepository):

@@ -62,7 +62,7 @@ def faults_and_suggestions(
         if suggestion is not None:
             also = sorted(one.name for one in releases.values() if _fits(release, one))
             suggestion = replace(
-                suggestion, name=_unused_path(suggestion.name, used), other_releases=tuple(also)
+                suggestion, file=_unused_path(suggestion.file, used), other_releases=tuple(also)
             )
             suggestions.append(suggestion)
         message = _message(path, before is None, after is None, suggestion)
@@ -87,7 +87,7 @@ def _unused_path(name: str, used: set[str]) -> str:
 def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | None) -> str:
     if suggestion is not None and deleted:
         return (
-            f"{_LOST}; to stop the release, merge {suggestion.name} as shown, or delete its "
+            f"{_LOST}; to stop the release, merge {suggestion.file} as shown, or delete its "
             "claims in ledger/"
         )
     if suggestion is not None:
@@ -97,7 +97,7 @@ def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | Non
             unchanged = (
                 f" (no override changes {', '.join(suggestion.not_covered[:_MOST_LEFT])}{more})"
             )
-        return f"{_LOST}, and merge {suggestion.name} as shown{unchanged}"
+        return f"{_LOST}, and merge {suggestion.file} as shown{unchanged}"
     if path.startswith(f"{NOTES_ROOT}/"):
         return "is written by the generator, which undoes the edit; revert it"
     if path.startswith(f"{claim_file.LEDGER_ROOT}/") and added:

@@ -228,7 +228,7 @@ class CommitBatch:
                 continue
             kind: Change = "stop" if files[path] is None else "start" if old is None else "change"
             name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
-            changes.append(ReleaseChange(name, kind, path, ()))
+            changes.append(ReleaseChange(name, path, path, kind))
         return Changeset({**more, **files}, tuple(changes))
 
     def _write(
