@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import getpass
 import os
-import re
 from collections.abc import Iterable, Sequence
-from datetime import datetime
+from datetime import datetime, timezone
 from typing import NamedTuple
 
 import git
@@ -25,9 +24,6 @@ from demandops.staterepo.history import commit_log, commit_message
 
 _ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _MOST_NAMED = 20
-_MOST_AUTHOR = 200
-_UNFIT = re.compile(r"[<>\x00-\x1f\x7f]")
-_EMAIL = re.compile(r"[^\s<>\x00-\x1f\x7f]+")
 
 
 class Person(NamedTuple):
@@ -37,7 +33,6 @@ class Person(NamedTuple):
     email: str
 
     def __str__(self) -> str:
-        """Return ``name <email>``."""
         return f"{self.name} <{self.email}>"
 
 
@@ -74,16 +69,17 @@ def _touches(commit: Commit, paths: Iterable[str]) -> bool:
 
 def author_of(commit: Commit) -> Person:
     """Return the author of a commit, without characters that trailers and signatures forbid."""
-    name = _UNFIT.sub("", commit.author.name).strip(" .,:;\"'\\") or "unnamed"
-    email = commit.author.email if _EMAIL.fullmatch(commit.author.email or "") else ""
-    return Person(name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL)
+    author = commit.author
+    plain = commit_message.signature(author.name, author.email or "", _time_of(commit))
+    return Person(plain.name, plain.email)
+
+
+def _time_of(commit: Commit) -> datetime:
+    return datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
 
 
 def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
-    """Return ``Caused-By: <commit> <name> <email>`` for each commit, oldest first.
-
-    Only the newest are named if there are many; the trailer ``Since`` bounds the others.
-    """
+    """Return ``Caused-By: <commit> <name> <email>`` for the newest commits, oldest first."""
     return [("Caused-By", f"{one.id} {author_of(one)}") for one in reversed(causes[:_MOST_NAMED])]
 
 
@@ -96,11 +92,9 @@ def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
     if not causes:
         return commit_message.generator_signature(now)
     people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))
-    name = ", ".join(dict.fromkeys(one.name for one in people))
-    if len(name) > _MOST_AUTHOR:
-        name = name[: _MOST_AUTHOR - 1].rstrip(" ,") + "…"
+    names = ", ".join(dict.fromkeys(one.name for one in people))
     email = people[0].email if len(people) == 1 else commit_message.GENERATOR_EMAIL
-    return pygit2.Signature(name, email, causes[0].commit_time, 0)
+    return commit_message.signature(names, email, _time_of(causes[0]))
 
 
 def operator(folder: str | None = None) -> Person:

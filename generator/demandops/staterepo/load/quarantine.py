@@ -24,14 +24,6 @@ Faults = Mapping[Subject, tuple[Fault, ...]]
 
 
 @dataclass(frozen=True, slots=True)
-class Accepted:
-    """A snapshot with the last valid claims, and the changed subjects that are in effect in it."""
-
-    snapshot: Snapshot
-    subjects: tuple[Subject, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class Judgement:
     """People's changes, and the faults of subjects with the new and with the old configuration.
 
@@ -47,15 +39,15 @@ class Judgement:
     old: State
     """The new ledger with the configuration that was in effect before."""
 
-    def with_new_config(self) -> Accepted:
-        """Return the state in effect if the new configuration is accepted."""
+    def with_new_config(self) -> Advance:
+        """Return the state in effect, and what changed, if the new configuration is accepted."""
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
-        return self._without(Accepted(self.advance.snapshot, self.advance.subjects), faults)
+        return self._without(self.advance, faults)
 
-    def with_old_config(self, faults: Iterable[Fault]) -> Accepted:
-        """Return the state in effect if the new configuration has ``faults``."""
+    def with_old_config(self, faults: Iterable[Fault]) -> Advance:
+        """Return the state in effect, and what changed, if the new configuration has ``faults``."""
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
         snapshot = replace(
@@ -65,9 +57,10 @@ class Judgement:
             last_valid_commit=self.before.last_valid_commit,
             other_config_source=self.before.config_source,
         )
-        return self._without(Accepted(snapshot, accepted.subjects), self.with_old)
+        return self._without(replace(accepted, snapshot=snapshot), self.with_old)
 
-    def _without(self, accepted: Accepted, faults: Faults) -> Accepted:
+    def _without(self, accepted: Advance, faults: Faults) -> Advance:
+        """Put the last valid claims of faulty subjects in effect."""
         snapshot, before = accepted.snapshot, self.before
         problems, ledger = list(snapshot.problems), snapshot.state.ledger
         quarantined = dict.fromkeys(snapshot.quarantined_files)
@@ -89,7 +82,7 @@ class Judgement:
             quarantined_files=tuple(quarantined),
         )
         good = tuple(subject for subject in accepted.subjects if subject not in faults)
-        return Accepted(snapshot, good)
+        return replace(accepted, snapshot=snapshot, subjects=good)
 
 
 def judge(repo: Repository, advance: Advance, before: Snapshot, tree: Tree) -> Judgement:

@@ -23,7 +23,11 @@ from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.load import last_valid_config, ledger_files
-from demandops.staterepo.load.last_valid_config import ConfigSource, LastValidConfig
+from demandops.staterepo.load.last_valid_config import (
+    ConfigSource,
+    LastValidConfig,
+    load_last_valid_config,
+)
 from demandops.subject import Subject
 
 Progress = Callable[[int, int], None]
@@ -64,14 +68,6 @@ class Advance:
     snapshot: Snapshot
     subjects: tuple[Subject, ...]
     config_changed: bool
-
-    def followed_by(self, further: Advance) -> Advance:
-        """Return one advance for this one and ``further``, which follows it."""
-        return Advance(
-            further.snapshot,
-            tuple(dict.fromkeys((*self.subjects, *further.subjects))),
-            self.config_changed or further.config_changed,
-        )
 
 
 def load(
@@ -124,7 +120,13 @@ def advance(
     if recorded is not None:
         known = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
     elif before.problems or trees.differ(old, new, CONFIG_ROOTS):
-        known = _last_valid_config(repo, before, to)
+        known = load_last_valid_config(
+            repo,
+            before.config_source,
+            before.last_valid_commit,
+            to,
+            lambda files: _load_and_rehearse(files, before.state),
+        )
     config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
     world_changed = config != state.config or ended != state.ledger.ended
     config_changed = world_changed or _has_manual_edit(repo, before.commit, to)
@@ -155,16 +157,6 @@ def advance(
         known.source if known.faults or recorded else None,
     )
     return Advance(snapshot, tuple(dict.fromkeys(subjects)), config_changed)
-
-
-def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValidConfig:
-    return last_valid_config.load_last_valid_config(
-        repo,
-        before.config_source,
-        before.last_valid_commit,
-        to,
-        lambda files: _load_and_rehearse(files, before.state),
-    )
 
 
 def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
@@ -208,6 +200,11 @@ class ReadAhead:
         if known is None or self._start != before.commit:
             known = Advance(before, (), False)
         if known.snapshot.commit != tip or known.snapshot.problems:
-            known = known.followed_by(advance(repo, known.snapshot, tip))
+            more = advance(repo, known.snapshot, tip)
+            known = Advance(
+                more.snapshot,
+                tuple(dict.fromkeys((*known.subjects, *more.subjects))),
+                known.config_changed or more.config_changed,
+            )
         self._known, self._start = known, before.commit
         return known

@@ -23,7 +23,6 @@ from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
 from demandops.plan.overrides import kept_claims
 from demandops.plan.overrides.lifecycle import (
-    LedgerUpdate,
     changed_claim_files,
     changed_override_files,
     end_override,
@@ -41,7 +40,6 @@ from demandops.staterepo.load import (
     quarantine,
     state_in_effect,
 )
-from demandops.staterepo.load.quarantine import Accepted
 from demandops.staterepo.load.snapshot import Advance, Snapshot
 
 _ATTEMPTS = 5
@@ -95,9 +93,8 @@ class CommitBatch:
             more.append((commit_log.PROPOSAL, proposal))
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
-        made = self._write(decision.files, text, commit_message.author(decision, received), now)
-        self.head = self.head.with_commit(made, decision.state)
-        return str(made)
+        author = commit_message.author(decision, received)
+        return self.commit_files(decision.files, decision.state, text, author, now)
 
     def commit_files(
         self,
@@ -165,16 +162,16 @@ class CommitBatch:
                 accepted = judgement.with_old_config(error.faults)
         return self._rendered_subjects(accepted, before, now)
 
-    def _rendered_whole(self, accepted: Accepted, before: Snapshot, now: datetime) -> _Followed:
+    def _rendered_whole(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
         """Render everything, because the configuration changed."""
         marked = last_valid_config.end_markers_at(self._tree)
         state = accepted.snapshot.state
         applied = update_ledger(before.state, state, accepted.subjects, marked, now)
-        state = _updated(state, applied)
+        state = replace(state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
         return _with_started_leases(accepted.snapshot, state, change, applied.keys, now)
 
-    def _rendered_subjects(self, accepted: Accepted, before: Snapshot, now: datetime) -> _Followed:
+    def _rendered_subjects(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
         """Render the subjects that people changed."""
         state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
         ledger, keys = kept_claims.update_kept_claims(old, state, subjects, now)
@@ -199,9 +196,8 @@ class CommitBatch:
         Raises:
             Refused, InvalidInput: the state without the override cannot be planned or rendered.
         """
-        state = self.head.state
-        applied = end_override(state, override, now)
-        state = _updated(state, applied)
+        applied = end_override(self.head.state, override, now)
+        state = replace(self.head.state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
         more = state_in_effect.trailers_of(self.head)
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
@@ -284,7 +280,3 @@ def _with_started_leases(
         files[claim_file.path_of(claim.key)] = claim_file.text_of(started)
     snapshot = replace(snapshot, state=replace(state, ledger=ledger))
     return _Followed(snapshot, replace(change, files=files), tuple(keys))
-
-
-def _updated(state: State, update: LedgerUpdate) -> State:
-    return replace(state, ledger=update.ledger)
