@@ -30,7 +30,6 @@ from demandops.staterepo.load import (
 )
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
-from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
 from demandops.staterepo.write.slot import Slot
 
 
@@ -38,11 +37,7 @@ class Reader:
     """An open state repo, at its newest commit."""
 
     def __init__(self, address: str) -> None:
-        """Open the state repo; a URL is fetched into a clone that is kept.
-
-        Raises:
-            StateRepoError: it cannot be read.
-        """
+        """Open the state repo; a URL is fetched into a clone that is kept."""
         self._slot: Slot | None = None
         folder = Path()
         if is_url(address):
@@ -65,11 +60,7 @@ class Reader:
         last_valid_config.refuse_other_render_version(self._tree())
 
     def commit(self, revision: str | None = None) -> str:
-        """Return the commit id of a revision or a time; by default the newest commit.
-
-        Raises:
-            StateRepoError: it is neither, or a time before the first commit.
-        """
+        """Return the commit of a revision or a time, by default the newest, or raise."""
         if not revision:
             return str(self._tip)
         return str(revisions.resolve(self._objects, self._tip, revision, REAL.now()).id)
@@ -79,10 +70,9 @@ class Reader:
     ) -> Snapshot:
         """Load the ledger and the configuration that are in effect at a commit.
 
-        If the generator quarantined a file, its last valid version is in effect.
-
         Raises:
-            InvalidInput, StateRepoError: the commit is not a valid state repo.
+            InvalidInput, StateRepoError: the commit is not valid, and no generator quarantined its
+                files.
         """
         commit = self.commit(revision)
         if state_in_effect.record_at(self._objects, commit).first("In-Force"):
@@ -94,10 +84,7 @@ class Reader:
     ) -> Snapshot:
         """Load a commit, with last valid versions of files that are not valid.
 
-        Unlike :meth:`snapshot` it does so even if the generator has not quarantined them yet.
-
-        Raises:
-            InvalidInput, StateRepoError: there never was a valid configuration.
+        Unlike :meth:`snapshot` it does so even if no generator has quarantined them yet.
         """
         try:
             return self.snapshot(revision, progress)
@@ -121,45 +108,27 @@ class Reader:
         return lambda path: trees.read_text(tree, path)
 
     def config(self) -> Config:
-        """Return the configuration at the newest commit.
-
-        Raises:
-            InvalidInput, StateRepoError: it is not valid.
-        """
+        """Return the configuration at the newest commit; raise if it is not valid."""
         return last_valid_config.config_at(self._tree())
-
-    def proposals(self) -> list[PendingProposal]:
-        """Return the demands that await approval, by branch.
-
-        Raises:
-            RemoteAway: the remote cannot be reached.
-        """
-        return list(pending_proposals(self.repository))
 
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``.
 
-        Args:
-            path: leave out the commits that did not change this file or folder.
+        If a file or folder is given, only the commits that changed it.
         """
         since, until = self._sides(spec or "")
-        if path is None:
-            yield from commit_log.walk(self._objects, until, since)
-        else:
+        if path is not None:
             changes = commit_log.changes_to(self._objects, until, path, since)
-            yield from (change.entry for change in changes)
+            return (change.entry for change in changes)
+        return (entry for _, entry in commit_log.commits(self._objects, until, since))
 
     def revisions(self, spec: str | None) -> list[str]:
-        """Return the commits that ``REV`` or ``A..B`` names, oldest first.
-
-        Raises:
-            StateRepoError: a side is neither a revision nor a time.
-        """
+        """Return the commits that ``REV`` or ``A..B`` names, oldest first, or raise."""
         since, until = self._sides(spec or "")
         if since is None:
             return [until]
-        walked = commit_log.walk(self._objects, until, since)
-        return [entry.commit for entry in walked][::-1]
+        walked = commit_log.commits(self._objects, until, since)
+        return [entry.commit for _, entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
         """Return the commits A and B of ``A..B``, or None and REV of ``REV``."""
@@ -177,12 +146,9 @@ class Reader:
         whole: bool = False,
         progress: Progress = lambda done, total: None,
     ) -> list[Verdict]:
-        """Return a verdict on each commit: its files, compared byte by byte, and its signature.
+        """Return a verdict on each commit, oldest first: its files, byte by byte, and signature.
 
-        Args:
-            commits: oldest first.
-            whole: load every commit whole, rather than what differs from the one before.
-            progress: called with (commits done, all commits).
+        With ``whole``, each commit is loaded whole, rather than what differs from the one before.
         """
         verdicts = list[Verdict]()
         for verdict in verification.verify(self._objects, commits, whole=whole):

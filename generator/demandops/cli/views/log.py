@@ -27,22 +27,14 @@ _TRAILERS = {
 }
 
 
-class _Time(click.ParamType):  # type: ignore[type-arg]
-    """A time in the form of ``revisions.TIMES``."""
-
-    name = "time"
-
-    def __init__(self, *, end: bool) -> None:
-        self._end = end
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> datetime:
-        """Parse a time."""
-        time = revisions.parse_time(str(value), REAL.now(), end=self._end)
-        if time is None:
-            self.fail(f"'{value}' is not a time; write it like {revisions.TIMES}", param, ctx)
-        return time
+def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
+    """Parse the time of --since or --until."""
+    if text is None:
+        return None
+    time = revisions.parse_time(text, REAL.now(), end=param.name == "until")
+    if time is None:
+        raise click.BadParameter(f"'{text}' is not a time; write it like {revisions.TIMES}")
+    return time
 
 
 @click.command()
@@ -68,13 +60,11 @@ class _Time(click.ParamType):  # type: ignore[type-arg]
 )
 @click.option(
     "--since",
-    type=_Time(end=False),
+    callback=_time,
     metavar="TIME",
     help=f"Commits at or after this time: {revisions.TIMES}.",
 )
-@click.option(
-    "--until", type=_Time(end=True), metavar="TIME", help="Commits at or before this time."
-)
+@click.option("--until", callback=_time, metavar="TIME", help="Commits at or before this time.")
 @click.option(
     "-n",
     "--max-count",

@@ -16,7 +16,7 @@ from demandops.errors import InvalidInput
 from demandops.forge import Forge, ForgeError, forge_for
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo import reader
-from demandops.staterepo.write.proposal_branch import PendingProposal
+from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
 
 
 @click.command()
@@ -30,7 +30,7 @@ def proposals(state_repo: str, output: str) -> None:
     read from GitHub or Gitea.
     """
     with reader.opened(state_repo) as repo:
-        pending = repo.proposals()
+        pending = list(pending_proposals(repo.repository))
         forge = _forge(repo) if pending else None
     rows = [_row(each, forge) for each in pending]
     show(output, rows, [_table(rows) if rows else "nothing awaits approval"])

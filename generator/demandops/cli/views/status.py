@@ -87,7 +87,24 @@ def _read(
 def _state(
     target: Target, commit: str, stores: Mapping[str, ObjectCache], history: History
 ) -> dict[str, Any]:
-    health, seen, when = _seen(target, commit, stores, history)
+    store, read, seen, when = (
+        stores.get(target.domain.cluster),
+        health_reader(target.domain),
+        "",
+        "",
+    )
+    unread = store.why_unknown(read.objects_to_watch(target.domain)) if store else None
+    if store is None:
+        health = Health("waiting", "no access to this cluster")
+    elif unread:
+        health = Health("waiting", f"cannot be read: {unread}", f"cluster {store.name}")
+    else:
+        objects = store.objects()
+        health = read.domain_health(target.domain, commit, objects, history)
+        if health.state != "waiting":
+            health = read.release_health(target, commit, objects, history)
+        seen = read.applied_commit(target.domain, objects)
+        when = read.last_transition(target, objects)
     return {
         "seen": seen or None,
         "health": health.state if seen or health.object else "unknown",
@@ -96,25 +113,6 @@ def _state(
         "object": health.object or None,
         "reason": health.reason or None,
     }
-
-
-def _seen(
-    target: Target, commit: str, stores: Mapping[str, ObjectCache], history: History
-) -> tuple[Health, str, str]:
-    store = stores.get(target.domain.cluster)
-    if store is None:
-        return Health("waiting", "no access to this cluster"), "", ""
-    read = health_reader(target.domain)
-    unread = store.why_unknown(read.objects_to_watch(target.domain))
-    if unread:
-        reason = f"cannot be read: {unread}"
-        return Health("waiting", reason, f"cluster {store.name}"), "", ""
-    objects = store.objects()
-    health = read.domain_health(target.domain, commit, objects, history)
-    if health.state != "waiting":
-        health = read.release_health(target, commit, objects, history)
-    seen = read.applied_commit(target.domain, objects)
-    return health, seen, read.last_transition(target, objects)
 
 
 def _table(rows: Iterable[dict[str, Any]]) -> Table:

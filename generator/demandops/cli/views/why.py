@@ -98,11 +98,7 @@ def why(
 
 
 def _match(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> _Match:
-    """Return the object that a name identifies.
-
-    Raises:
-        StateRepoError: the name fits no object, or several.
-    """
+    """Return the object that a name identifies; raise if it fits none, or several."""
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     world = snapshot.state
@@ -221,7 +217,6 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 
 
 def _history(repo: Reader, snapshot: Snapshot, path: str, most: int) -> dict[str, Any]:
-    """Return the commits that created, changed and removed a path."""
     history = repo.history(path, str(snapshot.commit), most)
 
     def row(entry: LogEntry | None) -> dict[str, Any] | None:

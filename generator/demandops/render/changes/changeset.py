@@ -71,10 +71,7 @@ def build_changeset(
 
     Args:
         before, after: the world before and after; the configuration is the same.
-        claims: the claims that differ.
         keys: the releases that may differ (:func:`demandops.plan.release_keys.affected`).
-        engine: the engine of the configuration.
-        read: returns a current file.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.
@@ -113,8 +110,6 @@ def render_all(
     """Return all generated files, by path.
 
     Args:
-        world: the configuration and the claims.
-        engine: the configuration's engine.
         keys: all releases (:func:`demandops.plan.release_keys.all_keys`).
         current: the generated files in the state repo; overrides may hold some of them.
 

@@ -8,7 +8,7 @@ because the clusters follow the files. The plans of both sides describe the diff
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -24,7 +24,6 @@ from demandops.render.changes.data_diff import leaf_differences, short_value
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
-from demandops.subject import Subject, SubjectKind
 
 _MOST_FACTS = 20
 
@@ -85,43 +84,31 @@ def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) ->
 
     A fault's file is the first that exists: a claim of the release that is in ``edited``, the
     fault's own file, any claim of the release.
-
-    Args:
-        world: the configuration and the claims.
-        engine: the configuration's engine.
-        edited: the files that a person changed.
     """
     faults: list[Fault] = []
-    claim_files: dict[ReleaseKey, list[str]] = {}
+    files: dict[ReleaseKey, list[str]] = {}
     for key in all_keys(world):
         try:
             release = plan(world, key)
             if release is not None:
                 manifests.render(release, world.config, engine)
         except InvalidInput as error:
-            claim_files = claim_files or _claim_files(world)
-            faults += _located(error.faults, claim_files.get(key, []), edited)
+            files = files or _claim_files(world)
+            claims = files.get(key, [])
+            edited_claim = next((path for path in claims if path in edited), "")
+            for fault in error.faults:
+                faults.append(fault.within(edited_claim or fault.file or (claims or [""])[0]))
     return list(dict.fromkeys(faults))
 
 
 def _claim_files(world: World) -> dict[ReleaseKey, list[str]]:
     """Return the files of the claims that need a release, by release."""
     by_release: dict[ReleaseKey, list[str]] = {}
-    for subject in (
-        Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)
-    ):
-        files = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
+    for subject in sorted(world.ledger.claims, key=str):
+        paths = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
         for key in keys_of(world, subject):
-            by_release.setdefault(key, []).extend(files)
+            by_release.setdefault(key, []).extend(paths)
     return by_release
-
-
-def _located(
-    faults: Iterable[Fault], claims: list[str], edited: Collection[str]
-) -> Iterator[Fault]:
-    edited_claim = next((path for path in claims if path in edited), "")
-    for fault in faults:
-        yield replace(fault, file=edited_claim or fault.file or (claims or [""])[0])
 
 
 def preview(
@@ -130,12 +117,7 @@ def preview(
     current: Mapping[str, str],
     files: Mapping[str, str],
 ) -> MergePreview:
-    """Return the releases and files that change.
-
-    Args:
-        old, new: the releases before and after.
-        current, files: the generated files before and after.
-    """
+    """Return what changes from ``old`` to ``new`` releases, and ``current`` to ``files``."""
     file_changes = tuple(
         FileChange(path, current.get(path), files.get(path))
         for path in sorted({*current, *files})

@@ -67,7 +67,6 @@ class _Proof:
     """A commit that was rendered again; the proof of the next commit reuses its results."""
 
     def __init__(self, state: State, commit: Commit) -> None:
-        """Render a commit whole."""
         self.state, self._commit = state, commit
         self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
@@ -84,11 +83,7 @@ class _Proof:
         return trees.differ(self._commit.tree, commit.tree, roots)
 
     def advance(self, commit: Commit) -> None:
-        """Render the releases that a later commit affects, and record the files that it changed.
-
-        Raises:
-            _Unreadable: a claim file is not valid.
-        """
+        """Render the releases that a later commit affects, and record the files that it changed."""
         before, after = self._commit.tree, commit.tree
         try:
             changes = [
@@ -140,11 +135,7 @@ class _Proof:
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
-    """Yield a verdict on each commit, oldest first.
-
-    Args:
-        whole: load and render every commit whole.
-    """
+    """Yield a verdict on each commit, oldest first; with ``whole``, load and render each whole."""
     proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):
         commit = trees.commit_of(repo, revision)
@@ -252,7 +243,6 @@ def _disallowed(commit: Commit, entry: LogEntry) -> Iterator[str]:
 
 
 def _named(entry: LogEntry) -> set[str]:
-    """Return the file names of the claims that a commit's message accounts for."""
     demands = {*entry.trailers.get("Demand-Id", ())}
     for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
         demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))

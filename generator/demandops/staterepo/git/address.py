@@ -23,11 +23,9 @@ def is_url(address: str) -> bool:
 def connect(
     address: str, folder: Path, notify: Notify = lambda text: None, *, allow_offline: bool = False
 ) -> StateRepository:
-    """Open the state repo at ``address``.
+    """Open the state repo at a bare repository's folder, or at a URL that git clones to ``folder``.
 
     Args:
-        address: a folder with a bare repository, or any URL that git clones.
-        folder: the folder for the clone of a URL.
         notify: called with a text before work that takes a while.
         allow_offline: use an existing clone if its remote cannot be reached.
 

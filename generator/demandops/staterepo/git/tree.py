@@ -16,11 +16,7 @@ pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectTyp
 
 
 def commit_of(repo: Repository, revision: str | Oid) -> Commit:
-    """Return the commit of a revision, in any form that Git knows.
-
-    Raises:
-        StateRepoError: there is no such commit.
-    """
+    """Return the commit of a revision that Git knows, or raise StateRepoError."""
     try:
         found = repo[revision] if isinstance(revision, Oid) else repo.revparse_single(revision)
         return found.peel(Commit)

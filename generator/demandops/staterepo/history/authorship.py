@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import getpass
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime, timezone
+from functools import cache
 from typing import NamedTuple
 
 import git
@@ -37,30 +38,26 @@ class Person(NamedTuple):
 
 
 def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
-    """Return the commits by people up to ``to`` that ``known`` does not include, newest first.
-
-    Leaves out commits that change nothing the generator reads (a README).
-    """
+    """Return people's commits since ``known`` that change what the generator reads."""
     commits = commit_log.person_commits(repo, to, known)
     return [commit for commit in commits if _touches(commit, _ROOTS)]
 
 
-class FaultOrigins:
-    """Finds the commit by a person since ``known`` that last changed a path."""
+def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
+    """Return what finds commit and author of people's last change to a path, else to any."""
 
-    def __init__(self, repo: Repository, known: Oid, to: Oid) -> None:
-        self._range = (repo, to, known)
-        self._commits: list[Commit] | None = None
+    @cache  # read late: most reports exist already and need no commits
+    def commits() -> list[Commit]:
+        return list(commit_log.person_commits(repo, to, known))
 
-    def __call__(self, path: str) -> tuple[str, str] | None:
-        """Return commit and author of the last change to ``path``, else of any change."""
-        if self._commits is None:  # read late: most reports exist already and need no commits
-            self._commits = list(commit_log.person_commits(*self._range))
+    def origin(path: str) -> tuple[str, str] | None:
         for paths in ((path,) if path else (), _ROOTS):
-            for commit in self._commits:
+            for commit in commits():
                 if _touches(commit, paths):
                     return str(commit.id), str(author_of(commit))
         return None
+
+    return origin
 
 
 def _touches(commit: Commit, paths: Iterable[str]) -> bool:
@@ -86,8 +83,7 @@ def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
 def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
     """Return the author of a follow commit: the people whose commits it renders.
 
-    One person keeps name and address, so that ``git log --author`` finds both commits. Several
-    people are named with the generator's address, because a commit has only one.
+    One person keeps name and address, so that ``git log --author`` finds both commits.
     """
     if not causes:
         return commit_message.generator_signature(now)
@@ -98,11 +94,7 @@ def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
 
 
 def operator(folder: str | None = None) -> Person:
-    """Return the person who runs this program, from git or else the login.
-
-    Args:
-        folder: a repository whose configuration counts too; by default that of this directory.
-    """
+    """Return the person who runs this program, from git's configuration or else the login."""
     try:
         login = getpass.getuser()
     except (KeyError, OSError):  # a container's user has no passwd entry

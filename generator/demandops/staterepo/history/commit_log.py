@@ -90,11 +90,6 @@ def commits(
     return ((commit, entry_of(commit)) for commit in walker)
 
 
-def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> Iterator[LogEntry]:
-    """Yield the log entries of :func:`commits`."""
-    return (entry for _, entry in commits(repo, tip, until))
-
-
 def person_commits(
     repo: Repository, tip: str | Oid, until: str | Oid | None = None
 ) -> Iterator[Commit]:
@@ -137,7 +132,7 @@ def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Recorde
     except (pygit2.GitError, KeyError, ValueError):
         known = False
     outcomes = {}
-    for entry in walk(repo, tip, base if known else None):
+    for _, entry in commits(repo, tip, base if known else None):
         for key, outcome in _OUTCOMES.items():
             for operation in entry.trailers.get(key, ()):
                 outcomes[operation] = RecordedOutcome(entry.commit, outcome)

@@ -49,11 +49,7 @@ def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
 
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
-    """Return the claim at a path, or None if there is no file.
-
-    Raises:
-        InvalidInput: the file is not valid.
-    """
+    """Return the claim at a path, or None if there is no file; raise the faults of a file."""
     text = trees.read_text(tree, path)
     return claim_file.read(text, path) if text is not None else None
 
@@ -94,12 +90,7 @@ def last_valid_claims(
 
 
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
-    """Return the request to roll back to a commit, with ``more`` of its fields.
-
-    Raises:
-        InvalidInput: every fault of that commit's claim files.
-        StateRepoError: there is no such commit.
-    """
+    """Return the request to roll back to a commit, or raise every fault of its claim files."""
     commit = trees.commit_of(repo, to)
     found = read(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())
     if found.faults:

@@ -86,12 +86,7 @@ class Judgement:
 
 
 def judge(repo: Repository, advance: Advance, before: Snapshot, tree: Tree) -> Judgement:
-    """Return the subjects that people changed and that cannot be planned.
-
-    Args:
-        before: the state in effect before.
-        tree: the generated files, some of which overrides may hold.
-    """
+    """Return the subjects that people changed since ``before`` and that cannot be planned."""
     state, ledger = advance.snapshot.state, before.state.ledger
     old = replace(before.state, ledger=state.ledger)
 

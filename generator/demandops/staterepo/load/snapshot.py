@@ -73,14 +73,10 @@ class Advance:
 def load(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Load a commit whole.
-
-    Args:
-        progress: called with (files read, all files) while the ledger is read.
+    """Load a commit whole; ``progress`` is called with (files read, all files) of the ledger.
 
     Raises:
-        InvalidInput: every fault of every file.
-        StateRepoError: the commit is not a state repo.
+        InvalidInput, StateRepoError: with every fault of every file.
     """
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
@@ -160,7 +156,6 @@ def advance(
 
 
 def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Return whether a person changed generated files between two commits."""
     return any(
         trees.differ(commit.parents[0].tree, commit.tree, GENERATED_ROOTS)
         for commit in commit_log.person_commits(repo, to, before)
@@ -190,11 +185,7 @@ class ReadAhead:
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        """Return the advance from ``before`` to ``tip``.
-
-        Raises:
-            StateRepoError: ``tip`` has another render version.
-        """
+        """Return the advance to ``tip``; raise if that has another render version."""
         last_valid_config.refuse_other_render_version(trees.commit_of(repo, tip).tree)
         known = self._known
         if known is None or self._start != before.commit:

@@ -51,9 +51,6 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
     """Return the state to start from: :func:`start_at` of the newest commit.
 
     :func:`demandops.staterepo.load.snapshot.advance` then applies what people changed since.
-
-    Raises:
-        InvalidInput, StateRepoError: there never was a valid state.
     """
     objects, tip = repository.objects, repository.tip()
     last_valid_config.refuse_other_render_version(trees.commit_of(objects, tip).tree)
@@ -65,8 +62,7 @@ def state_at(
 ) -> Snapshot:
     """Return the state in effect at any commit: the recorded state with people's later changes.
 
-    Raises:
-        InvalidInput, StateRepoError: there never was a valid state.
+    Raises InvalidInput or StateRepoError if there never was a valid state.
     """
     commit = trees.commit_of(repo, revision)
     start = start_at(repo, commit.id, progress)
@@ -88,8 +84,7 @@ def start_at(
 ) -> Snapshot:
     """Return the newest known state up to a commit: a recorded one, or one without invalid files.
 
-    Raises:
-        InvalidInput, StateRepoError: there never was a valid state.
+    Raises InvalidInput or StateRepoError if there never was a valid state.
     """
     record = record_at(repo, commit)
     if record.first("In-Force"):
@@ -116,11 +111,7 @@ def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
 def recorded_state(
     repo: Repository, record: LogEntry, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state that was in effect at a commit of the generator.
-
-    Raises:
-        InvalidInput, StateRepoError: the recorded state is not valid.
-    """
+    """Return the state in effect at a commit of the generator; raise if the record is not valid."""
     commit = trees.commit_of(repo, record.commit)
     if not record.first("In-Force"):
         return snapshots.load(repo, commit.id, progress)

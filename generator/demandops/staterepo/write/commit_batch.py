@@ -8,7 +8,7 @@ evaluated again on the new tip.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from types import MappingProxyType
 from typing import Literal
@@ -46,13 +46,8 @@ _ATTEMPTS = 5
 _PAUSE_S = 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class _Followed:
-    """The effect of people's changes: the state in effect, the files and the kept claims."""
-
-    snapshot: Snapshot
-    change: Changeset
-    keys: tuple[ClaimKey, ...]
+_Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
+"""The effect of people's changes: the state in effect, the files and the kept claims."""
 
 
 class CommitBatch:
@@ -85,8 +80,7 @@ class CommitBatch:
     ) -> str:
         """Commit one demand and return the commit's id.
 
-        Args:
-            proposal: the branch that it awaits approval on; empty if it needs no approval.
+        ``proposal`` is the branch that it awaits approval on; empty if it needs no approval.
         """
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
@@ -123,33 +117,32 @@ class CommitBatch:
         A claim or file that cannot be planned or rendered (its node left the inventory) stays
         unchanged and is listed in the head's problems.
         """
-        followed = self._followed(advance, before, now)
-        self.head = followed.snapshot
-        report = self._report(followed.snapshot.problems, before)
-        files = {**followed.change.files, **report}
+        self.head, change, keys = self._followed(advance, before, now)
+        state, tip, problems = self.head.state, self.head.commit, self.head.problems
+        report = self._report(problems, before)
+        files = {**change.files, **report}
         if not files:
             return
         overrides = [
-            *changed_override_files(before.state, followed.snapshot.state),
-            *followed.change.overrides,
-            *commit_message.keep_override_paths(followed.keys),
+            *changed_override_files(before.state, state),
+            *change.overrides,
+            *commit_message.keep_override_paths(keys),
         ]
-        tip = followed.snapshot.commit
         causes = authorship.person_commits_since(self._objects, before.last_valid_commit, tip)
         text = commit_message.of_follow(
-            followed.change.releases,
+            change.releases,
             str(tip),
             str(before.commit),
-            followed.snapshot.problems,
+            problems,
             [
                 *commit_message.override_trailers(overrides),
                 *authorship.caused_by_trailers(causes),
-                *state_in_effect.trailers_of(followed.snapshot),
+                *state_in_effect.trailers_of(self.head),
             ],
             reports=bool(report),
         )
         author = authorship.follow_author(causes, now)
-        self.commit_files(files, followed.snapshot.state, text, author, now)
+        self.commit_files(files, state, text, author, now)
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
         """Return the effect, with the old configuration if the new one cannot be planned."""
@@ -172,7 +165,6 @@ class CommitBatch:
         return _with_started_leases(accepted.snapshot, state, change, applied.keys, now)
 
     def _rendered_subjects(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Render the subjects that people changed."""
         state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
         ledger, keys = kept_claims.update_kept_claims(old, state, subjects, now)
         files = changed_claim_files(state.ledger, ledger, keys)
@@ -184,7 +176,7 @@ class CommitBatch:
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
         """Return the problem report, if it changed."""
         current = self.read(problem_report.PATH)
-        origin = authorship.FaultOrigins(self._objects, before.last_valid_commit, self.start.commit)
+        origin = authorship.fault_origin(self._objects, before.last_valid_commit, self.start.commit)
         wanted = problem_report.write(
             problem_report.with_origins(problems, problem_report.read(current), origin)
         )
@@ -193,8 +185,7 @@ class CommitBatch:
     def end_override(self, override: Override, now: datetime) -> None:
         """Commit the end of an expired override, with its effect on claims and releases.
 
-        Raises:
-            Refused, InvalidInput: the state without the override cannot be planned or rendered.
+        Raises Refused or InvalidInput if the state without it cannot be planned or rendered.
         """
         applied = end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
@@ -208,8 +199,7 @@ class CommitBatch:
     ) -> Changeset:
         """Return all generated files that differ from the current ones, and the files of ``more``.
 
-        Raises:
-            Refused, InvalidInput: a release cannot be planned or rendered.
+        Raises Refused or InvalidInput if a release cannot be planned or rendered.
         """
         generated = trees.texts(self._tree, GENERATED_ROOTS)
         files: dict[str, str | None] = dict(rendered_files(state, generated))
@@ -255,11 +245,7 @@ class CommitBatch:
         return made
 
     def publish(self) -> bool:
-        """Publish the commits; return false if the state repo has moved.
-
-        Raises:
-            RemoteAway, PushDenied: they could not be published for another reason.
-        """
+        """Publish the commits; return false if the repo moved. Raises RemoteAway or PushDenied."""
         if self.is_empty:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)
@@ -279,4 +265,4 @@ def _with_started_leases(
         ledger = ledger.replace(claim.key, started)
         files[claim_file.path_of(claim.key)] = claim_file.text_of(started)
     snapshot = replace(snapshot, state=replace(state, ledger=ledger))
-    return _Followed(snapshot, replace(change, files=files), tuple(keys))
+    return snapshot, replace(change, files=files), tuple(keys)

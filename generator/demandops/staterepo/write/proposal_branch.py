@@ -64,15 +64,13 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        """Return the current commits of the branches.
-
-        Raises:
-            RemoteAway: the remote cannot be reached.
-        """
-        if self._remote is None:
-            found = _heads(Repository(self._repository.objects.path))
-        else:
+        """Return the current commits of the branches, or raise RemoteAway."""
+        if self._remote is not None:
             found = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
+        else:
+            references = Repository(self._repository.objects.path).references
+            names = [MAIN, *(name for name in references if name.startswith(f"{_HEADS}{PREFIX}"))]
+            found = {name: str(references[name].target) for name in names}
         named = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
         return BranchHeads(named.pop(MAIN_BRANCH, ""), named)
 
@@ -80,8 +78,6 @@ class ProposalBranches:
         """Make a branch point to ``commit``, durably; return the link that the server printed.
 
         Args:
-            branch: its name.
-            commit: a commit in this repository.
             expected: the branch's commit now; empty if the branch must not exist.
             options: push options; left out if the server supports none.
 
@@ -92,12 +88,7 @@ class ProposalBranches:
         return self._set(branch, commit, expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
-        """Delete a branch, if it exists.
-
-        Raises:
-            BranchMoved: the branch is at another commit.
-            RemoteAway, PushDenied: the deletion could not be pushed for another reason.
-        """
+        """Delete a branch, if it exists; raises like :meth:`put`."""
         self._set(branch, None, expected)
 
     def _set(
@@ -142,13 +133,10 @@ class ProposalBranches:
         demands: Iterable[tuple[str, datetime, Decision]],
         now: datetime,
     ) -> Oid:
-        """Commit demands for a branch on top of main; does not move the branch.
+        """Commit demands for a branch on top of main, ``tip``; does not move the branch.
 
         Args:
-            branch: its name, for the commits' trailers.
-            tip: main.
             demands: the operation id, the time received and the decision of each.
-            now: the time of the commits.
         """
         commits = CommitBatch(self._repository, tip)
         for operation, received, decision in demands:
@@ -168,11 +156,7 @@ class ProposalBranches:
     ) -> bool:
         """Return whether merging ``commit`` into ``tip`` changes ``files`` and no others, cleanly.
 
-        Args:
-            tip: the current commit of main.
-            commit: the proposal, on top of ``base``.
-            base: the commit of main that the proposal was made on.
-            files: what the demands write on the current main.
+        ``base`` is the commit of main that the proposal was made on.
         """
         objects = self._repository.objects
         try:
@@ -184,13 +168,7 @@ class ProposalBranches:
         proposed = dict(trees.differences(old, proposal))
         if proposed != dict(trees.differences(now, new)):
             return False
-        moved = dict(trees.differences(old, now))
-        return not set(moved) & set(proposed)
-
-
-def _heads(repo: Repository) -> dict[str, str]:
-    names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
-    return {name: str(repo.references[name].target) for name in [MAIN, *names]}
+        return proposed.keys().isdisjoint(path for path, _ in trees.differences(old, now))
 
 
 def _link(output: str) -> str:
@@ -229,24 +207,19 @@ class PendingProposal:
 
 
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
-    """Yield the proposals that are not merged, by branch.
-
-    Raises:
-        RemoteAway: the remote cannot be reached.
-    """
+    """Yield the proposals that are not merged, by branch, or raise RemoteAway."""
+    space = f"{_HEADS}{PREFIX}"
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
+        space = f"refs/remotes/origin/{PREFIX}"
     repo = Repository(repository.objects.path)
-    remote = isinstance(repository, RemoteRepository)
-    space = f"refs/remotes/origin/{PREFIX}" if remote else f"{_HEADS}{PREFIX}"
     main = repository.tip()
     for name in sorted(name for name in repo.references if name.startswith(space)):
         found = commit_log.commits(repo, repo.references[name].resolve().target, main)
         proposed = [pair for pair in found if commit_log.PROPOSAL in pair[1].trailers]
         if not proposed:
             continue
-        entries = [entry for _, entry in proposed]
-        first = proposed[-1][0]
+        entries, first = [entry for _, entry in proposed], proposed[-1][0]
         yield PendingProposal(
             branch=f"{PREFIX}{name.removeprefix(space)}",
             commit=entries[0].commit,
