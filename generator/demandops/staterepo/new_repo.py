@@ -17,9 +17,6 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import commit_message
 
-PIPELINES = (".github/workflows/demandops.yml", ".gitlab-ci.yml")
-"""The pipelines that check pull requests, on GitHub and GitLab."""
-
 
 def init(
     target: Path,

@@ -51,9 +51,7 @@ class _Document:
 )
 @signing_option
 @output_option
-@click.pass_context
 def request(
-    ctx: click.Context,
     files: tuple[str, ...],
     state_repo: str,
     dry_run: bool,
@@ -82,7 +80,7 @@ def request(
     else:
         _print(rows, documents, dry_run)
     if any(row["outcome"] == "refused" for row in rows):
-        ctx.exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _documents(file: str) -> Iterable[_Document]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,13 @@ from typing import Any
 import click
 
 from demandops.cli.actions.ledger_change import claim_text, print_refusal, started_generator
-from demandops.cli.json_output import claim_data, faults_of, output_option, print_json
-from demandops.cli.output import SIGNS, console, progress, signing_option, state_repo_option
+from demandops.cli.json_output import claim_data, faults_of, output_option, show
+from demandops.cli.output import progress, signing_option, state_repo_option
+from demandops.cli.views.diff import release_lines
 from demandops.config.config import CONFIG_ROOTS
 from demandops.decision import Decision, decide
 from demandops.errors import InvalidInput
+from demandops.render.changes.changeset import ReleaseChange
 from demandops.runtime import REAL
 from demandops.service import rollback_goal
 from demandops.staterepo import reader
@@ -34,9 +37,7 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 @click.option("--dry-run", is_flag=True, help="Show the consequences and change nothing.")
 @signing_option
 @output_option
-@click.pass_context
-def rollback(  # noqa: PLR0913, PLR0917 - one for each option
-    ctx: click.Context,
+def rollback(
     revision: str,
     state_repo: str,
     reason: str | None,
@@ -66,12 +67,11 @@ def rollback(  # noqa: PLR0913, PLR0917 - one for each option
             result["faults"] = faults_of(error)
     if not dry_run and not result["faults"]:
         result |= _roll_back(state_repo, goal, signing_key, base)
-    if output == "json":
-        print_json(result)
-    else:
-        _print(result, dry_run)
+    if result["faults"] and output == "text":
+        print_refusal(f"the rollback to {to[:10]} is refused:", result["faults"])
+    show(output, result, _lines(result, dry_run))
     if result["faults"]:
-        ctx.exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _dry_run(repo: Reader, goal: dict[str, Any], base: str) -> dict[str, Any]:
@@ -113,26 +113,19 @@ def _roll_back(
     return result
 
 
-def _print(result: dict[str, Any], dry_run: bool) -> None:
-    to, out = result["to"][:10], console()
-    if result["faults"]:
-        print_refusal(f"the rollback to {to} is refused:", result["faults"])
-    elif result["outcome"] == "unchanged":
-        out.print(f"the ledger is the same as at {to}; there is nothing to roll back")
-    elif dry_run:
-        out.print(f"the rollback to {to} would change:")
-    else:
-        out.print(f"rolled back to {to} in {result['commit']}")
+def _lines(result: dict[str, Any], dry_run: bool) -> Iterator[str]:
+    to = result["to"][:10]
+    if result["outcome"] == "unchanged":
+        yield f"the ledger is the same as at {to}; there is nothing to roll back"
+    elif not result["faults"]:
+        done = f"rolled back to {to} in {result['commit']}"
+        yield f"the rollback to {to} would change:" if dry_run else done
     for word, sign in _SIGN.items():
         for claim in result[word]:
             what = f"claim of {', '.join(claim['requesters'])} on {claim_text(claim)}"
-            out.print(f"  {sign} {what} ({word.replace('_', ' ')})")
-    for release in result["releases"]:
-        out.print(f"  {SIGNS[release['change']]} release {release['name']} ({release['what']})")
-        for detail in release["details"]:
-            out.print(f"      {detail}")
-    since = result["configuration_since"]
-    if since:
-        out.print(f"a rollback does not change configuration; changed since {to}:")
-        for path in since:
-            out.print(f"  {path}")
+            yield f"  {sign} {what} ({word.replace('_', ' ')})"
+    releases = (ReleaseChange(**each) for each in result["releases"])
+    yield from (f"  {line}" for line in release_lines(releases, "release "))
+    if result["configuration_since"]:
+        yield f"a rollback does not change configuration; changed since {to}:"
+        yield from (f"  {path}" for path in result["configuration_since"])

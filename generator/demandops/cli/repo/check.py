@@ -51,7 +51,7 @@ def check(directory: Path, base: str | None, output: str) -> None:
     else:
         _print(directory, checked)
     if checked.faults:
-        click.get_current_context().exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _data(checked: CheckResult) -> dict[str, Any]:

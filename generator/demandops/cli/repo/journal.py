@@ -38,7 +38,7 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
     for damage in damages:
         errors.print(f"error: {damage}")
     if damages:
-        click.get_current_context().exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _row(found: FoundJournal) -> dict[str, Any]:

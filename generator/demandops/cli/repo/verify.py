@@ -34,7 +34,7 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
         verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
     show(output, [_row(verdict) for verdict in verdicts], _lines(verdicts))
     if not all(verdict.holds for verdict in verdicts):
-        click.get_current_context().exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _row(verdict: Verdict) -> dict[str, Any]:

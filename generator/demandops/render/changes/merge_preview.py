@@ -10,9 +10,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
-from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.world import World
@@ -20,12 +19,15 @@ from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of
 from demandops.render.changes.changeset import ReleaseChange, describe_change
-from demandops.render.changes.data_diff import leaf_differences, short_value
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
+from demandops.strict_yaml import load_all, short_repr
 
 _MOST_FACTS = 20
+
+ABSENT = object()
+"""Marks a missing value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,12 +160,27 @@ def _pairs(
 def _facts(before: str, after: str) -> Iterator[str]:
     """Yield the differences between two manifests, if no fact of the plan describes them."""
     try:
-        differing = list(
-            leaf_differences(list(strict_yaml.load_all(before)), list(strict_yaml.load_all(after)))
-        )
+        differing = list(leaf_differences(list(load_all(before)), list(load_all(after))))
     except InvalidInput:
         return
     for path, old, new in differing[:_MOST_FACTS]:
-        yield f"{path.removeprefix('[0].')}: {short_value(old)} → {short_value(new)}"
+        was, now = ("none" if one is ABSENT else short_repr(one) for one in (old, new))
+        yield f"{path.removeprefix('[0].')}: {was} → {now}"
     if len(differing) > _MOST_FACTS:
         yield f"and {len(differing) - _MOST_FACTS} more"
+
+
+def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
+    """Yield (path, old, new) of the smallest parts that differ.
+
+    A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`.
+    """
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in dict.fromkeys([*old, *new]):
+            inner = f"{path}.{key}" if path else str(key)
+            yield from leaf_differences(old.get(key, ABSENT), new.get(key, ABSENT), inner)
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for index, (left, right) in enumerate(zip(old, new, strict=True)):
+            yield from leaf_differences(left, right, f"{path}[{index}]")
+    elif type(old) is not type(new) or old != new:
+        yield path, old, new

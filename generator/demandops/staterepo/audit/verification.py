@@ -144,7 +144,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         if verdict.skipped:
             yield verdict
             continue
-        verdict = replace(verdict, touched=disallowed_files(commit, entry))
+        verdict = replace(verdict, touched=tuple(sorted(_disallowed_files(commit, entry))))
         before, proof = proof, None  # it stays None if the commit cannot be read
         try:
             if whole or place == len(commits) or entry.first("In-Force"):
@@ -214,16 +214,14 @@ def _blob(text: str) -> Oid:
     return pygit2.hash(text.encode())
 
 
-def disallowed_files(commit: Commit, entry: LogEntry) -> tuple[str, ...]:
-    """Return the files that a commit changed although its message does not account for them.
+def _disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
+    """Yield the files that a commit changed although its message does not account for them.
 
     These are files that people write, claims of demands that the message does not name, and claims
     that are not formatted as the generator writes them.
     """
-    return tuple(sorted(_disallowed(commit, entry))) if commit.parents else ()
-
-
-def _disallowed(commit: Commit, entry: LogEntry) -> Iterator[str]:
+    if not commit.parents:
+        return
     before, operation = commit.parents[0].tree, entry.first("Operation")
     named = _named(entry)
     for path, blob in trees.differences(before, commit.tree):
@@ -233,7 +231,8 @@ def _disallowed(commit: Commit, entry: LogEntry) -> Iterator[str]:
         if root != claim_file.LEDGER_ROOT:
             yield path
         elif path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
-            if operation not in _ENDING or (blob and not _is_marker(commit, path)):
+            text = trees.read_text(commit.tree, path) or ""
+            if operation not in _ENDING or (blob and not ended_override_file.read({path: text})):
                 yield path
         elif path.rsplit("/", 1)[-1] in named:
             if blob and not _is_canonical(commit, path):
@@ -259,10 +258,6 @@ def _only_starts_lease(commit: Commit, path: str) -> bool:
     started = not before.lease.has_started and after.lease.has_started
     same = replace(before, lease=replace(before.lease, until=after.lease.until)) == after
     return started and same and _is_canonical(commit, path)
-
-
-def _is_marker(commit: Commit, path: str) -> bool:
-    return bool(ended_override_file.read({path: trees.read_text(commit.tree, path) or ""}))
 
 
 def _is_canonical(commit: Commit, path: str) -> bool:

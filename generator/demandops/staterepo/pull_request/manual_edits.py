@@ -18,7 +18,7 @@ from demandops.config.registry import Image
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file
 from demandops.plan.release import Release, ServiceRelease
-from demandops.render.changes.data_diff import leaf_differences, merge_patch
+from demandops.render.changes.merge_preview import ABSENT, leaf_differences
 from demandops.render.gitops.flux import chart_object
 from demandops.render.gitops.paths import BOOTSTRAP_ROOT, path_of
 from demandops.settings import API_VERSION, GENERATED_ROOTS, NOTES_ROOT
@@ -182,7 +182,7 @@ def _service_effects(
     before, after = _at(old[0], place_of_values), _at(new[0] if new else None, place_of_values)
     patched: tuple[str, ...] = ()
     if isinstance(before, dict) and isinstance(after, dict):
-        values = merge_patch(before, after)
+        values = _merge_patch(before, after)
         images = dict[str, dict[str, str]]()
         _move_images(values, before, release, config, images)
         replicas = values.get("replicas")
@@ -271,3 +271,17 @@ def _pin(reference: object, image: Image) -> dict[str, str] | None:
     if match["repository"] != image.repository:
         pin["repository"] = match["repository"]
     return pin if pin.keys() & {"tag", "digest"} else None
+
+
+def _merge_patch(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON merge patch (RFC 7386) that turns ``old`` into ``new``; null removes."""
+    patch: dict[str, Any] = {key: None for key in old if key not in new}
+    for key, value in new.items():
+        old_value = old.get(key, ABSENT)
+        if isinstance(old_value, dict) and isinstance(value, dict):
+            inner = _merge_patch(old_value, value)
+            if inner:
+                patch[key] = inner
+        elif next(leaf_differences(old_value, value), None) is not None:
+            patch[key] = value
+    return patch

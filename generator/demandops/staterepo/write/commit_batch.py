@@ -37,7 +37,6 @@ from demandops.staterepo.history import authorship, commit_log, commit_message
 from demandops.staterepo.load import (
     last_valid_config,
     problem_report,
-    quarantine,
     state_in_effect,
 )
 from demandops.staterepo.load.snapshot import Advance, Snapshot
@@ -146,7 +145,7 @@ class CommitBatch:
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
         """Return the effect, with the old configuration if the new one cannot be planned."""
-        judgement = quarantine.judge(self._objects, advance, before, self._tree)
+        judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
         accepted = judgement.with_new_config()
         if advance.config_changed:
             try:
