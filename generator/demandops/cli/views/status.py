@@ -14,7 +14,8 @@ from rich.table import Table
 from demandops.cli.json_output import output_option, release_data, show
 from demandops.cli.output import errors, progress, state_repo_option
 from demandops.cluster import access
-from demandops.cluster.health import Health, History, ObjectSelector, Target, health_reader
+from demandops.cluster.health import health_reader
+from demandops.cluster.health.release_health import Health, History, ObjectSelector, Target
 from demandops.cluster.object_cache import ObjectCache
 from demandops.runtime import REAL
 from demandops.service import rollout_targets
@@ -87,22 +88,15 @@ def _read(
 def _state(
     target: Target, commit: str, stores: Mapping[str, ObjectCache], history: History
 ) -> dict[str, Any]:
-    store, read, seen, when = (
-        stores.get(target.domain.cluster),
-        health_reader(target.domain),
-        "",
-        "",
-    )
-    unread = store.why_unknown(read.objects_to_watch(target.domain)) if store else None
+    store, seen, when = stores.get(target.domain.cluster), "", ""
+    unread = store.unread(target.domain) if store else None
     if store is None:
         health = Health("waiting", "no access to this cluster")
     elif unread:
-        health = Health("waiting", f"cannot be read: {unread}", f"cluster {store.name}")
+        health = unread
     else:
-        objects = store.objects()
-        health = read.domain_health(target.domain, commit, objects, history)
-        if health.state != "waiting":
-            health = read.release_health(target, commit, objects, history)
+        read, objects = health_reader(target.domain), store.objects()
+        health = read.health(target, commit, objects, history)
         seen = read.applied_commit(target.domain, objects)
         when = read.last_transition(target, objects)
     return {

@@ -16,7 +16,6 @@ import git
 import pygit2
 from pygit2 import Oid, Repository
 
-from demandops.decision import Decision
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
@@ -24,8 +23,6 @@ from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import MAIN, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
-from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write.commit_batch import CommitBatch
 
 PREFIX = "demand/"
 _HEADS = "refs/heads/"
@@ -65,12 +62,12 @@ class ProposalBranches:
 
     def heads(self) -> BranchHeads:
         """Return the current commits of the branches, or raise RemoteAway."""
-        if self._remote is not None:
-            found = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
+        if self._remote is None:
+            repo = Repository(self._repository.objects.path)
+            names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
+            found = {name: str(repo.references[name].target) for name in [MAIN, *names]}
         else:
-            references = Repository(self._repository.objects.path).references
-            names = [MAIN, *(name for name in references if name.startswith(f"{_HEADS}{PREFIX}"))]
-            found = {name: str(references[name].target) for name in names}
+            found = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
         named = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
         return BranchHeads(named.pop(MAIN_BRANCH, ""), named)
 
@@ -78,6 +75,8 @@ class ProposalBranches:
         """Make a branch point to ``commit``, durably; return the link that the server printed.
 
         Args:
+            branch: its name.
+            commit: a commit in this repository.
             expected: the branch's commit now; empty if the branch must not exist.
             options: push options; left out if the server supports none.
 
@@ -88,7 +87,12 @@ class ProposalBranches:
         return self._set(branch, commit, expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
-        """Delete a branch, if it exists; raises like :meth:`put`."""
+        """Delete a branch, if it exists.
+
+        Raises:
+            BranchMoved: the branch is at another commit.
+            RemoteAway, PushDenied: the deletion could not be pushed for another reason.
+        """
         self._set(branch, None, expected)
 
     def _set(
@@ -126,24 +130,6 @@ class ProposalBranches:
         else:
             references.create(reference, commit)
 
-    def commit(
-        self,
-        branch: str,
-        tip: Snapshot,
-        demands: Iterable[tuple[str, datetime, Decision]],
-        now: datetime,
-    ) -> Oid:
-        """Commit demands for a branch on top of main, ``tip``; does not move the branch.
-
-        Args:
-            demands: the operation id, the time received and the decision of each.
-        """
-        commits = CommitBatch(self._repository, tip)
-        for operation, received, decision in demands:
-            if decision.files:
-                commits.commit(decision, operation, received, now, branch)
-        return commits.head.commit
-
     def message(self, commit: str) -> str:
         """Return a commit's message; empty if the commit is not here."""
         try:
@@ -156,7 +142,11 @@ class ProposalBranches:
     ) -> bool:
         """Return whether merging ``commit`` into ``tip`` changes ``files`` and no others, cleanly.
 
-        ``base`` is the commit of main that the proposal was made on.
+        Args:
+            tip: the current commit of main.
+            commit: the proposal, on top of ``base``.
+            base: the commit of main that the proposal was made on.
+            files: what the demands write on the current main.
         """
         objects = self._repository.objects
         try:
@@ -176,21 +166,6 @@ def _link(output: str) -> str:
     lines = [line for line in output.splitlines() if line.startswith("remote:")]
     links = [found[0] for line in lines if (found := _LINK.search(line))]
     return next((link for link in links if "/merge_requests/" in link), "")
-
-
-def gitlab_options(title: str, description: str, labels: Iterable[str]) -> list[str]:
-    """Return the push options that make GitLab open a merge request.
-
-    Push options cannot hold line breaks, so the description has one line.
-    """
-    return [
-        "merge_request.create",
-        f"merge_request.target={MAIN_BRANCH}",
-        f"merge_request.title={title}",
-        f"merge_request.description={description}",
-        "merge_request.remove_source_branch",
-        *(f"merge_request.label={label}" for label in labels),
-    ]
 
 
 @dataclass(frozen=True, slots=True)
