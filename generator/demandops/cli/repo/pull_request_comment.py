@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 
 from demandops.cli.output import printable
-from demandops.plan.views.bookkeeping_diff import EntryChange
+from demandops.plan.views.bookkeeping import EntryChange
 from demandops.render.changes.changeset import CHANGE_ORDER, ReleaseChange
 from demandops.staterepo.pull_request.merge_check import CheckResult
 

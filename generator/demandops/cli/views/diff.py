@@ -9,8 +9,7 @@ import click
 
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import SIGNS, progress, state_repo_option, warn_of
-from demandops.plan.views.bookkeeping import bookkeeping
-from demandops.plan.views.bookkeeping_diff import EntryChange, bookkeeping_changes
+from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.changes.merge_preview import planned_releases, preview
 from demandops.render.gitops.paths import CLUSTERS_ROOT

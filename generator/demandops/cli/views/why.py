@@ -25,7 +25,7 @@ from demandops.demand.claim import Claim
 from demandops.errors import StateRepoError, quoted, suggestion
 from demandops.ledger import claim_file
 from demandops.ledger.world import World
-from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
+from demandops.plan.overrides.claim_overrides import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import release_causes
 from demandops.render.gitops.paths import path_of
@@ -168,8 +168,8 @@ def _of_release(world: World, running: Release) -> dict[str, Any]:
         **place_data(running),
         **_claims(claims, world),
         "shaped_by": [
-            {"file": each.file, "entry": each.entry or None, "what": each.what}
-            for each in release_causes.shaping_files(running, world.config)
+            {"file": file, "entry": entry or None, "what": what}
+            for file, entry, what in release_causes.shaping_files(running, world.config)
         ],
         "overrides": [override_data(*each) for each in running.shaping.by],
     }
@@ -201,7 +201,7 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
     rows = []
     for claim in claims:
         suspended = suspended_by(claim, world)
-        kept = release_causes.keeping_override(claim, world.config)
+        kept = world.config.overrides.get(claim.keeping_override or "")
         rows.append(
             claim_data(claim)
             | {
