@@ -224,6 +224,15 @@ def commits(repo: Path, revisions: str = "main") -> list[Commit]:
     return [commit for commit in found if commit.parents]
 
 
+def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
+    """Have a repository run a script; return its file."""
+    path = Path(os.fspath(repo), "hooks", name)
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return path
+
+
 def tip(repo: Path | str) -> str:
     """Return the newest commit of main."""
     return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)

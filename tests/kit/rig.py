@@ -27,6 +27,7 @@ from tests.kit.repo import (
     commits,
     differing,
     git,
+    hook,
     init,
     operations,
     root,

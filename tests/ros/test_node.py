@@ -14,17 +14,13 @@ from demandops_interfaces.srv import GetBookkeeping
 from examples.experiment import paper
 from tests.kit.goals import experiment
 from tests.kit.goals import link as connection
-from tests.kit.repo import git, tip
+from tests.kit.repo import git, hook, tip
 from tests.kit.ros import Client, Serve, Served
 
 
 def held_remote(bare: Path) -> str:
     """Hold every push to a repository until its file ``go`` is there, and return its URL."""
-    hook = bare / "hooks" / "pre-receive"
-    hook.parent.mkdir(exist_ok=True)
-    wait = "for _ in $(seq 600); do [ -e go ] && exit; sleep 0.05; done"
-    hook.write_text(f"#!/bin/sh\n{wait}\n")
-    hook.chmod(0o755)
+    hook(bare, "pre-receive", "for _ in $(seq 600); do [ -e go ] && exit; sleep 0.05; done")
     return f"file://{bare}"
 
 

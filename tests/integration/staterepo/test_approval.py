@@ -420,16 +420,15 @@ def hooked(bare: Path) -> Iterator[Path]:
     """Where a server's hook writes the push options that reach it."""
     git(bare, "config", "receive.advertisePushOptions", "true")
     log = bare / "options"
-    hook = bare / "hooks" / "pre-receive"
-    hook.parent.mkdir(exist_ok=True)
-    hook.write_text(
-        '#!/bin/sh\nread old new ref\necho "$ref" >> options\ni=0\n'
+    rig.hook(
+        bare,
+        "pre-receive",
+        'read old new ref\necho "$ref" >> options\ni=0\n'
         'while [ "$i" -lt "${GIT_PUSH_OPTION_COUNT:-0}" ]; do\n'
         '  eval "echo \\"  \\$GIT_PUSH_OPTION_$i\\"" >> options\n  i=$((i+1))\ndone\n'
         'case "$ref" in refs/heads/demand/*) echo "View merge request for $ref:"\n'
-        'echo "  https://git.example.org/its/state/-/merge_requests/7";; esac\n'
+        'echo "  https://git.example.org/its/state/-/merge_requests/7";; esac',
     )
-    hook.chmod(0o755)
     yield log
 
 
@@ -472,10 +471,7 @@ def test_a_server_that_takes_no_push_options_gets_the_branch_without(
 def test_a_server_that_refuses_the_branch_is_told_to_the_requester(
     url: str, bare: Path, petra: Person
 ) -> None:
-    hook = bare / "hooks" / "pre-receive"
-    hook.parent.mkdir(exist_ok=True)
-    hook.write_text("#!/bin/sh\necho 'no branches here' >&2\nexit 1\n")
-    hook.chmod(0o755)
+    rig.hook(bare, "pre-receive", "echo 'no branches here' >&2; exit 1")
     refused = pytest.raises(StateRepoError, match=r"rejects the push: .*no branches here")
     with rig.running(url) as generator, refused:
         rig.receipt(generator.submit(goal(1)))

@@ -15,10 +15,7 @@ def pushes(bare: Path) -> Path:
     """A file with a line for each push that the remote took."""
     log = bare / "pushes"
     log.touch()
-    hook = bare / "hooks" / "post-receive"
-    hook.parent.mkdir(exist_ok=True)
-    hook.write_text(f"#!/bin/sh\ncat >> {log}\n")
-    hook.chmod(0o755)
+    rig.hook(bare, "post-receive", f"cat >> {log}")
     return log
 
 

@@ -24,14 +24,6 @@ def away(bare: Path) -> Iterator[None]:
         elsewhere.rename(bare)
 
 
-def _hook(bare: Path, name: str, script: str) -> Path:
-    path = bare / "hooks" / name
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(f"#!/bin/sh\n{script}\n")
-    path.chmod(0o755)
-    return path
-
-
 # ---- away and back ----
 
 
@@ -177,7 +169,7 @@ def test_a_declined_push_fails_the_demand_with_the_hooks_words_and_leaves_no_tra
 ) -> None:
     with rig.running(url) as generator:
         rig.book(generator, goal(0))
-        hook = _hook(bare, name, "echo 'main is frozen until Monday' >&2; exit 1")
+        hook = rig.hook(bare, name, "echo 'main is frozen until Monday' >&2; exit 1")
         with pytest.raises(StateRepoError, match="main is frozen until Monday"):
             rig.receipt(generator.submit(goal(1), "op-denied"))
         hook.unlink()
@@ -195,7 +187,7 @@ def test_a_declined_push_is_told_to_all_of_its_batch_but_not_to_those_refused_be
     url: str, bare: Path
 ) -> None:
     gate = Gate()
-    hook = _hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
+    hook = rig.hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
     with rig.running(url) as generator:
         tickets = [generator.submit(goal(1), listener=gate)]
         assert gate.reached.wait(rig.PATIENCE_S)
@@ -216,7 +208,7 @@ def test_a_declined_push_is_told_to_all_of_its_batch_but_not_to_those_refused_be
 def test_a_declined_release_leaves_what_is_held(url: str, bare: Path) -> None:
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
-        hook = _hook(bare, "pre-receive", "exit 1")
+        hook = rig.hook(bare, "pre-receive", "exit 1")
         with pytest.raises(StateRepoError, match="rejects the push"):
             rig.book(generator, leave(1))
         assert len(rig.claims(bare, "user1")) == 2
