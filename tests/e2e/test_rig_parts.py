@@ -204,7 +204,7 @@ def test_a_process_outlives_the_thread_that_started_it(
 
 @pytest.fixture
 def git_port(tmp_path: Path) -> Iterator[int]:
-    server = githttp.GitServer(tmp_path / "served", net.LOOPBACK, net.free_port())
+    server = githttp.GitServer(tmp_path / "served", net.LOOPBACK, net.free_port(), githttp.Handler)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
     thread.start()
     yield server.server_address[1]

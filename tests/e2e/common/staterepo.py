@@ -100,6 +100,14 @@ class StateRepo(Generic[Domain]):
         self.generator = Generator(self.push_url, folder, ros_domain, client)
         self.domains: dict[str, Domain] = {}
 
+    def bootstrap(self, cluster: str, rig: Rig) -> Domain:
+        """Apply `bootstrap/<cluster>.yaml` to a cluster and wait until it follows."""
+        raise NotImplementedError
+
+    def remove(self) -> None:
+        """Remove the state repo from its clusters. The namespace stays."""
+        raise NotImplementedError
+
     @property
     def domain(self) -> Domain:
         """The access domain, if only one cluster follows."""

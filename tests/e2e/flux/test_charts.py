@@ -11,10 +11,9 @@ import pytest
 import yaml
 
 from tests.e2e.common.golden import golden
+from tests.e2e.common.running import NAMESPACE
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Manifest
-
-from .conftest import NAMESPACE
 
 ROOT = Path(__file__).resolve().parents[3]
 CHARTS = ROOT / "appdefs" / "object-detection-fusion" / "charts"
