@@ -163,6 +163,10 @@ class Person:
         assert old in text, f"{path} does not hold {old!r}"
         return self.change({path: text.replace(old, new)})
 
+    def override(self, **named: str | None) -> str:
+        """Merge ``name=text`` as overrides/<name>.yaml, or remove it; return the commit."""
+        return self.change({f"overrides/{name}.yaml": text for name, text in named.items()})
+
     def policy(self, **changed: Any) -> None:
         """Change every access domain."""
         data = yaml.safe_load(self.read(POLICY))
@@ -205,7 +209,10 @@ class Commit:
     trailers: tuple[tuple[str, str], ...]
 
     def one(self, key: str) -> str:
-        return next((value for known, value in self.trailers if known == key), "")
+        return next(iter(self.all(key)), "")
+
+    def all(self, key: str) -> list[str]:
+        return [value for known, value in self.trailers if known == key]
 
 
 _FORMAT = "%H%x1f%P%x1f%s%x1f%(trailers:only,unfold,separator=%x1e)%x1d"
@@ -241,6 +248,13 @@ def tip(repo: Path | str) -> str:
 def read(repo: Path, path: str) -> str:
     """Return a file of main, empty when it is not there."""
     return GitRepo(repo).files(path).get(path, "")
+
+
+def without_vehicle01(repo: Path) -> dict[str, str | None]:
+    """Return the inventory of nodes without one that demand 1 uses."""
+    path = "inventory/nodes.yaml"
+    before, _, rest = read(repo, path).partition("  - id: vehicle01\n")
+    return {path: before + rest[rest.index("  - id: vehicle02\n") :]}
 
 
 def operations(repo: Path) -> list[str]:

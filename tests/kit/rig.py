@@ -32,4 +32,5 @@ from tests.kit.repo import (
     operations,
     root,
     tip,
+    without_vehicle01,
 )

@@ -83,9 +83,9 @@ def petra(hub: Hub, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_pull_request_is_opened_and_its_link_told(
-    hub: Hub, address: str, bare: Path, petra: Person
+    hub: Hub, url: str, bare: Path, petra: Person
 ) -> None:
-    with rig.running(address) as generator:
+    with rig.running(url) as generator:
         proposed = Proposed(generator, goal(1))
         branch = proposed.branch
         [pull] = hub.pulls
