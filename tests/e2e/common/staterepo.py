@@ -19,10 +19,11 @@ from tests.e2e.rig import launch
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.errors import RigError
+from tests.kit.ros import Sent
 
 from .expected import demand
 from .namespace import Namespace
-from .ros import Client, Sent
+from .ros import Client
 from .timing import Times
 
 Domain = TypeVar("Domain", bound=Namespace)

@@ -65,8 +65,9 @@ def test_a_service_that_cannot_start_is_reconfigured_and_removed(
 def running(world: World) -> Namespace:
     """Return the domain after step 1, with nothing left to reconcile."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
-    world.domain.wait_releases()
-    return world.domain
+    domain: Namespace = world.domain
+    domain.wait_releases()
+    return domain
 
 
 def test_another_requester_changes_no_object_of_a_release(world: World) -> None:
