@@ -75,18 +75,6 @@ def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:
     }
 
 
-def test_sent_again_it_waits_on_the_same_branch_and_once_merged_changes_nothing(
-    demandops: Run, send: Send, strict: GitRepo
-) -> None:
-    first, second = send(strict), send(strict)
-    assert first.out == second.out
-    branch = first.out.split()[-1]
-    git(strict, "branch", "--force", "main", branch)
-    assert demandops("proposals", "--state-repo", strict.path).out == "nothing awaits approval\n"
-    [row] = send(strict, "--output", "json").json()
-    assert (row["outcome"], row["commit"]) == ("unchanged", strict.tip)
-
-
 @contextmanager
 def decided(state: GitRepo, *command: str) -> Iterator[None]:
     """A person who runs a command of git with the first branch that comes."""

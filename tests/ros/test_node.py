@@ -67,19 +67,19 @@ def test_a_goal_sent_again_succeeds_without_a_commit(shared: Served, caller: Cli
     assert (again.status, again.message) == ("succeeded", f"unchanged: {commit}")
 
 
-def test_two_hundred_goals_at_once_are_all_answered_and_none_is_lost(
+def test_a_hundred_goals_at_once_are_all_answered_and_none_is_lost(
     shared: Served, caller: Client
 ) -> None:
     before = tip(shared.state_repo)
     sent: list[Any] = []
-    for number in range(2000, 2200):
+    for number in range(2000, 2120):
         caller.wait(lambda: sum(not goal.answered for goal in sent) < 100)
         sent.append(caller.send(connection(number)))
     caller.wait(lambda: all(goal.answered for goal in sent))
     assert {goal.status for goal in sent} == {"succeeded"}
-    booked = {f"c{number}" for number in range(2000, 2200)}
+    booked = {f"c{number}" for number in range(2000, 2120)}
     assert shared.bookkeeping()["connections"].keys() >= booked
-    assert git(shared.state_repo, "rev-list", "--count", f"{before}..main") == "200"
+    assert git(shared.state_repo, "rev-list", "--count", f"{before}..main") == "120"
 
 
 def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(

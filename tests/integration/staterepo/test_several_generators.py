@@ -137,10 +137,10 @@ def test_housekeeping_by_git_during_demands_loses_nothing(bare: Path) -> None:
     thread.start()
     try:
         with rig.running(bare) as generator:
-            for number in range(30):
+            for number in range(15):
                 rig.book(generator, goal(number))
     finally:
         stop.set()
         thread.join(20)
-    assert len(rig.operations(bare)) == 30
+    assert len(rig.operations(bare)) == 15
     rig.assert_sound(bare, verify_last=5)
