@@ -5,8 +5,13 @@ A test module imports those that it runs; its `world` fixture decides the contro
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
+import pytest
+
+from tests.e2e.rig.cluster import PARTS, Rig
+from tests.e2e.rig.kube import build_manifest
 from tests.e2e.rig.tools import Report
 
 from . import expected
@@ -19,8 +24,10 @@ from .expected import (
     target_end,
     unscheduled,
 )
+from .golden import golden
 from .manual import change_image, overwrite, pod_template, requested_by, wait_restored
 from .namespace import Namespace
+from .running import NAMESPACE
 from .staterepo import StateRepo, demandops
 from .timing import Table
 
@@ -145,3 +152,26 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
     assert domain.pods() == before
     for step in (2, 3):
         world.step(step, expected.after(step))
+
+
+def _controller(rig: Rig) -> list[str]:
+    """Make the namespace that golden manifests are for; return the controller's kinds."""
+    rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
+    return [*PARTS[rig.gitops].KINDS, "Deployment"]
+
+
+def test_the_server_takes_every_golden_manifest(rig: Rig) -> None:
+    """Golden manifests before the judge: the API server's dry run, with the real definitions."""
+    kinds = _controller(rig)
+    manifests = list(golden(rig.gitops))
+    assert {*kinds, "Role"} <= {manifest["kind"] for manifest in manifests}
+    rig.kube.apply(*manifests, dry_run=True)
+
+
+def test_the_server_does_look(rig: Rig) -> None:
+    """The dry run means something: a field that does not exist is not taken."""
+    for kind in _controller(rig):
+        broken = copy.deepcopy(next(item for item in golden(rig.gitops) if item["kind"] == kind))
+        broken["spec"]["interwal"] = "1m"
+        with pytest.raises(Exception, match="field not declared in schema"):
+            rig.kube.apply(broken, dry_run=True)
