@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -238,6 +238,16 @@ def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
     path.write_text(f"#!/bin/sh\n{script}\n")
     path.chmod(0o755)
     return path
+
+
+@contextmanager
+def away(repo: Path) -> Iterator[None]:
+    """Have a repository's folder somewhere else for the length of a block."""
+    elsewhere = repo.rename(repo.with_name("away.git"))
+    try:
+        yield
+    finally:
+        elsewhere.rename(repo)
 
 
 def tip(repo: Path | str) -> str:

@@ -21,6 +21,7 @@ from tests.kit.repo import (
     Commit,
     Person,
     assert_sound,
+    away,
     books,
     branches,
     claims,

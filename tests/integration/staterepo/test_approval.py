@@ -16,27 +16,12 @@ import pytest
 import yaml
 from demandops.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
 from demandops.service import Ticket
-from demandops.service.approvals import approvals
 
 from tests.kit import goals, rig
 from tests.kit.generator import Proposed
-from tests.kit.git_over_http import serving
+from tests.kit.git_over_http import Server
 from tests.kit.repo import Person, branches
 from tests.kit.rig import Gate, git, goal, leave
-
-
-@pytest.fixture(autouse=True)
-def _eager(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have branches looked at often."""
-    monkeypatch.setattr(approvals, "CHECK_EMBEDDED_S", 0.05)
-    monkeypatch.setattr(approvals, "CHECK_REMOTE_S", 0.1)
-
-
-@pytest.fixture
-def petra(bare: Path, tmp_path: Path) -> Person:
-    made = Person(bare, tmp_path / "petra")
-    made.policy(approval="required")
-    return made
 
 
 def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_it(
@@ -493,9 +478,9 @@ def test_two_generators_that_take_one_demand_agree_once_it_is_merged(
 
 
 def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
-    bare: Path, petra: Person
+    http: str, server: Server, bare: Path, petra: Person
 ) -> None:
-    with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
+    with rig.running(http) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
         server.faults.away = True
@@ -507,8 +492,10 @@ def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
         assert branches(bare) == []
 
 
-def test_a_push_whose_answer_got_lost_makes_no_second_branch(bare: Path, petra: Person) -> None:
-    with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
+def test_a_push_whose_answer_got_lost_makes_no_second_branch(
+    http: str, server: Server, bare: Path, petra: Person
+) -> None:
+    with rig.running(http) as generator:
         server.faults.cut_answers = 1
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
@@ -576,19 +563,17 @@ def test_a_proposal_passes_the_check_of_pull_requests(
 
 
 def test_one_cancelled_right_before_a_crash_is_taken_away_at_the_restart(
-    bare: Path, petra: Person
+    http: str, server: Server, bare: Path, petra: Person
 ) -> None:
     """The withdrawal is on the disk before anything else; its branch is not to be merged."""
-    with serving(bare.parent) as server:
-        address = f"{server.url}/state.git"
-        with rig.running(address) as generator:
-            proposed = Proposed(generator, goal(1), "op-1")
-            assert [proposed.branch] == branches(bare)
-            server.faults.away = True
-            assert generator.withdraw("op-1") is True
-            generator.close(timeout=0)
-        server.faults.away = False
-        assert len(branches(bare)) == 1
-        with rig.running(address):
-            rig.wait_until(lambda: branches(bare) == [], "the branch is deleted")
+    with rig.running(http) as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        assert [proposed.branch] == branches(bare)
+        server.faults.away = True
+        assert generator.withdraw("op-1") is True
+        generator.close(timeout=0)
+    server.faults.away = False
+    assert len(branches(bare)) == 1
+    with rig.running(http):
+        rig.wait_until(lambda: branches(bare) == [], "the branch is deleted")
     assert rig.claims(bare) == []

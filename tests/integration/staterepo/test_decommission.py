@@ -192,10 +192,9 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
 
     generator = Generator(url)
     rig.book(generator, goal(1))
-    away = bare.rename(bare.with_name("away.git"))
-    generator.submit(decommission_goal.as_data("vehicle01", ("node",), ""), "op-leave")
-    assert generator.close(timeout=0.3) is False
-    away.rename(bare)
+    with rig.away(bare):
+        generator.submit(decommission_goal.as_data("vehicle01", ("node",), ""), "op-leave")
+        assert generator.close(timeout=0.3) is False
     assert rig.restart(url) is True
     assert rig.operations(bare)[-1] == "op-leave"
     assert rig.commits(bare)[-1].one("Node") == "vehicle01"

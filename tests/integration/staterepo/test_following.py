@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from collections.abc import Iterator
 from concurrent.futures import TimeoutError as NotAnswered
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from demandops.staterepo.load import problem_report
 from demandops.staterepo.write.journal import Journal
 
 from tests.kit import goals, rig
-from tests.kit.git_over_http import Server, serving
+from tests.kit.git_over_http import Server
 from tests.kit.repo import read as file_of
 from tests.kit.rig import Person, Stages, goal, leave
 
@@ -31,17 +30,6 @@ NODES, CLUSTERS = "inventory/nodes.yaml", "inventory/clusters.yaml"
 BROKERS, CHARTS = "inventory/brokers.yaml", "registry/charts.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 SOON_S = 0.1
-
-
-@pytest.fixture
-def server(bare: Path) -> Iterator[Server]:
-    with serving(bare.parent) as running:
-        yield running
-
-
-@pytest.fixture
-def http(server: Server) -> str:
-    return f"{server.url}/state.git"
 
 
 @pytest.fixture
@@ -383,16 +371,15 @@ def test_all_that_waits_while_the_remote_is_away_survives_a_kill(
     """More than go into one push: those behind it are on the disk as well."""
     many = 250
     rig.restart(url)  # makes the clone
-    away = bare.rename(bare.with_name("away.git"))
-    lanes = [[rig.demand(f"{n}", goal(n % 3))] for n in range(many)]
-    run = drivers.start(url, lanes)
-    journal = settings.data_home(url) / "slot-0" / "outbox.jsonl"
-    watcher = threading.Thread(target=run.listen)
-    watcher.start()
-    rig.wait_until(lambda: len(_kept(journal)) == many, "all are in the outbox")
-    run.kill()
-    watcher.join()
-    away.rename(bare)
+    with rig.away(bare):
+        lanes = [[rig.demand(f"{n}", goal(n % 3))] for n in range(many)]
+        run = drivers.start(url, lanes)
+        journal = settings.data_home(url) / "slot-0" / "outbox.jsonl"
+        watcher = threading.Thread(target=run.listen)
+        watcher.start()
+        rig.wait_until(lambda: len(_kept(journal)) == many, "all are in the outbox")
+        run.kill()
+        watcher.join()
     assert rig.restart(url) is True
     assert rig.books(bare) == rig.books_after(map(goal, range(3)))
     assert Journal(journal).pending == {}

@@ -240,13 +240,11 @@ def test_a_clone_cut_off_half_way_is_made_anew(url: str, bare: Path, data_home: 
 
 def _leave_pending(url: str, bare: Path, numbers: list[int]) -> None:
     """Have a generator accept demands that it cannot publish, and end."""
-    away = bare.with_name("away.git")
     generator = Generator(url)
-    bare.rename(away)
-    for number in numbers:
-        generator.submit(goal(number), f"op-{number}")
-    assert generator.close(timeout=0) is False
-    away.rename(bare)
+    with rig.away(bare):
+        for number in numbers:
+            generator.submit(goal(number), f"op-{number}")
+        assert generator.close(timeout=0) is False
 
 
 def _torn(text: bytes) -> bytes:

@@ -316,13 +316,12 @@ def test_a_verdict_on_a_stale_clone_is_not_given_while_the_remote_is_away(
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         _delete_claims(bare)(person)
-        away = bare.rename(bare.with_name("away.git"))
-        again = generator.submit(goal(1))
-        late = generator.submit(rig.impossible())
-        rig.wait_until(lambda: "trying again" in caplog.text, "the remote was asked in vain")
-        assert not again.future.done()
-        assert not late.future.done()
-        away.rename(bare)
+        with rig.away(bare):
+            again = generator.submit(goal(1))
+            late = generator.submit(rig.impossible())
+            rig.wait_until(lambda: "trying again" in caplog.text, "the remote was asked in vain")
+            assert not again.future.done()
+            assert not late.future.done()
         assert rig.receipt(again).outcome == "booked"
         with pytest.raises(InvalidInput, match="nowhere"):
             rig.receipt(late)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -13,17 +11,6 @@ from demandops.service import Generator
 from tests.kit import rig
 from tests.kit.rig import Gate, Stages, goal
 
-
-@contextmanager
-def away(bare: Path) -> Iterator[None]:
-    """The remote's folder is somewhere else for the length of a block."""
-    elsewhere = bare.rename(bare.with_name("away.git"))
-    try:
-        yield
-    finally:
-        elsewhere.rename(bare)
-
-
 # ---- away and back ----
 
 
@@ -32,7 +19,7 @@ def test_goals_stay_open_while_the_remote_is_away_and_are_published_once_it_is_b
 ) -> None:
     with rig.running(url) as generator:
         rig.book(generator, goal(0))
-        with away(bare):
+        with rig.away(bare):
             stages = Stages()
             tickets = [generator.submit(goal(1), listener=stages)]
             rig.wait_until(lambda: "committed" in stages.names, "the first demand is committed")
@@ -53,7 +40,7 @@ def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
 ) -> None:
     generator = Generator(url)
     rig.book(generator, goal(0))
-    with away(bare):
+    with rig.away(bare):
         left = generator.submit(goal(1), "op-1")
         assert generator.close(timeout=0.3) is False
         with pytest.raises(ShuttingDown, match="stays in the journal"):
@@ -77,7 +64,7 @@ def test_what_waits_in_the_outbox_is_judged_on_what_the_remote_has_become(
 ) -> None:
     """A join waits; meanwhile another generator books the same, and somebody takes a claim away."""
     generator = Generator(url)
-    with away(bare):
+    with rig.away(bare):
         generator.submit(goal(1), "op-1")
         generator.submit(goal(2), "op-2")
         generator.close(timeout=0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,17 +14,6 @@ from tests.kit import rig
 from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server, serving
 from tests.kit.rig import Gate, goal, leave
-
-
-@pytest.fixture
-def server(bare: Path) -> Iterator[Server]:
-    with serving(bare.parent) as running:
-        yield running
-
-
-@pytest.fixture
-def http(server: Server) -> str:
-    return f"{server.url}/state.git"
 
 
 def test_an_answer_lost_after_the_push_was_taken_counts_the_demand_once(
