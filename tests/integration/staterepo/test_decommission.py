@@ -55,7 +55,7 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
         rig.wait_until(
             lambda: "vehicle01" not in generator.snapshot.state.config.nodes, "it is taken in"
         )
-        assert generator.state_repo_status.problems == ()
+        assert generator.snapshot.problems == ()
         assert rig.git(bare, "ls-tree", "main", ".demandops") == ""
         assert made in [c.id for c in rig.commits(bare)]
         rig.book(generator, goal(3))
