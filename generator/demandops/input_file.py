@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from demandops.errors import InvalidInput, fault
+from demandops.errors import InvalidInput
 
 
 def read_input(file: str | Path) -> tuple[str, str]:
@@ -22,7 +22,7 @@ def read_input(file: str | Path) -> tuple[str, str]:
         problem = f"cannot be read: {error.strerror or error}"
     except UnicodeDecodeError:
         problem = "is not UTF-8 text"
-    raise InvalidInput([fault("", problem).within(name)])
+    raise InvalidInput.at("", problem, file=name)
 
 
 def read_secret(path: Path, *, private: bool = False) -> bytes:
@@ -45,5 +45,5 @@ def read_secret(path: Path, *, private: bool = False) -> bytes:
     except OSError as error:
         problem = f"cannot be read: {error.strerror or error}; put the secret there"
     if not secret.strip():
-        raise InvalidInput([fault("", problem).within(str(path))])
+        raise InvalidInput.at("", problem, file=str(path))
     return secret

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 
 from demandops.decision import Decision, Outcome, decide
-from demandops.demand import decommission_goal
+from demandops.demand.demand_request import Decommission
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
 from demandops.service.approvals.approvals import Approvals
@@ -121,6 +121,6 @@ def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt |
         outcome = "unchanged"
     elif rollback_goal.is_rollback(goal):
         outcome = "restored"
-    elif is_release(goal) or decommission_goal.is_decommission(goal):
+    elif is_release(goal) or Decommission.is_goal(goal):
         outcome = "released"
     return Receipt(ticket.operation, name_of(goal), outcome, arrival.commit)

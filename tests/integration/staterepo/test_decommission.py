@@ -188,12 +188,13 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     url: str, bare: Path, demandops: Run
 ) -> None:
     """As for any demand: it is in the outbox, and the next start carries it out."""
-    from demandops.demand import decommission_goal
+    from demandops.demand.demand_request import Decommission
 
     generator = Generator(url)
     rig.book(generator, goal(1))
+    leaving = Decommission("vehicle01", kinds=frozenset({"node"}))
     with rig.away(bare):
-        generator.submit(decommission_goal.as_data("vehicle01", ("node",), ""), "op-leave")
+        generator.submit(leaving.goal(), "op-leave")
         assert generator.close(timeout=0.3) is False
     assert rig.restart(url) is True
     assert rig.operations(bare)[-1] == "op-leave"

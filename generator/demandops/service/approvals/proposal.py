@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from demandops.decision import Decision, State, admit, decide
-from demandops.demand import approval_rule
+from demandops.demand import permission
 from demandops.demand.demand_request import DemandRequest, Release
 from demandops.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
 from demandops.forge import PullRequest
@@ -160,7 +160,7 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
     written: dict[str, str | None] = {}
     steps, failed = Decided(), Failed()
     for ticket, decision in left:
-        request = approval_rule.with_leases_from_approval(decision.request)
+        request = permission.with_leases_from_approval(decision.request)
         try:
             step = decide(
                 state,
