@@ -127,6 +127,17 @@ def link(number: int, **more: Any) -> Goal:
     return goal([], [item | more], id=f"request{number}")
 
 
+def put(
+    demand: str, *who: str, topic: Topic = ("/ego", "vehicle00"), node: str = "edge", **more: Any
+) -> Goal:
+    """Return a demand in our own format: one application with one input."""
+    inputs = {"ego_data": [{"topic": topic[0], "source": topic[1]}]}
+    item = {"id": f"edge/{demand[:100]}", "type": "object-detection-fusion", "node": node}
+    item |= {"inputs": inputs} | ({"connect": more.pop("connect")} if "connect" in more else {})
+    made = {"kind": "Demand", "demand": demand, "requesters": list(who or ["vehicle00"])}
+    return made | {"applications": [item]} | more
+
+
 def experiment(step: int) -> Goal:
     """Return the demand of a step of the paper's experiment; the first step is 1."""
     made: Goal = yaml.safe_load(EXPERIMENT[step - 1].read_text())
