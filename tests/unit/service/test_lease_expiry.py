@@ -15,7 +15,8 @@ from demandops.ledger.ledger import Ledger
 from demandops.service.timing.lease_expiry import LeaseClock
 
 from tests.kit.clock import Clock
-from tests.scenarios.running import START, rebuilt
+from tests.kit.memory import NOW as START
+from tests.kit.memory import rebuilt
 
 
 def leased(*terms: tuple[str, int, int]) -> Ledger:
