@@ -101,12 +101,6 @@ def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: Lea
     assert ended(clock, ledger) == ["a"]
 
 
-def test_a_machine_that_slept_grants_a_full_term(clocks: Clock, clock: LeaseClock) -> None:
-    ledger = leased(("a", 60, 0))
-    clocks.set_by(8 * 3600)  # the steady clock stands still meanwhile
-    assert ended(clock, ledger) == []
-
-
 def test_a_clock_that_is_drawn_on_slowly_is_no_step(
     clocks: Clock, clock: LeaseClock, caplog: pytest.LogCaptureFixture
 ) -> None:
