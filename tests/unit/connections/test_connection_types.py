@@ -37,6 +37,9 @@ def carried(before: State, asked: dict[str, Any]) -> ConnectionType:
 ABLE = state(vehicle00=SPEAKS | TYPED, edge=REACHABLE | WAN)
 """Every type can carry a connection here."""
 
+BRIDGES = state(vehicle00=SPEAKS, edge=REACHABLE)
+_ONE_ROUTER = {"zenoh": {"connect": ["tcp/router:7447"]}}
+ROUTER = state(vehicle00=_ONE_ROUTER, edge=_ONE_ROUTER)
 _NO_DDS = state(vehicle00=SPEAKS | TYPED | {"ros": {"rmw": "rmw_zenoh_cpp"}}, edge=REACHABLE | WAN)
 _ROS = state(vehicle00=TYPED, edge=WAN)
 _ONE_RATE = state(vehicle00=SPEAKS, edge=REACHABLE, cloud={"zenoh": {"endpoint": "tcp/c:1"}})
@@ -93,49 +96,47 @@ REFUSED: dict[str, tuple[State, dict[str, Any]]] = {
 class TestAutomaticChoice:
     """Zenoh where both speak it, else MQTT where there is a broker, else ROS, else refused."""
 
-    def test_zenoh_where_both_nodes_speak_it(self) -> None:
-        assert carried(state(vehicle00=SPEAKS, edge=REACHABLE), demand()) is ZENOH
-
-    def test_zenoh_where_both_connect_to_one_router(self) -> None:
-        both = {"zenoh": {"connect": ["tcp/router:7447"]}}
-        assert carried(state(vehicle00=both, edge=both), demand()) is ZENOH
-
-    def test_mqtt_where_one_does_not(self) -> None:
-        assert carried(state(edge=REACHABLE), demand()) is MQTT
-
-    def test_mqtt_where_neither_can_be_reached(self) -> None:
-        assert carried(state(vehicle00=SPEAKS, edge=SPEAKS), demand()) is MQTT
-
-    def test_mqtt_where_the_registry_has_no_bridge(self) -> None:
-        found = state("", vehicle00=SPEAKS, edge=REACHABLE)
-        assert carried(found, demand()) is MQTT
-
-    def test_mqtt_for_what_zenoh_cannot_do(self) -> None:
-        found = state(vehicle00=SPEAKS, edge=REACHABLE)
-        for topics in ({"/a": "/b"}, {"/a": {"qos": 1}}):
-            assert carried(found, demand(topics=topics)) is MQTT
-        assert carried(found, demand(broker="edge")) is MQTT
-
-    def test_ros_where_there_is_no_broker(self) -> None:
-        found = state(brokers=False, vehicle00=TYPED, edge=WAN)
-        assert carried(found, demand()) is ROS
+    @pytest.mark.parametrize(
+        ("before", "asked", "chosen"),
+        [
+            pytest.param(BRIDGES, demand(), ZENOH, id="both nodes speak Zenoh"),
+            pytest.param(ROUTER, demand(), ZENOH, id="both connect to one router"),
+            pytest.param(state(edge=REACHABLE), demand(), MQTT, id="one does not speak Zenoh"),
+            pytest.param(
+                state(vehicle00=SPEAKS, edge=SPEAKS), demand(), MQTT, id="neither can be reached"
+            ),
+            pytest.param(
+                state("", vehicle00=SPEAKS, edge=REACHABLE), demand(), MQTT, id="no image of Zenoh"
+            ),
+            pytest.param(BRIDGES, demand(topics={"/a": "/b"}), MQTT, id="a name that changes"),
+            pytest.param(BRIDGES, demand(topics={"/a": {"qos": 1}}), MQTT, id="an option of MQTT"),
+            pytest.param(BRIDGES, demand(broker="edge"), MQTT, id="a broker"),
+            pytest.param(
+                state(brokers=False, vehicle00=TYPED, edge=WAN), demand(), ROS, id="no broker"
+            ),
+            pytest.param(
+                state(edge=WAN | TYPED),
+                demand("ros", {"/a": {"reverse": True}}),
+                ROS,
+                id="the target's message type of what is carried back",
+            ),
+        ],
+    )
+    def test_the_first_type_that_can_carry_it(
+        self, before: State, asked: dict[str, Any], chosen: ConnectionType
+    ) -> None:
+        assert carried(before, asked) is chosen
 
     def test_what_stands_keeps_its_type(self) -> None:
-        before = state(vehicle00=SPEAKS, edge=REACHABLE)
-        after = decided(before, demand("mqtt"))
+        after = decided(BRIDGES, demand("mqtt"))
         again = demand(requesters=["vehicle01"])
         after = decided(after, again)
         assert {claim.connection.type for claim in after.ledger.connection_claims("c")} == {MQTT}
 
     def test_a_shutdown_without_a_type_means_what_stands(self) -> None:
-        before = state(vehicle00=SPEAKS, edge=REACHABLE)
-        after = decided(before, demand("mqtt"))
+        after = decided(BRIDGES, demand("mqtt"))
         after = decided(after, demand() | {"shutdown": True})
         assert after.ledger == Ledger()
-
-
-def test_the_type_of_a_topic_that_is_carried_back_is_the_targets() -> None:
-    assert carried(state(edge=WAN | TYPED), demand("ros", {"/a": {"reverse": True}})) is ROS
 
 
 class TestThroughTheWire:

@@ -143,18 +143,3 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     later = claim.lease.restarted(NOW)
     assert (later.seconds, (later.until - NOW).total_seconds()) == (60, 60)
     assert waiting.state.ledger.ended_claims(NOW.replace(year=2100)) == ()
-
-
-@pytest.mark.parametrize(
-    ("config", "field"),
-    [
-        (policy(approval="maybe"), "domains[0].approval"),
-        (rules({"name": "x", "approval": True}), "domains[0].rules[0].approval"),
-    ],
-)
-def test_another_word_is_a_fault(config: dict[str, str], field: str) -> None:
-    from demandops.errors import InvalidInput
-
-    with pytest.raises(InvalidInput) as error:
-        MemoryRepo(config)
-    assert [found.field for found in error.value.faults] == [field]
