@@ -163,3 +163,17 @@ def test_what_was_not_held_is_named_and_the_rest_released() -> None:
         "connection 'vehicle00/edge': topic /never",
     )
     assert books.books() == {"services": {}, "connections": {}}
+
+
+def test_which_of_several_claims_is_meant_is_not_guessed() -> None:
+    books = MemoryRepo()
+    for id in ("one", "two"):
+        books.send(goal([application(who=["vehicle00", id])], id=id))
+    assert len(books.faults(goal([application()], id="three", shutdown=True))) == 1
+
+
+def test_a_shutdown_by_one_of_the_requesters_releases_the_only_claim_that_has_it() -> None:
+    books = MemoryRepo()
+    books.send(goal([application(who=["vehicle00", "station00"])]))
+    asked = goal([application(who=["station00"])], shutdown=True)
+    assert books.send(asked).outcome == "released"
