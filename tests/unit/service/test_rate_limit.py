@@ -57,3 +57,9 @@ def test_who_sends_no_more_is_forgotten() -> None:
     assert len(sending.throttle._seen) <= 62
     assert sending.send("vehicle499", 499.5)
     assert not sending.send("vehicle499", 499.6)
+
+
+def test_a_clock_that_is_set_back_does_not_shut_anybody_out() -> None:
+    sending = Sending()
+    assert [sending.send("vehicle00", at) for at in (5000, 5001)] == [True, True]
+    assert sending.send("vehicle00", 0)
