@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import pytest
 import yaml
 from demandops.config.load import load
-from demandops.connections.communication_client import ClientKey
+from demandops.connections.connection_type import ClientKey
 from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH
 from demandops.decision import Decision, State, rendered_files

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import yaml
 from demandops.decision import decide
-from demandops.demand.approval_rule import with_leases_from_approval
 from demandops.demand.lease import UNSTARTED
+from demandops.demand.permission import with_leases_from_approval
 from demandops.ledger import claim_file
 
 from tests.kit.config import edited, skeleton

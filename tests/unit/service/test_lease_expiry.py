@@ -12,7 +12,7 @@ from demandops.connections.route import Route
 from demandops.demand.claim import Claim
 from demandops.demand.lease import Lease
 from demandops.ledger.ledger import Ledger
-from demandops.service.timing.lease_expiry import LeaseClock
+from demandops.service.timing.expiry import LeaseExpiry
 
 from tests.kit.clock import Clock
 from tests.kit.memory import NOW as START
@@ -40,18 +40,18 @@ def clocks() -> Clock:
 
 
 @pytest.fixture
-def clock(clocks: Clock) -> LeaseClock:
-    return LeaseClock(clocks)
+def clock(clocks: Clock) -> LeaseExpiry:
+    return LeaseExpiry(clocks)
 
 
-def ended(clock: LeaseClock, ledger: Ledger) -> list[str]:
+def ended(clock: LeaseExpiry, ledger: Ledger) -> list[str]:
     return [claim.demand for claim in clock.ended_claims(ledger)[1]]
 
 
 @pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
 def test_it_is_set_forward_and_a_full_term_is_granted(
     clocks: Clock,
-    clock: LeaseClock,
+    clock: LeaseExpiry,
     steps: list[int],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -70,7 +70,7 @@ def test_it_is_set_forward_and_a_full_term_is_granted(
     assert ended(clock, ledger) == ["short", "long"]
 
 
-def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: LeaseClock) -> None:
+def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: LeaseExpiry) -> None:
     ledger = leased(("a", 60, 0))
     clocks.pass_(50)
     clocks.set_by(3600)
@@ -81,7 +81,7 @@ def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: Lea
 
 
 def test_a_clock_that_is_drawn_on_slowly_is_no_step(
-    clocks: Clock, clock: LeaseClock, caplog: pytest.LogCaptureFixture
+    clocks: Clock, clock: LeaseExpiry, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
     ledger = leased(("a", 60, 0))
@@ -93,7 +93,7 @@ def test_a_clock_that_is_drawn_on_slowly_is_no_step(
     assert caplog.text == ""
 
 
-def test_it_looks_again_when_the_first_lease_ends(clocks: Clock, clock: LeaseClock) -> None:
+def test_it_looks_again_when_the_first_lease_ends(clocks: Clock, clock: LeaseExpiry) -> None:
     ledger = leased(("a", 20, 10), ("b", 600, 0))
     assert clock.seconds_until_due(ledger, 60.0) == pytest.approx(30.01)
     clocks.pass_(29.5)
