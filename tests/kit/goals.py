@@ -45,13 +45,14 @@ def application(
         "type": type,
         "object_detection_fusion_app": {
             "requester_ids": list(who),
-            "ego_data_topics": [_topic(topic) for topic in ego],
-            "pointcloud_topics": [_topic(topic) for topic in clouds],
+            "ego_data_topics": [input_topic(topic) for topic in ego],
+            "pointcloud_topics": [input_topic(topic) for topic in clouds],
         },
     }
 
 
-def _topic(topic: Topic) -> dict[str, str]:
+def input_topic(topic: Topic) -> dict[str, str]:
+    """Return one topic of an application."""
     return {"topic_name": topic[0], "source_node_id": topic[1]}
 
 

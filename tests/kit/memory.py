@@ -12,7 +12,9 @@ import yaml
 from demandops.config.config import Config
 from demandops.config.load import load
 from demandops.decision import Decision, State, decide, rendered_files
+from demandops.demand.claim import Claim
 from demandops.errors import Refused
+from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 
@@ -120,6 +122,11 @@ class MemoryRepo:
             if path.split("/")[0] in roots and not path.endswith("/README.md")
         }
 
+    def claims_in_files(self) -> list[Claim]:
+        """Return the claims as one who has only the files reads them."""
+        paths = filter(claim_file.kind_of, self.files)
+        return [claim_file.read(self.files[path], path) for path in paths]
+
     def rendered(self) -> dict[str, str]:
         """Return the files below ``clusters/`` that demands brought."""
         return {
@@ -139,6 +146,14 @@ class MemoryRepo:
         named = {document["metadata"]["name"]: document for document in documents}
         assert len(named) == len(documents), "two objects have one name"
         return named
+
+
+def rebuilt(claims: Iterable[Claim]) -> Ledger:
+    """Return the ledger that holds ``claims``, put in one by one."""
+    ledger = Ledger()
+    for claim in claims:
+        ledger = ledger.replace(claim.key, claim)
+    return ledger
 
 
 def outcome(taken: Decision | Refused) -> str:

@@ -29,7 +29,7 @@ from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
 from tests.kit.config import skeleton
 from tests.kit.memory import NOW as START
-from tests.kit.memory import MemoryRepo
+from tests.kit.memory import MemoryRepo, rebuilt
 
 HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"
@@ -229,25 +229,12 @@ class World(MemoryRepo):
 
     def assert_sound(self) -> None:
         """The files say what the books say, and nothing else is there."""
-        claims = [
-            claim_file.read(text, path)
-            for path, text in self.files.items()
-            if claim_file.kind_of(path)
-        ]
-        assert rebuilt(claims) == self.state.ledger
+        assert rebuilt(self.claims_in_files()) == self.state.ledger
         asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())
         assert not names, f"these are there and not asked for, or the other way round: {names}"
         assert there == asked
-
-
-def rebuilt(claims: Iterable[Any]) -> Ledger:
-    """Return the ledger that holds ``claims``, put in one by one."""
-    ledger = Ledger()
-    for claim in claims:
-        ledger = ledger.replace(claim.key, claim)
-    return ledger
 
 
 def _purpose(entry: Mapping[str, Any]) -> str:
@@ -321,7 +308,7 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
     if bool(taken.files) != (taken.outcome != "unchanged"):
         yield f"is {taken.outcome}, and makes {'a' if taken.files else 'no'} commit"
     signs = {"start": "+", "change": "~", "stop": "-"}
-    desired = sorted(f"{signs[release.change]} {release.description}" for release in taken.releases)
+    desired = sorted(f"{signs[release.change]} {release.what}" for release in taken.releases)
     if step.desired is not None and desired != sorted(step.desired):
         yield f"the desired state changes otherwise: {desired}"
     if step.warns is not None:
