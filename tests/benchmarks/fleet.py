@@ -20,12 +20,12 @@ from demandops.decision import State, admit, rendered_files
 from demandops.ledger import claim_file
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
-from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
 from rich.table import Table
 
 from tests.kit import goals
 from tests.kit.config import configuration
+from tests.kit.repo import write_tree
 
 VEHICLES_PER_EDGE = 10
 RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
@@ -125,7 +125,7 @@ def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, fur
     files |= rendered_files(State(config, ledger, state.engine))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
-    tree = trees.write(repo, None, files)
+    tree = write_tree(repo, None, files)
     who = commit_message.generator_signature(now)
     text = "A fleet\n\nOperation: init\nRender-Version: 2\n"
     repo.create_commit("refs/heads/main", who, who, text, tree, [])

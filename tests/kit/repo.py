@@ -18,6 +18,8 @@ import pygit2
 import yaml
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.staterepo import new_repo, reader
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.load import snapshot as snapshots
 
 from tests.kit.memory import NOW
@@ -56,6 +58,16 @@ def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
     )
     assert not check or done.returncode == 0, f"git {' '.join(args)}: {done.stdout}{done.stderr}"
     return done.stdout.removesuffix("\n")
+
+
+def write_tree(
+    repo: pygit2.Repository, base: pygit2.Tree | None, files: Mapping[str, str | None]
+) -> pygit2.Oid:
+    """Write ``base`` with ``files`` changed, as the program does, and return the tree."""
+    objects = NewObjects(repo)
+    tree = trees.write(objects, base, files)
+    with objects.packed(tree):
+        return tree
 
 
 def _index(path: Path, revision: str) -> tuple[pygit2.Repository, pygit2.Index]:

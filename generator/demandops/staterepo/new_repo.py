@@ -14,6 +14,7 @@ from demandops.settings import MAIN_BRANCH, RENDER_VERSION
 from demandops.staterepo import skeleton
 from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import commit_message
 
@@ -66,13 +67,15 @@ def _write(
 ) -> str:
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
-    tree = trees.write(repo, None, content)
+    objects = NewObjects(repo)
+    tree = trees.write(objects, None, content)
     why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
     trailers = [("Operation", "init"), ("Render-Version", str(RENDER_VERSION))]
     text = commit_message.compose([["Create the state repo"], [why]], trailers)
     signature = commit_message.generator_signature(now)
-    commit = signing.create_commit(repo, signer, (signature, signature), text, tree, [])
-    repo.references.create(f"refs/heads/{MAIN_BRANCH}", commit)
+    commit = signing.create_commit(objects, signer, (signature, signature), text, tree, [])
+    with objects.packed(commit):
+        repo.references.create(f"refs/heads/{MAIN_BRANCH}", commit)
     if not bare:
         repo.checkout_head(  # type: ignore[no-untyped-call]
             strategy=pygit2.enums.CheckoutStrategy.FORCE

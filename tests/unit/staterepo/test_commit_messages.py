@@ -10,11 +10,10 @@ import pytest
 from demandops.errors import fault
 from demandops.identifiers import id_problem
 from demandops.render.changes.changeset import ReleaseChange
-from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log, commit_message
 
 from tests.kit import goals
-from tests.kit.repo import git
+from tests.kit.repo import git, write_tree
 
 CONNECTION = goals.connection(
     "station00/edge", ends=("station00", "edge"), topics=[goals.STATION_CLOUD[0]], broker=""
@@ -157,7 +156,7 @@ NASTY = [
 def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly(
     desk: Any, repo: pygit2.Repository
 ) -> None:
-    tree = trees.write(repo, None, {"f": "x"})
+    tree = write_tree(repo, None, {"f": "x"})
     failed, parents = [], list[pygit2.Oid]()
     commits = []
     for name in NASTY:

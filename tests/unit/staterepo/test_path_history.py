@@ -10,7 +10,7 @@ import pytest
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
 
-from tests.kit.repo import git
+from tests.kit.repo import git, write_tree
 
 PATH = "clusters/c/d/n/r.yaml"
 
@@ -27,7 +27,7 @@ class History:
         number = len(self.made)
         who = pygit2.Signature("a", "a@example.org", 1_770_000_000 + 60 * number, 0)
         files = {"other": str(number)} | ({PATH: text} if text is not None else {})
-        tree = trees.write(self.repo, None, files)
+        tree = write_tree(self.repo, None, files)
         above = [self.made[parent] for parent in parents]
         made = self.repo.create_commit(None, who, who, f"{number}\n", tree, above)
         self.made.append(made)

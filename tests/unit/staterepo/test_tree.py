@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
+from tests.kit.repo import write_tree
 
 Files = dict[str, str]
 
@@ -96,7 +97,7 @@ def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.Da
     files = data.draw(file_trees(), "files")
     change = data.draw(changes(files), "change")
     with scratch() as repo:
-        made = trees.write(repo, lay(repo, files) if files else None, change)
+        made = write_tree(repo, lay(repo, files) if files else None, change)
         wanted = changed(files, change)
         assert read(repo, made) == wanted
         assert made == lay(repo, wanted).id, "same files, other tree: an empty folder or a mode"
@@ -120,7 +121,7 @@ def test_differences_tell_just_what_differs_and_rebuild_the_one_from_the_other(
 
 def test_a_change_rewrites_only_the_folders_on_its_way(repo: pygit2.Repository) -> None:
     base = lay(repo, {f"{top}/{n}": "x" for top in "abc" for n in range(3)})
-    made = repo[trees.write(repo, base, {"b/1": "y"})].peel(pygit2.Tree)
+    made = repo[write_tree(repo, base, {"b/1": "y"})].peel(pygit2.Tree)
     assert [made[name].id == base[name].id for name in "abc"] == [True, False, True]
 
 

@@ -13,6 +13,7 @@ from pygit2 import Oid, Repository
 from demandops.errors import StateRepoError
 from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.repository import MAIN, StateRepository
 
 _STALE_LOCK_S = 5.0
@@ -33,6 +34,7 @@ class LocalRepository(StateRepository):
             raise StateRepoError(
                 f"{path} is not a Git repository; make one with `demandops init {path} --bare`"
             ) from None
+        self.new = NewObjects(self.objects)
         if MAIN not in self.objects.references:
             raise StateRepoError(
                 f"{path} has no branch '{MAIN_BRANCH}'; make a state repo with "
@@ -54,7 +56,8 @@ class LocalRepository(StateRepository):
         if reference.target != expected:
             return False
         try:
-            reference.set_target(commit, "demandops")
+            with self.new.packed(commit):
+                reference.set_target(commit, "demandops")
         except (pygit2.GitError, OSError):
             self._break_stale_lock()
             return False  # another writer holds the lock or was first: evaluate again

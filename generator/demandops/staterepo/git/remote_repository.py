@@ -19,6 +19,7 @@ from pygit2 import Oid, Repository
 from demandops.errors import StateRepoError
 from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.repository import (
     ENVIRONMENT,
     MAIN,
@@ -70,6 +71,7 @@ class RemoteRepository(StateRepository):
             self._clone(notify)
         self._git = git.Repo(folder)
         self.objects = Repository(str(folder))
+        self.new = NewObjects(self.objects)
         try:
             self.refresh()
         except RemoteAway as error:
@@ -111,7 +113,8 @@ class RemoteRepository(StateRepository):
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Push ``commit``; the remote accepts it only on top of its own tip."""
         try:  # the lease forces nothing: commit is on top
-            self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
+            with self.new.packed(commit):
+                self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except git.GitCommandError as error:
             if _REMOTE_MOVED.search(str(error)):  # git compared first: nothing was sent
                 return False

@@ -5,11 +5,11 @@ There are two kinds, on this disk and behind a URL; :mod:`demandops.staterepo.gi
 
 from __future__ import annotations
 
+import os
+import subprocess
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import suppress
 
-import git
 import pygit2
 from pygit2 import Oid, Repository, Tree
 
@@ -17,10 +17,12 @@ from demandops.errors import StateRepoError
 from demandops.runtime import REAL, Runtime
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.signing import Signer
 
 MAIN = f"refs/heads/{MAIN_BRANCH}"
 TIMEOUT_S = 120
+_REPACK = ("repack", "--geometric=2", "-d", "-l", "--quiet")
 ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
 
 
@@ -40,6 +42,8 @@ class StateRepository(ABC):
     """A state repo: Git objects to read and write, and a tip that only moves forward."""
 
     objects: Repository
+    new: NewObjects
+    """What was written since the last publication."""
     address: str
     signer: Signer | None = None
     """Signs the commits made here; None: they are not signed."""
@@ -47,6 +51,7 @@ class StateRepository(ABC):
     """The clock, chance and threads of whoever writes to it."""
     always_current: bool
     """Whether :meth:`tip` is never out of date (a repository on this disk)."""
+    _tidying: subprocess.Popen[bytes] | None = None
     main_reference = MAIN
     """The branch, or its remote-tracking branch of the last fetch."""
 
@@ -107,11 +112,14 @@ class StateRepository(ABC):
         """End the running transfer with a remote, if any."""
 
     def tidy(self) -> None:
-        """Have git pack loose objects if there are many."""
-        with suppress(git.GitCommandError), git.Repo(self.objects.path) as repo:
-            repo.git.execute(
-                [repo.git.GIT_PYTHON_GIT_EXECUTABLE, "gc", "--auto", "--quiet"],
-                kill_after_timeout=TIMEOUT_S,
-                start_new_session=True,  # so that Ctrl-C does not end it
-                env=ENVIRONMENT,
-            )
+        """Have git join the packs, beside what else happens, unless it still does."""
+        if self._tidying is not None and self._tidying.poll() is None:
+            return
+        self._tidying = subprocess.Popen(
+            ["git", *_REPACK],
+            cwd=self.objects.path,
+            env=os.environ | ENVIRONMENT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # so that Ctrl-C does not end it
+        )

@@ -55,6 +55,7 @@ class CommitBatch:
     def __init__(self, repository: StateRepository, start: Snapshot) -> None:
         self._repository = repository
         self._objects = repository.objects
+        repository.new.forget()
         self._tree = trees.commit_of(self._objects, start.commit).tree
         self._settled: list[tuple[str, str]] = []
         self.start = start
@@ -222,9 +223,9 @@ class CommitBatch:
         committer = commit_message.generator_signature(now)
         for attempt in range(1, _ATTEMPTS + 1):
             try:
-                tree = trees.write(self._objects, self._tree, files)
+                tree = trees.write(self._repository.new, self._tree, files)
                 made = signing.create_commit(
-                    self._objects,
+                    self._repository.new,
                     self._repository.signer,
                     (author, committer),
                     text,

@@ -84,7 +84,8 @@ class ProposalBranches:
             BranchMoved: the branch is not at ``expected``.
             RemoteAway, PushDenied: it could not be pushed for another reason.
         """
-        return self._set(branch, commit, expected, options)
+        with self._repository.new.packed(commit):
+            return self._set(branch, commit, expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
         """Delete a branch, if it exists.
@@ -154,7 +155,7 @@ class ProposalBranches:
         except StateRepoError:
             return False  # the clone was made again, or `git gc` removed the commit
         now = commit_of(objects, tip).tree
-        new = objects[trees.write(objects, now, files)].peel(pygit2.Tree)
+        new = objects[trees.write(self._repository.new, now, files)].peel(pygit2.Tree)
         proposed = dict(trees.differences(old, proposal))
         if proposed != dict(trees.differences(now, new)):
             return False
