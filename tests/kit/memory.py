@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from functools import lru_cache
 from typing import Any
@@ -14,6 +15,7 @@ from demandops.config.load import load
 from demandops.decision import Decision, State, decide, rendered_files
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.recent_shutdowns import RecentShutdowns, path_of
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit.config import FAST, configuration, skeleton
@@ -92,6 +94,15 @@ class MemoryRepo:
             outcome(self.take(goal, self.now + timedelta(minutes=minute)))
             for minute, goal in enumerate(goals)
         ]
+
+    def forget_shutdowns(self) -> None:
+        """Let the recent shutdowns be forgotten."""
+        shutdowns = self.state.ledger.shutdowns
+        self.state = replace(
+            self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())
+        )
+        for digest in shutdowns.by_digest:
+            del self.files[path_of(digest)]
 
     def faults(self, goal: object) -> list[str]:
         """Return the faults of a goal that must be refused, each as ``field: message``."""

@@ -11,7 +11,7 @@ from copy import deepcopy
 from random import Random
 from typing import Any, TypeVar
 
-from tests.model.books import Goal, Item, World
+from tests.model.books import Goal, Item, World, requesters
 
 T = TypeVar("T")
 
@@ -144,6 +144,7 @@ class Maker:
         self._random = random
         self.calm = calm
         self.joined: list[Goal] = []
+        self.left: list[Goal] = []
 
     def sequence(self, length: int) -> list[Goal]:
         """Return requests of every sort, in any order."""
@@ -157,7 +158,11 @@ class Maker:
             return self.again(self._pick(self.joined))
         if self._odds(30):
             return goal(self._pick(REQUESTS), shutdown=True)
-        return self.leave()
+        if self.left and self._odds(4):  # the last one, or one from long ago
+            made = self.left[-1] if self._odds(2) else self._pick(self.left)
+            return self.again(made) if self._odds(3) else made
+        self.left.append(self.leave())
+        return self.left[-1]
 
     def join(self, request: str | None = None, who: Sequence[str] | None = None) -> Goal:
         """Return a request for one to four subjects, mostly in the name of the same requesters."""
@@ -200,7 +205,7 @@ class Maker:
                 made[kind] = made[kind][:1]
         if self._odds(4):
             made["id"] = self._pick(REQUESTS)
-        if self._odds(5):
+        if self._odds(4):
             self._ask_others(made)
         for app in made["apps"]:
             self._leave_application(app)
@@ -241,6 +246,8 @@ class Maker:
             self._disturb_application(app)
         for item in made["connections"]:
             self._disturb_connection(item)
+        if self._odds(16):  # a subject is asked for in the name of the same: one claim is older
+            self._name(self._pick(["apps", "connections"]), made, self._people())
         if self._odds(20):
             made["apps"] += deepcopy(made["apps"])
         if self._odds(20):
@@ -252,8 +259,8 @@ class Maker:
         body = app["object_detection_fusion_app"]
         if self._odds(16):
             app["header"]["node_id"] = self._pick(["cloud", "edge", "nowhere"])
-        if self._odds(20):
-            body["requester_ids"] = self._people() if self._odds(2) else []
+        if self._odds(40):
+            body["requester_ids"] = []
         if self._odds(40):
             app["type"] = 2
         if self._odds(40):
@@ -268,8 +275,8 @@ class Maker:
         self._disturb_ends(item)
         if self._odds(20):
             item["target_topics"][0] = "/elsewhere"
-        if self._odds(24):
-            item["requester_ids"] = self._people() if self._odds(2) else []
+        if self._odds(48):
+            item["requester_ids"] = []
         if self._odds(40):
             item["target_topics"] = item["target_topics"][1:]
         if self._odds(40):
@@ -286,12 +293,16 @@ class Maker:
             item["type"] = self._pick([0, 2, 7])
 
     def _ask_others(self, made: Goal) -> None:
-        """Ask in the name of fewer or other requesters."""
+        """Ask in the name of fewer requesters, of others, or of those of several claims."""
         people = self._people()
-        for item in [app["object_detection_fusion_app"] for app in made["apps"]]:
-            item["requester_ids"] = item["requester_ids"][:1] if self._odds(2) else people
-        for item in made["connections"]:
-            item["requester_ids"] = item["requester_ids"][:1] if self._odds(2) else people
+        for kind in ("apps", "connections"):
+            named = [one for item in made[kind] for one in requesters(item)]
+            who = [named[:1], people, list(dict.fromkeys((*named, *people)))]
+            self._name(kind, made, self._pick(who))
+
+    def _name(self, kind: str, made: Goal, who: Sequence[str]) -> None:
+        for item in made[kind]:
+            item.get("object_detection_fusion_app", item)["requester_ids"] = list(who)
 
     def _leave_application(self, app: Item) -> None:
         body = app["object_detection_fusion_app"]

@@ -6,7 +6,7 @@ clock, after every step.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -19,7 +19,7 @@ from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.demand_request import Expire
 from demandops.errors import Fault, Refused
-from demandops.ledger import claim_file
+from demandops.ledger import claim_file, recent_shutdowns
 from demandops.ledger.ledger import Ledger
 from demandops.service.timing.lease_expiry import LeaseClock
 from demandops.service.timing.rate_limit import RateLimit
@@ -178,8 +178,8 @@ class World(MemoryRepo):
         self.state = replace(state, ledger=self.state.ledger)
         empty = replace(state, ledger=Ledger())
         self._initial = {**skeleton(), **config, **rendered_files(empty)}
-        claims = {p: text for p, text in self.files.items() if claim_file.kind_of(p)}
-        self.files = {**self._initial, **claims, **rendered_files(self.state)}
+        ledger = {p: text for p, text in self.files.items() if is_booked(p)}
+        self.files = {**self._initial, **ledger, **rendered_files(self.state)}
 
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
@@ -229,12 +229,7 @@ class World(MemoryRepo):
 
     def assert_sound(self) -> None:
         """The files say what the books say, and nothing else is there."""
-        claims = [
-            claim_file.read(text, path)
-            for path, text in self.files.items()
-            if claim_file.kind_of(path)
-        ]
-        assert rebuilt(claims) == self.state.ledger
+        assert ledger_in(self.files) == self.state.ledger
         asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())
@@ -248,6 +243,20 @@ def rebuilt(claims: Iterable[Any]) -> Ledger:
     for claim in claims:
         ledger = ledger.replace(claim.key, claim)
     return ledger
+
+
+def is_booked(path: str) -> bool:
+    """Return whether demands write the file: a claim's, or a recent shutdown's."""
+    return bool(claim_file.kind_of(path)) or path.startswith(recent_shutdowns.SHUTDOWNS_ROOT)
+
+
+def ledger_in(files: Mapping[str, str], order: Callable[[list[Any]], None] = list.sort) -> Ledger:
+    """Return the ledger as one who only has the files reads it."""
+    booked = [path for path in files if is_booked(path)]
+    order(booked)
+    claims = [claim_file.read(files[path], path) for path in booked if claim_file.kind_of(path)]
+    shutdowns = {path: files[path] for path in booked if not claim_file.kind_of(path)}
+    return replace(rebuilt(claims), shutdowns=recent_shutdowns.read_all(shutdowns))
 
 
 def _purpose(entry: Mapping[str, Any]) -> str:

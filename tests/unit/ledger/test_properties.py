@@ -6,21 +6,21 @@ The model in ``tests/model`` knows the design and not the program; both take the
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from datetime import timedelta
 from random import Random
 
 import pytest
 from demandops.decision import Decision, State, rendered_files
-from demandops.demand.claim import Claim
+from demandops.demand.claim import ClaimKey, demand_id
 from demandops.errors import Refused
 from demandops.ledger import claim_file
-from demandops.ledger.ledger import Ledger
-from hypothesis import assume, given, note
+from hypothesis import assume, currently_in_test_context, given, note
 from hypothesis import strategies as st
 
 from tests.kit.chance import TIMES, chances, examples, told
 from tests.kit.memory import NOW, MemoryRepo, outcome
-from tests.model.books import Books, Demand, Goal
+from tests.model.books import Books, Demand, Goal, Result
 from tests.model.goals import (
     SKELETON,
     STATION_CLOUD,
@@ -33,21 +33,44 @@ from tests.model.goals import (
     shutdown_of,
     summary,
 )
+from tests.scenarios.running import ledger_in
+
+Key = tuple[tuple[str, str], str]
+"""A subject and a demand id."""
+
+PAUSES = (1, 1, 1, 60, 400, 899, 900, 901)
+"""Seconds between two requests; a shutdown is remembered for 900."""
 
 
-def demand_in(claim: Claim) -> tuple[str, str, Demand]:
-    """Return what the model knows a claim by."""
-    kind = "application" if claim.is_on_application else "connection"
-    return kind, claim.subject.id, (claim.request, claim.requesters)
+def key_of(subject: tuple[str, str], demand: Demand) -> Key:
+    """Return what the program knows a claim of the model by."""
+    return subject, demand_id(*demand)
 
 
-def ledger_in(repo: MemoryRepo) -> Ledger:
-    """Return the ledger as one who only has the files reads it."""
-    ledger = Ledger()
-    for path, text in repo.below("ledger").items():
-        claim = claim_file.read(text, path)
-        ledger = ledger.replace(claim.key, claim)
-    return ledger
+def key_in(key: ClaimKey) -> Key:
+    """Return the key of a claim in plain words."""
+    return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
+
+
+def holds_in(repo: MemoryRepo) -> dict[Key, dict[tuple[str, ...], set[str]]]:
+    """Return who holds which topic in each claim."""
+    return {
+        key_in(claim.key): {key: set(claim.holders(key)) for key in claim.held.topic_keys()}
+        for claim in repo.state.ledger
+    }
+
+
+Taken = tuple[Goal, Result, Decision | Refused]
+
+
+def taken_by_both(random: Random, length: int, repo: MemoryRepo, books: Books) -> Iterator[Taken]:
+    """Have both take the same requests as time passes."""
+    for request in Maker(random).sequence(length):
+        pause = random.choice(PAUSES)
+        if currently_in_test_context():
+            note(f"{pause} s later: {json.dumps(summary(request))}")
+        repo.now += timedelta(seconds=pause)
+        yield request, books.take(request, pause), repo.take(request)
 
 
 # As the model has it
@@ -55,46 +78,41 @@ def ledger_in(repo: MemoryRepo) -> Ledger:
 
 @examples(45)
 @given(chances, st.integers(1, 14))
-def test_bookkeeping_and_outcomes_are_the_models_after_every_request(
+def test_holds_bookkeeping_and_outcomes_are_the_models_after_every_request(
     random: Random, length: int
 ) -> None:
     repo, books = MemoryRepo(), Books(SKELETON)
-    for request in told(Maker(random).sequence(length)):
-        expected = books.take(request)
-        taken = repo.take(request)
+    for _, expected, taken in taken_by_both(random, length, repo, books):
         assert outcome(taken) == expected.outcome, (expected, taken)
-        assert {demand_in(claim) for claim in repo.state.ledger} == books.demands()
+        assert holds_in(repo) == {key_of(*key): holds for key, holds in books.holds().items()}
         assert repo.view() == books.view()
 
 
 @pytest.mark.parametrize("seed", range(2 * TIMES))
 def test_bookkeeping_stays_the_models_over_a_long_time(seed: int) -> None:
     repo, books = MemoryRepo(), Books(SKELETON)
-    for place, request in enumerate(Maker(Random(seed)).sequence(150)):
-        expected = books.take(request)
-        taken = repo.take(request)
-        assert outcome(taken) == expected.outcome, (place, request, expected, taken)
-        assert repo.view() == books.view(), (place, request)
+    for request, expected, taken in taken_by_both(Random(seed), 150, repo, books):
+        assert outcome(taken) == expected.outcome, (request, expected, taken)
+        assert repo.view() == books.view(), request
 
 
 @examples(45)
 @given(chances, st.integers(1, 14))
 def test_a_shutdown_names_what_was_not_held_and_nothing_else(random: Random, length: int) -> None:
     repo, books = MemoryRepo(), Books(SKELETON)
-    for request in told(Maker(random).sequence(length)):
-        expected = books.take(request)
-        taken = repo.take(request)
+    for _, expected, taken in taken_by_both(random, length, repo, books):
         if isinstance(taken, Refused) or expected.outcome == "refused":
             continue
         named = taken.changes.not_held
-        for subject, topic in expected.not_held:
-            about = [text for text in named if f"'{subject}'" in text]
-            assert any(_whole(text) or f" {topic}" in text for text in about), (subject, named)
-        for text in named:
-            assert any(
-                f"'{subject}'" in text and (_whole(text) or f" {topic}" in text)
-                for subject, topic in expected.not_held
-            ), (text, expected.not_held)
+        assert all(any(_tells(text, one) for text in named) for one in expected.not_held), named
+        assert all(any(_tells(text, one) for one in expected.not_held) for text in named), named
+
+
+def _tells(text: str, in_vain: tuple[str, tuple[str, ...] | None, str]) -> bool:
+    id_, topic, who = in_vain
+    name = " ".join(("topic", topic[0]) if len(topic) == 1 else topic[:2]) if topic else ""
+    about = f"'{id_}'" in text and text.endswith(f" for {who}")
+    return about and (_whole(text) or f": {name} " in text)
 
 
 def _whole(text: str) -> bool:
@@ -168,6 +186,8 @@ def test_a_released_demand_leaves_no_trace(random: Random, before: int, after: i
     left = outcome(with_guest.take(shutdown_of(guest)))
 
     assert (came, left) in (("booked", "released"), ("refused", "refused"))
+    with_guest.forget_shutdowns()
+    without.forget_shutdowns()
     assert with_guest.state == without.state
     assert with_guest.files == without.files
 
@@ -180,6 +200,7 @@ def test_when_all_have_left_the_repo_is_as_it_was_laid_down(random: Random, coun
     repo.take_all(requests)
 
     assert set(repo.take_all([shutdown_of(request) for request in requests])) == {"released"}
+    repo.forget_shutdowns()
     assert repo.state == MemoryRepo().state
     assert repo.files == MemoryRepo().files
 
@@ -251,15 +272,13 @@ def test_what_a_request_asks_for_is_booked_together_or_not_at_all(
 @given(chances, st.integers(1, 12))
 def test_a_request_writes_the_claims_it_changes_and_no_others(random: Random, length: int) -> None:
     repo, books = MemoryRepo(), Books(SKELETON)
-    for request in told(Maker(random).sequence(length)):
-        expected = books.take(request)
-        taken = repo.take(request)
+    for _, expected, taken in taken_by_both(random, length, repo, books):
         if isinstance(taken, Refused):
             continue
-        changed = [change.after or change.before for change in taken.changes.claims]
-        assert {demand_in(claim) for claim in changed if claim} == expected.touched
+        changed = {key_in(change.key) for change in taken.changes.claims}
+        assert changed == {key_of(*key) for key in expected.touched}
         paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
-        assert {path for path in taken.files if path.startswith("ledger/")} == paths
+        assert {path for path in taken.files if claim_file.kind_of(path)} == paths
         assert bool(taken.files) == expected.effective
 
 
@@ -299,6 +318,8 @@ def test_the_order_of_independent_demands_does_not_matter(random: Random, count:
     assert "refused" not in {outcome(one.take(request)) for request in one_order}
     for request in other_order:  # nor does it matter in which order a request lists things
         assert outcome(other.take(maker.again(request))) != "refused"
+    one.forget_shutdowns()
+    other.forget_shutdowns()
     assert one.state == other.state
     assert one.files == other.files
 
@@ -316,7 +337,7 @@ def test_rendering_step_by_step_gives_what_rendering_at_once_gives(
         repo.take(request)
         at_once = rendered_files(repo.state)
         assert repo.below(*{path.split("/")[0] for path in at_once}) == at_once
-        fresh = State.of(repo.state.config, ledger_in(repo))
+        fresh = State.of(repo.state.config, ledger_in(repo.files))
         assert fresh.ledger == repo.state.ledger
     assert rendered_files(fresh) == at_once
 
@@ -360,4 +381,4 @@ def test_the_model_and_the_program_agree_on_the_papers_table() -> None:
     for request in [*joins, *map(shutdown_of, joins)]:
         assert outcome(repo.take(request)) == books.take(request).outcome != "refused"
         assert repo.view() == books.view()
-    assert not books.demands()
+    assert not books.claims
