@@ -6,7 +6,7 @@ clock, after every step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -250,13 +250,12 @@ def is_booked(path: str) -> bool:
     return bool(claim_file.kind_of(path)) or path.startswith(recent_shutdowns.SHUTDOWNS_ROOT)
 
 
-def ledger_in(files: Mapping[str, str], order: Callable[[list[Any]], None] = list.sort) -> Ledger:
+def ledger_in(files: Mapping[str, str]) -> Ledger:
     """Return the ledger as one who only has the files reads it."""
-    booked = [path for path in files if is_booked(path)]
-    order(booked)
-    claims = [claim_file.read(files[path], path) for path in booked if claim_file.kind_of(path)]
-    shutdowns = {path: files[path] for path in booked if not claim_file.kind_of(path)}
-    return replace(rebuilt(claims), shutdowns=recent_shutdowns.read_all(shutdowns))
+    booked = {path: text for path, text in files.items() if is_booked(path)}
+    claims = [path for path in booked if claim_file.kind_of(path)]
+    ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
+    return replace(ledger, shutdowns=recent_shutdowns.read_all(booked))
 
 
 def _purpose(entry: Mapping[str, Any]) -> str:
