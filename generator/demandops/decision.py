@@ -15,18 +15,9 @@ from types import MappingProxyType
 from typing import Literal
 
 from demandops.config.config import Config
-from demandops.connections.connection import Connection
-from demandops.demand import (
-    admission,
-    approval_rule,
-    connection_type_choice,
-    decommission_goal,
-    demand_goal,
-    deployment_request_goal,
-    permission,
-)
+from demandops.demand import admission, demand_goal, deployment_request_goal, permission
 from demandops.demand.application import Application
-from demandops.demand.demand_request import DemandRequest
+from demandops.demand.demand_request import Decommission, DemandRequest
 from demandops.errors import Fault, InvalidInput, Refused
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Changes, Ledger, changes_on
@@ -35,9 +26,12 @@ from demandops.ledger.operations.restoration import Restoration
 from demandops.ledger.world import World
 from demandops.plan import implied_connections
 from demandops.plan.checks import denial, quota
-from demandops.plan.connection_clients import is_bridged
-from demandops.plan.overrides import kept_claims
-from demandops.plan.overrides.suspended_claims import without_suspended
+from demandops.plan.overrides.claim_overrides import (
+    with_kept_claims,
+    without_kept_claims,
+    without_suspended,
+)
+from demandops.plan.planner import is_bridged
 from demandops.plan.release_keys import affected_keys, all_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
@@ -148,13 +142,12 @@ def decide(
         files=rendered.files if changes.claims else {},
         releases=rendered.releases,
         warnings=(
-            *_missing_connections(request, after),
-            *_already_bridged(request, state.config),
+            *_connection_warnings(request, after),
             *rendered.blocked,
             *_repeat(changes),
             *denial.warnings(request, after),
         ),
-        approval=approval_rule.approval_reasons(
+        approval=permission.approval_reasons(
             request, ((c.before, c.after) for c in changes.claims), state.config
         ),
         overrides=rendered.overrides,
@@ -168,13 +161,13 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
         Refused: if existing claims, an override or a quota forbid it.
     """
     subjects = request.subjects()
-    ledger, changes = apply(kept_claims.without_kept_claims(state.ledger, subjects), request, now)
+    ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
     after = replace(state, ledger=ledger)
     refusals = list(denial.faults(request, after, changes))
     refusals = refusals or list(quota.faults(state, after, changes))
     if refusals:
         raise Refused(refusals)
-    return kept_claims.with_kept_claims(state.ledger, after, changes, subjects, now)
+    return with_kept_claims(state.ledger, after, changes, subjects, now)
 
 
 def admit(
@@ -186,8 +179,8 @@ def admit(
         Refused: with every fault, of form and of content.
     """
     config = state.config
-    if isinstance(goal, dict) and decommission_goal.is_decommission(goal):
-        return decommission_goal.parse(goal)
+    if isinstance(goal, dict) and Decommission.is_goal(goal):
+        return Decommission.parse(goal)
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         parsed, faults = demand_goal.parse(goal)
         request = permission.with_lease_terms(parsed, config)
@@ -197,7 +190,7 @@ def admit(
         if wired is None:
             raise Refused(faults)
         request = permission.with_lease_terms(wired, config)
-    request = connection_type_choice.with_chosen_types(request, config, state.ledger.connection)
+    request = admission.with_chosen_types(request, config, state.ledger.connection)
     malformed = {found.field for found in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
     content = [*admission.faults(request, config), *permission.faults(request, config)]
@@ -256,21 +249,25 @@ def _subject_of(field: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else ("", 0)
 
 
-def _missing_connections(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each input that no connection brings to the application's node."""
-    if not request.adds_claims:
-        return
+def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
+    """Yield a warning for each input that no connection brings, and each that needs none."""
     ledger = without_suspended(world).ledger
-    for one in request.demanded:
-        app = one.held
-        if not isinstance(app, Application):
+    for one in request.demanded if request.adds_claims else ():
+        held = one.held
+        if isinstance(held, Application):
+            for foreign in implied_connections.foreign_inputs(held, world.config):
+                topic = foreign.topic
+                if not ledger.is_carried_to(held.node, topic.topic):
+                    yield (
+                        f"application '{held.id}': no connection carries {foreign.name} "
+                        f"{topic.topic} of '{topic.source}' to '{held.node}'"
+                    )
             continue
-        for foreign in implied_connections.foreign_inputs(app, world.config):
-            topic = foreign.topic
-            if not ledger.is_carried_to(app.node, topic.topic):
+        for route in held.topics:
+            if is_bridged(route, *held.nodes, world.config):
                 yield (
-                    f"application '{app.id}': no connection carries {foreign.name} {topic.topic} "
-                    f"of '{topic.source}' to '{app.node}'"
+                    f"connection '{held.id}': {route.read_topic} is bridged between "
+                    f"'{held.source}' and '{held.target}' already, so no client carries it"
                 )
 
 
@@ -279,23 +276,6 @@ def _repeat(changes: Changes) -> Iterator[str]:
     if changes.repeats is not None:
         at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
         yield f"the same shutdown was carried out at {at}; this one releases nothing more"
-
-
-def _already_bridged(request: DemandRequest, config: Config) -> Iterator[str]:
-    """Yield a warning for each topic that the initial deployment already carries."""
-    if not request.adds_claims:
-        return
-    for one in request.demanded:
-        connection = one.held
-        if not isinstance(connection, Connection):
-            continue
-        for route in connection.topics:
-            if is_bridged(route, *connection.nodes, config):
-                yield (
-                    f"connection '{connection.id}': {route.read_topic} is bridged between "
-                    f"'{connection.source}' and '{connection.target}' already, so no client "
-                    "carries it"
-                )
 
 
 def refusal_text(error: InvalidInput) -> str:

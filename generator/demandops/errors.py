@@ -46,6 +46,11 @@ class InvalidInput(DemandOpsError):
         self.faults = tuple(faults)
         super().__init__("\n".join(str(fault) for fault in self.faults))
 
+    @classmethod
+    def at(cls, field: str, message: str, *, code: str = "invalid", file: str = "") -> InvalidInput:
+        """Return the error with one fault."""
+        return cls([Fault(code, field, message, file)])
+
 
 class Refused(InvalidInput):
     """Raised when a demand cannot be fulfilled; no part of it was booked."""

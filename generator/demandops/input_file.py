@@ -1,11 +1,11 @@
-"""The text of a file that a person names on the command line."""
+"""The files that a person names on the command line or for the service: texts and secrets."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-from demandops.errors import InvalidInput, fault
+from demandops.errors import InvalidInput
 
 
 def read_input(file: str | Path) -> tuple[str, str]:
@@ -22,4 +22,28 @@ def read_input(file: str | Path) -> tuple[str, str]:
         problem = f"cannot be read: {error.strerror or error}"
     except UnicodeDecodeError:
         problem = "is not UTF-8 text"
-    raise InvalidInput([fault("", problem).within(name)])
+    raise InvalidInput.at("", problem, file=name)
+
+
+def read_secret(path: Path, *, private: bool = False) -> bytes:
+    """Return the secret in a file, without the line end.
+
+    Args:
+        path: the file.
+        private: whether to refuse a file that other users may read.
+
+    Raises:
+        InvalidInput: if it holds no secret, cannot be read, or is not private enough.
+    """
+    secret = b""
+    try:
+        if private and path.stat().st_mode & 0o007:
+            problem = "may be read by everybody on this machine; run chmod o= on it"
+        else:
+            secret = path.read_bytes().rstrip(b"\r\n")
+            problem = "is empty; put the secret there"
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror or error}; put the secret there"
+    if not secret.strip():
+        raise InvalidInput.at("", problem, file=str(path))
+    return secret

@@ -10,12 +10,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
 import yaml
 
-from demandops.errors import Fault, InvalidInput, fault
+from demandops.errors import Fault, InvalidInput
 
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -108,9 +109,17 @@ def short_repr(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "…"
 
 
-def _mark(error: yaml.YAMLError) -> str:
-    mark = getattr(error, "problem_mark", None)
-    return f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+@contextmanager
+def _strict(file: str) -> Iterator[None]:
+    try:
+        yield
+    except yaml.YAMLError as error:
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+        where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        message = f"not valid YAML: {problem or str(error).splitlines()[0]}"
+        raise InvalidInput.at(where, message, file=file) from error
+    except _MISFITS as error:
+        raise InvalidInput.at("", _MISFIT, file=file) from error
 
 
 def load_all(text: str, file: str = "") -> Iterator[Any]:
@@ -119,27 +128,18 @@ def load_all(text: str, file: str = "") -> Iterator[Any]:
     Raises:
         InvalidInput: if it is not strict YAML; the fault names ``file``.
     """
-    try:
+    with _strict(file):
         depth = 0
         for event in yaml.parse(text, Loader=_Loader):
             depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
             if depth > _MAX_DEPTH:  # before the C parser builds it and overruns its stack
                 message = f"is nested deeper than {_MAX_DEPTH} levels"
-                raise InvalidInput([fault("", message).within(file)])
+                raise InvalidInput.at("", message, file=file)
             if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
                 where = f"line {event.start_mark.line + 1}" if event.start_mark else ""
                 message = "anchors and aliases (& and *) are not allowed; write the value out"
-                raise InvalidInput([fault(where, message).within(file)])
+                raise InvalidInput.at(where, message, file=file)
         yield from yaml.load_all(text, Loader=_StrictLoader)
-    except yaml.YAMLError as error:
-        raise InvalidInput([_fault_of(error).within(file)]) from error
-    except _MISFITS as error:
-        raise InvalidInput([fault("", _MISFIT).within(file)]) from error
-
-
-def _fault_of(error: yaml.YAMLError) -> Fault:
-    problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-    return fault(_mark(error), f"not valid YAML: {problem}")
 
 
 def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which models then parse
@@ -151,7 +151,7 @@ def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which mo
     documents = list(load_all(text, file))
     if len(documents) > 1:
         message = f"holds {len(documents)} documents; only one is allowed"
-        raise InvalidInput([fault("", message).within(file)])
+        raise InvalidInput.at("", message, file=file)
     return documents[0] if documents else None
 
 
@@ -163,12 +163,8 @@ def load_rendered(text: str) -> Any:  # noqa: ANN401
     Raises:
         InvalidInput: if it is not valid YAML.
     """
-    try:
+    with _strict(""):
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
-    except yaml.YAMLError as error:
-        raise InvalidInput([_fault_of(error)]) from error
-    except _MISFITS as error:
-        raise InvalidInput([fault("", _MISFIT)]) from error
 
 
 def dump(data: Mapping[str, Any]) -> str:
@@ -208,9 +204,8 @@ def set_key(text: str, key: str, value: object) -> str:
     except (InvalidInput, TypeError):
         succeeded = False
     if not succeeded:
-        raise InvalidInput(
-            [fault(key, f"cannot be set automatically; write {short_repr(value)} there")]
-        )
+        message = f"cannot be set automatically; write {short_repr(value)} there"
+        raise InvalidInput.at(key, message)
     return changed
 
 

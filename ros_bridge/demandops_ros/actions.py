@@ -5,11 +5,11 @@ An adapter turns goals into plain data, and stages and outcomes into messages.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 from application_manager_interfaces.action import DeploymentRequest
 from builtin_interfaces.msg import Duration
-from demandops.cluster.health import Level
+from demandops.cluster.health.release_health import Level
 from demandops.decision import refusal_text
 from demandops.errors import (
     DemandOpsError,
@@ -23,59 +23,50 @@ from demandops.errors import (
 from demandops.service import Receipt
 from demandops_interfaces.action import Demand
 
-from demandops_ros.messages import demand_goal_to_data, message_to_data
+from demandops_ros.messages import ANSWER_LEVELS, demand_goal_to_data, message_to_data
 
-ANSWER_LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
-
-
-class ActionAdapter(Protocol):
-    """The part of the node that is specific to one action."""
-
-    action: Any
-
-    def to_data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
-        """Return a goal as plain data."""
-
-    def name(self, goal: Any) -> str:  # noqa: ANN401
-        """Return the name of a goal for the log."""
-
-    def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return the level at which to answer a goal, or None if the goal names none."""
-
-    def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
-        """Return the feedback for a stage."""
-
-    def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return the result for the outcome of a goal and the level that it reached."""
+_CODES: tuple[tuple[type[BaseException], str], ...] = (
+    (Withdrawn, "withdrawn"),
+    (TurnedDown, "turned-down"),
+    (ShuttingDown, "shutting-down"),
+    (QueueFull, "queue-full"),
+    (DemandOpsError, "state-repo"),
+    (BaseException, "fault"),
+)
 
 
 class DeploymentRequestAdapter:
     """The reference's action, whose results and feedback are plain text."""
 
-    action = DeploymentRequest
+    action: Any = DeploymentRequest
 
-    def to_data(self, goal: Any) -> Any:  # noqa: ANN401
+    def to_data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
         """Return a goal as plain data."""
         return message_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
-        """Return the request's id."""
+        """Return the id of a goal for the log."""
         return str(goal.id)
 
     def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return None, because the message has no field for the level."""
+        """Return the level at which to answer a goal, or None if the goal names none."""
         return None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
-        """Return the stage as text."""
+        """Return the feedback for a stage."""
         return DeploymentRequest.Feedback(message=text)
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return ``<outcome>: <commit>``, or ``<code>: <field>: <remedy>``."""
+        """Return the result of a goal: ``<outcome>: <commit>``, or ``<code>: <field>: <remedy>``.
+
+        Args:
+            outcome: the receipt, or the error.
+            reached: the level that the demand's releases reached.
+        """
         return DeploymentRequest.Result(message=_text(outcome))
 
 
-class DemandAdapter:
+class DemandAdapter(DeploymentRequestAdapter):
     """DemandOps' own action."""
 
     action = Demand
@@ -100,23 +91,16 @@ class DemandAdapter:
         """Return code and text, and the receipt's fields if there is a receipt."""
         result = Demand.Result(code=_code(outcome), message=_text(outcome))
         if isinstance(outcome, Receipt):
-            result.outcome = outcome.outcome
-            result.commit = outcome.commit
+            result.outcome, result.commit, result.reached = outcome.outcome, outcome.commit, reached
             result.lease = Duration(sec=outcome.lease_s or 0)
-            result.warnings = [
-                *outcome.warnings,
-                *(f"not held: {item}" for item in outcome.not_held),
-            ]
-            result.reached = reached
+            result.warnings = [*outcome.warnings, *_not_held(outcome)]
         return result
 
 
 def _text(outcome: Receipt | BaseException) -> str:
     if isinstance(outcome, Receipt):
-        lines = [f"{outcome.outcome}: {outcome.commit}"]
-        lines += [f"warning: {warning}" for warning in outcome.warnings]
-        lines += [f"not held: {item}" for item in outcome.not_held]
-        return "\n".join(lines)
+        warnings = (f"warning: {warning}" for warning in outcome.warnings)
+        return "\n".join([f"{outcome.outcome}: {outcome.commit}", *warnings, *_not_held(outcome)])
     if isinstance(outcome, InvalidInput):
         return refusal_text(outcome)
     if isinstance(outcome, Withdrawn):
@@ -124,19 +108,15 @@ def _text(outcome: Receipt | BaseException) -> str:
     return f"{_code(outcome)}: {outcome if isinstance(outcome, DemandOpsError) else repr(outcome)}"
 
 
+def _not_held(receipt: Receipt) -> list[str]:
+    return [f"not held: {item}" for item in receipt.not_held]
+
+
 def _code(outcome: Receipt | BaseException) -> str:
     if isinstance(outcome, Receipt):
         return "ok"
     if isinstance(outcome, InvalidInput):
         return outcome.faults[0].code
-    for kind, code in (
-        (Withdrawn, "withdrawn"),
-        (TurnedDown, "turned-down"),
-        (NotReached, f"not-{getattr(outcome, 'level', '')}"),
-        (ShuttingDown, "shutting-down"),
-        (QueueFull, "queue-full"),
-        (DemandOpsError, "state-repo"),
-    ):
-        if isinstance(outcome, kind):
-            return code
-    return "fault"
+    if isinstance(outcome, NotReached):
+        return f"not-{outcome.level}"
+    return next(code for kind, code in _CODES if isinstance(outcome, kind))

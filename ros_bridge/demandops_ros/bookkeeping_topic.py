@@ -12,9 +12,10 @@ from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.runtime import REAL
 from demandops.service import Generator
 from demandops.staterepo import reader
+from demandops.staterepo.load.snapshot import Snapshot
 from demandops_interfaces.msg import Bookkeeping as BookkeepingMessage
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
 
 def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
@@ -25,21 +26,19 @@ def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # 
                 snapshot = repo.snapshot(request.at)
         else:
             snapshot = generator.snapshot
-        books = bookkeeping(snapshot.state)
+        response.commit, response.bookkeeping_json = _commit_and_json(snapshot)
+        response.ok = True
     except DemandOpsError as error:
         response.ok, response.message = False, str(error)
-        return response
-    response.ok = True
-    response.commit = str(snapshot.commit)
-    response.bookkeeping_json = json.dumps(as_data(books, response.commit), ensure_ascii=False)
     return response
 
 
-_LATCHED = QoSProfile(
-    depth=1,
-    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
-    reliability=QoSReliabilityPolicy.RELIABLE,
-)
+def _commit_and_json(snapshot: Snapshot) -> tuple[str, str]:
+    commit = str(snapshot.commit)
+    return commit, json.dumps(as_data(bookkeeping(snapshot.state), commit), ensure_ascii=False)
+
+
+_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 _SHORTEST_PAUSE_S = 1.0
 _PAUSE_FACTOR = 20
 
@@ -71,10 +70,7 @@ class BookkeepingTopic:
         while self._changed.wait() and not self._closed.is_set():
             self._changed.clear()
             began = REAL.monotonic()
-            snapshot = self._generator.snapshot
-            books = bookkeeping(snapshot.state)
-            commit = str(snapshot.commit)
-            text = json.dumps(as_data(books, commit), ensure_ascii=False)
+            commit, text = _commit_and_json(self._generator.snapshot)
             message = BookkeepingMessage(commit=commit, bookkeeping_json=text)
             self._in_executor(partial(self._publish, message))
             took = REAL.monotonic() - began

@@ -26,7 +26,7 @@ from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops_interfaces.action import Demand
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSProfile
 
 from demandops_ros.messages import demand_goal_from_data
 
@@ -35,7 +35,6 @@ log = logging.getLogger("demandops.client")
 StageListener = Callable[[str, str], None]
 """Called with each stage and its text, in the client's thread."""
 
-_DEPTH = 100
 _RENEW_AFTER = 1 / 3
 """The fraction of a lease after which to renew it; two more attempts fit before its end."""
 _RETRY_S = 5.0
@@ -92,11 +91,7 @@ class DemandClient:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain_id)
         self._node = rclpy.create_node(node_name, context=self._context)
-        deep = QoSProfile(
-            history=QoSHistoryPolicy.KEEP_LAST,
-            depth=_DEPTH,
-            reliability=QoSReliabilityPolicy.RELIABLE,
-        )
+        deep = QoSProfile(depth=100)
         self._client = ActionClient(
             self._node,
             Demand,
@@ -150,14 +145,15 @@ class DemandClient:
             DemandError: if the demand fails or no answer arrives in time.
             ValueError, TypeError: for a field or a value that the message cannot carry.
         """
-        data: dict[str, Any] = {
+        data = {
             "demand": demand,
             "request": request,
             "answer": answer,
             "applications": list(applications),
             "connections": list(connections),
+            "lease": lease,
         }
-        return self.send(data | ({"lease": lease} if lease is not None else {}), on_stage)
+        return self.send(data, on_stage)
 
     def renew(self, demand: str) -> Answer:
         """Renew a demand's leases.
@@ -251,11 +247,9 @@ class HeldDemand:
 
     def __enter__(self) -> HeldDemand:
         """Put the demand and start to renew it."""
-        self.answer = self._put()
-        self.commit = self.answer.commit
-        if self.answer.lease_s:
-            renew = partial(self._renew_until_over, self.answer.lease_s)
-            self._renewer = REAL.start_thread("lease", renew)
+        lease_s = self._put_and_remember().lease_s
+        if lease_s:
+            self._renewer = REAL.start_thread("lease", partial(self._renew_until_over, lease_s))
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
@@ -270,22 +264,25 @@ class HeldDemand:
                 raise
             log.warning("demand %s was not released: %s", self.id, problem)
 
+    def _put_and_remember(self) -> Answer:
+        self.answer = self._put()
+        self.commit = self.answer.commit
+        return self.answer
+
     def _renew_until_over(self, lease_s: float) -> None:
         pause = lease_s * _RENEW_AFTER
         while not self._over.wait(pause):
             pause = lease_s * _RENEW_AFTER
             try:
-                self._client.renew(self.id)
+                self._renew()
             except DemandError as problem:
-                if problem.code == "not-held":  # it ended while the network was down
-                    self._put_again()
-                else:
-                    log.warning("demand %s was not renewed: %s", self.id, problem)
-                    pause = min(pause, _RETRY_S)
+                log.warning("demand %s was not renewed: %s", self.id, problem)
+                pause = min(pause, _RETRY_S)
 
-    def _put_again(self) -> None:
+    def _renew(self) -> None:
         try:
-            self.answer = self._put()
-            self.commit = self.answer.commit
+            self._client.renew(self.id)
         except DemandError as problem:
-            log.warning("demand %s ended and was not put again: %s", self.id, problem)
+            if problem.code != "not-held":
+                raise
+            self._put_and_remember()  # it ended while the network was down

@@ -14,7 +14,7 @@ from demandops.input_file import read_input
 from demandops.runtime import REAL
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 
-from demandops_ros.client import Answer, DemandClient, DemandError
+from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
 
 
 @click.command()
@@ -103,13 +103,9 @@ def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: over.set())
     client.requesters = tuple(data.get("requesters", ()))
-    options = {name: data[name] for name in ("lease", "request", "answer") if name in data}
-    with client.demand(
-        str(data.get("demand", "")),
-        data.get("applications", ()),
-        data.get("connections", ()),
-        on_stage=_print_stages(output),
-        **options,
+    goal, on_stage = {**data, "operation": "put"}, _print_stages(output)
+    with HeldDemand(
+        client, str(data.get("demand", "")), lambda: client.send(goal, on_stage)
     ) as held:
         if held.answer is not None:
             _print_answer(held.answer, output)

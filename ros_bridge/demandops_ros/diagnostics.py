@@ -9,11 +9,10 @@ from __future__ import annotations
 from datetime import datetime
 
 from demandops.service import Generator
-from demandops.service.remote_status import StateRepoStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-PERIOD_S = 1.0
+_PERIOD_S = 1.0
 _MOST_PROBLEMS = 20
 
 
@@ -23,52 +22,45 @@ class Diagnostics:
     def __init__(self, node: Node, generator: Generator) -> None:
         self._node, self._generator = node, generator
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = node.create_timer(PERIOD_S, self._publish)
+        self._timer = node.create_timer(_PERIOD_S, self._publish)
 
     def _publish(self) -> None:
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        message.status = statuses(self._generator.state_repo_status, self._generator.address)
+        message.status = [_of_state_repo(self._generator), _of_configuration(self._generator)]
         self._publisher.publish(message)
 
 
-def statuses(status: StateRepoStatus, address: str) -> list[DiagnosticStatus]:
-    """Return the two diagnostic statuses of a state repo."""
-    return [_of_state_repo(status, address), _of_configuration(status, address)]
-
-
-def _of_state_repo(status: StateRepoStatus, address: str) -> DiagnosticStatus:
-    remote = status.remote
+def _of_state_repo(generator: Generator) -> DiagnosticStatus:
+    remote, unpublished = generator.remote_status, generator.unpublished
     level, text = DiagnosticStatus.OK, "reachable"
     if remote.push_denied:
         level, text = DiagnosticStatus.ERROR, remote.push_denied
     if remote.unreachable:
         # while no demand waits, only people's changes are late
-        level = DiagnosticStatus.ERROR if status.unpublished else DiagnosticStatus.WARN
+        level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
         text = remote.unreachable
     values = {
         "reachable": str(not remote.unreachable).lower(),
         "away since": _time(remote.unreachable_since),
         "last reached": _time(remote.last_reached),
         "last push": _time(remote.last_push),
-        "demands in the outbox": str(status.unpublished),
-        "commit": status.commit,
+        "demands in the outbox": str(unpublished),
+        "commit": str(generator.snapshot.commit),
     }
-    return _status("demandops: state repo", address, level, text, values)
+    return _status("demandops: state repo", generator.address, level, text, values)
 
 
-def _of_configuration(status: StateRepoStatus, address: str) -> DiagnosticStatus:
-    problems = [str(problem) for problem in status.problems]
+def _of_configuration(generator: Generator) -> DiagnosticStatus:
+    problems = generator.snapshot.problems
     level, text = DiagnosticStatus.OK, "all files are valid"
     if problems:
         level = DiagnosticStatus.WARN
         text = f"{len(problems)} problems; the last valid version is in effect"
-    values = {
-        f"problem {number}": problem
-        for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1)
-    }
-    values = {"problems": str(len(problems))} | values
-    return _status("demandops: configuration", address, level, text, values)
+    values = {"problems": str(len(problems))}
+    for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
+        values[f"problem {number}"] = str(problem)
+    return _status("demandops: configuration", generator.address, level, text, values)
 
 
 def _status(

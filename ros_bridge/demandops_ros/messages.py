@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from builtin_interfaces.msg import Duration
+from demandops.cluster.health.release_health import Level
 from demandops.config.policy import seconds_of
 from demandops.connections.route import RouteOptions
 from demandops.errors import suggestion
@@ -33,8 +34,20 @@ def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generat
 
 _OPERATIONS = ("put", "release", "renew")
 _TYPES = ("auto", "mqtt", "zenoh", "ros", "none")
-_OPTIONS = tuple(RouteOptions.model_fields)
-_ANSWERS = ("pushed", "reconciled", "healthy")
+ANSWER_LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
+
+# the fields of a document, by the message's names
+_DEMAND = {"demand": "demand_id", "request": "request_id", "requesters": "requester_ids"}
+_APPLICATION = {"id": "id", "type": "type", "node": "node_id", "version": "version"}
+_INPUT = {"topic": "topic_name", "source": "source_node_id", "type": "type"}
+_CONNECTION = {
+    "id": "id",
+    "source": "source_node_id",
+    "target": "target_node_id",
+    "broker": "broker_node_id",
+}
+_ROUTE = {"source": "source_topic", "target": "target_topic"}
+_ROUTE |= {name: name for name in RouteOptions.model_fields}
 
 
 def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -46,12 +59,10 @@ def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
         "apiVersion": API_VERSION,
         "kind": "Demand",
         "operation": _word(_OPERATIONS, goal.operation),
-        "demand": goal.demand_id,
-        "request": goal.request_id,
-        "requesters": list(goal.requester_ids),
+        **_data(goal, _DEMAND),
         "applications": [_application(app) for app in goal.applications],
         "connections": [_connection(connection) for connection in goal.connections],
-        "answer": _word(_ANSWERS, goal.answer),
+        "answer": _word(ANSWER_LEVELS, goal.answer),
     }
     if goal.lease.sec or goal.lease.nanosec:  # a part of a second counts as a whole one
         data["lease"] = goal.lease.sec + bool(goal.lease.nanosec)
@@ -65,15 +76,10 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
         ValueError: for an unknown field or word.
         TypeError, AssertionError: for a value of the wrong type.
     """
-    goal = DemandMessage.Goal()
-    known = {"apiVersion", "kind", "lease", "operation", "answer", "applications", "connections"}
-    names = {"demand": "demand_id", "request": "request_id", "requesters": "requester_ids"}
-    _reject_unknown(data, {*known, *names}, "a demand")
-    for name, field in names.items():
-        if name in data:
-            setattr(goal, field, data[name])
+    more = {"apiVersion", "kind", "lease", "operation", "answer", "applications", "connections"}
+    goal = DemandMessage.Goal(**_fields(data, _DEMAND, more, "a demand"))
     goal.operation = _number(_OPERATIONS, data.get("operation", "put"), "operation")
-    goal.answer = _number(_ANSWERS, data.get("answer", "pushed"), "answer")
+    goal.answer = _number(ANSWER_LEVELS, data.get("answer", "pushed"), "answer")
     lease = data.get("lease") or 0
     seconds = seconds_of(lease) if isinstance(lease, str) else lease
     goal.lease = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
@@ -82,21 +88,26 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     return goal
 
 
+def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
+    inputs: dict[str, list[dict[str, str]]] = {}
+    for item in app.inputs:
+        inputs.setdefault(item.role, []).append(_data(item, _INPUT))
+    return {
+        **_data(app, _APPLICATION),
+        "inputs": inputs,
+        "parameters_json": {parameter.name: parameter.value_json for parameter in app.parameters},
+        "connect": _word(_TYPES, app.connect),
+    }
+
+
 def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    known = {"inputs", "parameters", "parameters_json", "connect"}
-    names = {"id": "id", "type": "type", "node": "node_id", "version": "version"}
-    _reject_unknown(data, {*known, *names}, "an application")
+    more = {"inputs", "parameters", "parameters_json", "connect"}
     values = {name: json.dumps(value) for name, value in data.get("parameters", {}).items()}
     values |= data.get("parameters_json", {})
     return messages.Application(
-        **{field: data[name] for name, field in names.items() if name in data},
+        **_fields(data, _APPLICATION, more, "an application"),
         inputs=[
-            messages.Input(
-                role=role,
-                topic_name=topic.get("topic", ""),
-                source_node_id=topic.get("source", ""),
-                type=topic.get("type", ""),
-            )
+            messages.Input(role=role, **_fields(topic, _INPUT, set(), "an input"))
             for role, topics in data.get("inputs", {}).items()
             for topic in topics
         ],
@@ -105,34 +116,41 @@ def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     )
 
 
-def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    names = {
-        "id": "id",
-        "source": "source_node_id",
-        "target": "target_node_id",
-        "broker": "broker_node_id",
+def _connection(connection: Any) -> dict[str, Any]:  # noqa: ANN401
+    return {
+        **_data(connection, _CONNECTION),
+        "type": _word(_TYPES[:-1], connection.type),
+        "topics": [_data(route, _ROUTE) for route in connection.topics],
     }
-    _reject_unknown(data, {"type", "topics", *names}, "a connection")
+
+
+def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    topics = []
+    for route in data.get("topics", ()):
+        fields = _fields(route, _ROUTE, set(), "a topic of a connection")
+        if "rate" in fields:
+            fields["rate"] = float(fields["rate"])
+        topics.append(messages.Route(**fields))
     return messages.Connection(
-        **{field: data[name] for name, field in names.items() if name in data},
+        **_fields(data, _CONNECTION, {"type", "topics"}, "a connection"),
         type=_number(_TYPES[:-1], data.get("type", "auto"), "type"),
-        topics=[_route_message(route) for route in data.get("topics", ())],
+        topics=topics,
     )
 
 
-def _route_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    _reject_unknown(data, {"source", "target", *_OPTIONS}, "a topic of a connection")
-    options = {name: data[name] for name in _OPTIONS if name in data}
-    if "rate" in options:
-        options["rate"] = float(options["rate"])
-    names = {"source_topic": data.get("source", ""), "target_topic": data.get("target", "")}
-    return messages.Route(**names, **options)
+def _data(message: Any, names: Mapping[str, str]) -> dict[str, Any]:  # noqa: ANN401
+    return {name: getattr(message, field) for name, field in names.items()}
 
 
-def _reject_unknown(data: Mapping[str, Any], known: set[str], what: str) -> None:
+def _fields(
+    data: Mapping[str, Any], names: Mapping[str, str], more: set[str], what: str
+) -> dict[str, Any]:
+    """Return the fields of a message; a name must be in ``names`` or ``more``."""
+    known = {*more, *names}
     for name in data:
         if name not in known:
             raise ValueError(f"'{name}' is not a field of {what}{suggestion(name, known)}")
+    return {field: data[name] for name, field in names.items() if name in data}
 
 
 def _number(words: tuple[str, ...], word: str, field: str) -> int:
@@ -143,37 +161,6 @@ def _number(words: tuple[str, ...], word: str, field: str) -> int:
 
 def _word(words: tuple[str, ...], number: int) -> str:
     return words[number] if number < len(words) else str(number)
-
-
-def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
-    inputs: dict[str, list[dict[str, str]]] = {}
-    for item in app.inputs:
-        topic = {"topic": item.topic_name, "source": item.source_node_id, "type": item.type}
-        inputs.setdefault(item.role, []).append(topic)
-    return {
-        "id": app.id,
-        "type": app.type,
-        "node": app.node_id,
-        "inputs": inputs,
-        "parameters_json": {parameter.name: parameter.value_json for parameter in app.parameters},
-        "version": app.version,
-        "connect": _word(_TYPES, app.connect),
-    }
-
-
-def _connection(connection: Any) -> dict[str, Any]:  # noqa: ANN401
-    return {
-        "id": connection.id,
-        "type": _word(_TYPES[:-1], connection.type),
-        "source": connection.source_node_id,
-        "target": connection.target_node_id,
-        "broker": connection.broker_node_id,
-        "topics": [
-            {"source": route.source_topic, "target": route.target_topic}
-            | {name: getattr(route, name) for name in _OPTIONS}
-            for route in connection.topics
-        ],
-    }
 
 
 def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
@@ -194,12 +181,8 @@ def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
 def _converted(default: Any, type_name: str, value: Any) -> Any:  # noqa: ANN401
     if isinstance(value, dict):
         return fill_message(default, value)
-    if isinstance(value, list) and "/" in type_name:
-        return [fill_message(_new(type_name), item) for item in value]
+    if isinstance(value, list) and "/" in type_name:  # sequence<pkg/Name>
+        package, name = type_name.removeprefix("sequence<").split(">")[0].split(",")[0].split("/")
+        new = getattr(import_module(f"{package}.msg"), name)
+        return [fill_message(new(), item) for item in value]
     return value
-
-
-def _new(type_name: str) -> Any:  # noqa: ANN401
-    """Return a new message of the type in ``sequence<pkg/Name>``."""
-    package, name = type_name.removeprefix("sequence<").split(">")[0].split(",")[0].split("/")
-    return getattr(import_module(f"{package}.msg"), name)()

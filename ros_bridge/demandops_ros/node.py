@@ -10,11 +10,11 @@ from __future__ import annotations
 import uuid
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from demandops.cluster.health import Level
+from demandops.cluster.health.release_health import Level
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.errors import NotReached, QueueFull, ShuttingDown, Withdrawn
 from demandops.runtime import REAL
@@ -24,33 +24,15 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
-from demandops_ros.actions import ActionAdapter, DemandAdapter, DeploymentRequestAdapter
+from demandops_ros.actions import DemandAdapter, DeploymentRequestAdapter
 from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
-QUEUE_DEPTH = 2000
-"""Depth of the services' queues: with ROS's default of 10, goals that arrive at once are lost."""
-
-DEEP_QOS = QoSProfile(
-    history=QoSHistoryPolicy.KEEP_LAST,
-    depth=QUEUE_DEPTH,
-    reliability=QoSReliabilityPolicy.RELIABLE,
-)
-
-
-@dataclass(frozen=True, slots=True)
-class AnswerSettings:
-    """When to answer goals: at ``level`` if the goal names none, after ``timeout_s`` at the latest.
-
-    ``status`` watches rollouts; None without access to the clusters.
-    """
-
-    level: Level = "pushed"
-    timeout_s: float = 120.0
-    status: RolloutWatcher | None = None
+DEEP_QOS = QoSProfile(depth=2000)
+"""For the actions' services: with ROS's default of 10, goals that arrive at once are lost."""
 
 
 class DemandNode(Node):  # type: ignore[misc]
@@ -61,12 +43,22 @@ class DemandNode(Node):  # type: ignore[misc]
         generator: Generator,
         action_name: str,
         demand_action_name: str,
-        answers: AnswerSettings,
-        **options: Any,  # noqa: ANN401
+        level: Level,
+        timeout_s: float,
+        status: RolloutWatcher | None,
     ) -> None:
-        super().__init__("demandops", **options)
+        """Start the servers.
+
+        Args:
+            generator: takes the demands.
+            action_name, demand_action_name: the names of the two actions.
+            level: when to answer a goal that names no level.
+            timeout_s: after how many seconds to answer in any case.
+            status: watches rollouts; None without access to the clusters.
+        """
+        super().__init__("demandops")
         self._generator = generator
-        self._answer_settings = answers
+        self._level, self._timeout_s, self._status = level, timeout_s, status
         self._open: dict[str, ServerGoalHandle] = {}
         self._events: deque[Callable[[], None]] = deque()
         self._stopping = False
@@ -87,7 +79,7 @@ class DemandNode(Node):  # type: ignore[misc]
         self._bookkeeping_topic = BookkeepingTopic(self, generator, self._from_worker)
         self._diagnostics = Diagnostics(self, generator)
 
-    def _serve(self, adapter: ActionAdapter, name: str) -> ActionServer:
+    def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> ActionServer:
         return ActionServer(
             self,
             adapter.action,
@@ -127,12 +119,12 @@ class DemandNode(Node):  # type: ignore[misc]
 
     # ---- callbacks of the action server, in the executor's thread ----
 
-    def _accept_or_reject(self, adapter: ActionAdapter, goal: Any) -> GoalResponse:  # noqa: ANN401
+    def _accept_or_reject(self, adapter: DeploymentRequestAdapter, goal: Any) -> GoalResponse:  # noqa: ANN401
         """Accept every goal unless overloaded: a rejection cannot carry a reason, a result can."""
         reason = "shutting down" if self._stopping else ""
         if len(self._open) >= self._generator.queue_limit:
             reason = "too many are waiting"
-            unreachable = self._generator.state_repo_status.remote.unreachable
+            unreachable = self._generator.remote_status.unreachable
             reason += f" for the state repo: {unreachable}" if unreachable else ""
         if reason:
             self.get_logger().warning(f"goal '{adapter.name(goal)}' rejected: {reason}")
@@ -145,77 +137,47 @@ class DemandNode(Node):  # type: ignore[misc]
             return CancelResponse.ACCEPT
         return CancelResponse.REJECT
 
-    async def _execute(self, adapter: ActionAdapter, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
-        operation = _operation(handle)
+    async def _execute(self, adapter: DeploymentRequestAdapter, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
+        operation, goal = _operation(handle), handle.request
         self._open[operation] = handle
         done = Future(executor=self.executor)
+
+        def notify(stage: str, text: str) -> None:
+            self._from_worker(partial(_give_feedback, handle, adapter.feedback(stage, text)))
+
         try:
-            ticket = self._generator.submit(
-                adapter.to_data(handle.request),
-                operation,
-                lambda stage, text: self._from_worker(
-                    partial(self._feedback, adapter, handle, stage, text)
-                ),
-            )
+            ticket = self._generator.submit(adapter.to_data(goal), operation, notify)
         except (ShuttingDown, QueueFull) as error:
             return self._finish(adapter, handle, error)
         ticket.future.add_done_callback(
             lambda future: self._from_worker(partial(done.set_result, future))
         )
         outcome = (await done).exception() or ticket.future.result()
-        level = adapter.answer_level(handle.request) or self._answer_settings.level
+        level = adapter.answer_level(goal) or self._level
         if not isinstance(outcome, Receipt) or level == "pushed":
             return self._finish(adapter, handle, outcome)
-        problem = self._cannot_watch(outcome)
-        if problem:
-            outcome = replace(outcome, warnings=(*outcome.warnings, problem))
-            return self._finish(adapter, handle, outcome)
-        return self._finish(
-            adapter, handle, await self._wait_for_rollout(adapter, handle, outcome, level), level
+        status, problem = self._status, "this node has no access to the clusters"
+        if status is not None:
+            problem = status.why_unreachable(target.domain for target in outcome.targets)
+        if problem or status is None:
+            warnings = (*outcome.warnings, f"answered at pushed: {problem}")
+            return self._finish(adapter, handle, replace(outcome, warnings=warnings))
+        rolled_out = Future(executor=self.executor)
+        status.follow(
+            outcome.commit, outcome.targets, level, self._timeout_s, notify
+        ).add_done_callback(
+            lambda future: self._from_worker(partial(rolled_out.set_result, future.result()))
         )
-
-    def _cannot_watch(self, receipt: Receipt) -> str:
-        """Return why the rollout of a demand cannot be watched, or empty."""
-        if self._answer_settings.status is None:
-            return "answered at pushed: this node has no access to the clusters"
-        problem = self._answer_settings.status.why_unreachable(
-            target.domain for target in receipt.targets
-        )
-        return f"answered at pushed: {problem}" if problem else ""
-
-    async def _wait_for_rollout(
-        self, adapter: ActionAdapter, handle: ServerGoalHandle, receipt: Receipt, level: Level
-    ) -> Receipt | NotReached:
-        """Wait until a rollout reaches a level, or for the time limit."""
-        assert self._answer_settings.status is not None  # noqa: S101 - the caller has checked
-        done = Future(executor=self.executor)
-        followed = self._answer_settings.status.follow(
-            receipt.commit,
-            receipt.targets,
-            level,
-            self._answer_settings.timeout_s,
-            lambda stage, text: self._from_worker(
-                partial(self._feedback, adapter, handle, stage, text)
-            ),
-        )
-        followed.add_done_callback(
-            lambda future: self._from_worker(partial(done.set_result, future.result()))
-        )
-        health = await done
+        health = await rolled_out
         if health.reaches(level):
-            return receipt
+            return self._finish(adapter, handle, outcome, level)
         prefix = f"{health.object}: " if health.object else ""
-        return NotReached(level, f"{prefix}{health.reason}; it is booked in {receipt.commit}")
-
-    def _feedback(
-        self, adapter: ActionAdapter, handle: ServerGoalHandle, stage: str, text: str
-    ) -> None:
-        if handle.is_active:
-            handle.publish_feedback(adapter.feedback(stage, text))
+        message = f"{prefix}{health.reason}; it is booked in {outcome.commit}"
+        return self._finish(adapter, handle, NotReached(level, message))
 
     def _finish(
         self,
-        adapter: ActionAdapter,
+        adapter: DeploymentRequestAdapter,
         handle: ServerGoalHandle,
         outcome: Receipt | BaseException,
         reached: Level = "pushed",
@@ -247,3 +209,8 @@ class DemandNode(Node):  # type: ignore[misc]
 
 def _operation(handle: ServerGoalHandle) -> str:
     return str(uuid.UUID(bytes=bytes(handle.goal_id.uuid)))
+
+
+def _give_feedback(handle: ServerGoalHandle, feedback: Any) -> None:  # noqa: ANN401
+    if handle.is_active:
+        handle.publish_feedback(feedback)

@@ -15,9 +15,10 @@ import rclpy
 from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_watcher import RolloutWatcher
+from demandops.input_file import read_secret
 from demandops.runtime import REAL
-from demandops.service import Generator, push_webhook
-from demandops.service.http_server import HttpServer
+from demandops.service import Generator
+from demandops.service.push_webhook import PushWebhook
 from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
 from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from rcl_interfaces.msg import ParameterDescriptor
@@ -26,11 +27,10 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from demandops_ros.actions import ANSWER_LEVELS
-from demandops_ros.node import AnswerSettings, DemandNode
+from demandops_ros.messages import ANSWER_LEVELS
+from demandops_ros.node import DemandNode
 
-_OF_ANY_TYPE = ParameterDescriptor(dynamic_typing=True)
-_LEVELS = ("debug", "info", "warn", "error", "fatal")
+_LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 _POLL_S = 0.02
 _TASK_S = 5.0
 _FLUSH_S = 0.3
@@ -46,7 +46,7 @@ class _RosLogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log a record at the matching ROS level."""
-        text = self.format(record)
+        text = self.format(record)  # one call for each level, because rclpy wants it so
         if record.levelno >= logging.ERROR:
             self._log.error(text)
         elif record.levelno >= logging.WARNING:
@@ -121,7 +121,7 @@ def serve(
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
         settings = _read_parameters(state_repo, fetch_interval)
-        secret = push_webhook.read_secret(webhook_secret_file) if webhook_secret_file else b""
+        secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
         with progress("reading the ledger") as report:
             generator = Generator(
@@ -134,10 +134,9 @@ def serve(
         trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
         generator.on_publish(trigger)
         trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
-        route = push_webhook.PushWebhook(secret, generator.fetch_now).route
-        http_server = HttpServer(webhook, [route], local_only=not secret) if webhook else None
+        push_webhook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
         status = RolloutWatcher(clusters, generator) if clusters else None
-        _run(generator, settings, status, http_server)
+        _run(generator, settings, status, push_webhook)
         trigger.close()
     finally:
         rclpy.try_shutdown()
@@ -145,25 +144,24 @@ def serve(
 
 def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
     """Read the node's parameters with a probe, because the generator starts before the node."""
+    defaults = {
+        "action_name": DEFAULT_ACTION_NAME,
+        "demand_action_name": DEFAULT_DEMAND_ACTION_NAME,
+        "answer": ANSWER_LEVELS[0],
+        "answer_timeout": 120.0,
+        "state_repo": state_repo or "",
+        "fetch_interval": fetch_interval or DEFAULT_INTERVAL,
+        "log_level": "info",
+    }
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
     try:
         values = {
-            "action_name": probe.declare_parameter("action_name", DEFAULT_ACTION_NAME).value,
-            "demand_action_name": probe.declare_parameter(
-                "demand_action_name", DEFAULT_DEMAND_ACTION_NAME
-            ).value,
-            "answer": probe.declare_parameter("answer", ANSWER_LEVELS[0]).value,
-            "answer_timeout": probe.declare_parameter("answer_timeout", 120.0).value,
-            "state_repo": probe.declare_parameter("state_repo", state_repo or "").value,
-            "fetch_interval": _as_text(
-                probe.declare_parameter(
-                    "fetch_interval", fetch_interval or DEFAULT_INTERVAL, _OF_ANY_TYPE
-                ).value
-            ),
-            "log_level": probe.declare_parameter("log_level", "info").value,
+            name: probe.declare_parameter(name, default, _descriptor(name)).value
+            for name, default in defaults.items()
         }
     finally:
         probe.destroy_node()
+    values["fetch_interval"] = _as_text(values["fetch_interval"])
     if not values["state_repo"]:
         raise click.UsageError(
             "no state repo given; use --state-repo URL_OR_DIR, DEMANDOPS_STATE_REPO or the ROS "
@@ -173,15 +171,17 @@ def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict
         parse_interval(values["fetch_interval"])
     except ValueError as error:
         raise click.UsageError(f"fetch interval: {error}") from None
-    if values["answer"] not in ANSWER_LEVELS:
-        raise click.UsageError(
-            f"parameter answer is '{values['answer']}'; it takes {', '.join(ANSWER_LEVELS)}"
-        )
-    if values["log_level"] not in _LEVELS:
-        raise click.UsageError(
-            f"parameter log_level is '{values['log_level']}'; it takes {', '.join(_LEVELS)}"
-        )
+    for name, choices in (("answer", ANSWER_LEVELS), ("log_level", _LOG_LEVELS)):
+        if values[name] not in choices:
+            raise click.UsageError(
+                f"parameter {name} is '{values[name]}'; it takes {', '.join(choices)}"
+            )
     return values
+
+
+def _descriptor(name: str, *, read_only: bool = False) -> ParameterDescriptor:
+    """Return a parameter's descriptor; a fetch interval may be of any type."""
+    return ParameterDescriptor(read_only=read_only, dynamic_typing=name == "fetch_interval")
 
 
 def _as_text(value: object) -> str:
@@ -193,20 +193,20 @@ def _run(
     generator: Generator,
     settings: dict[str, Any],
     status: RolloutWatcher | None,
-    http_server: HttpServer | None,
+    push_webhook: PushWebhook | None,
 ) -> None:
     node = DemandNode(
         generator,
         settings["action_name"],
         settings["demand_action_name"],
-        AnswerSettings(settings["answer"], settings["answer_timeout"], status),
+        settings["answer"],
+        settings["answer_timeout"],
+        status,
     )
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
         # read only, because the parameters are read at the start
-        of_any_type = name == "fetch_interval"
-        descriptor = ParameterDescriptor(read_only=True, dynamic_typing=of_any_type)
-        node.declare_parameter(name, shown, descriptor)
+        node.declare_parameter(name, shown, _descriptor(name, read_only=True))
     set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
     library_log = logging.getLogger("demandops")
     library_log.handlers, library_log.propagate = [_RosLogHandler(node)], False
@@ -218,11 +218,11 @@ def _run(
     spinner = REAL.start_thread("executor", executor.spin)
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
-    if http_server is not None:
-        node.get_logger().info(f"listening for pushes at {http_server.url}{push_webhook.PATH}")
+    if push_webhook is not None:
+        node.get_logger().info(f"listening for pushes at {push_webhook.url}")
     signals.wait()
-    if http_server is not None:
-        http_server.close()
+    if push_webhook is not None:
+        push_webhook.close()
     _drain(executor, node, generator, status)
     executor.shutdown(timeout_sec=1)
     spinner.join(5)
@@ -239,8 +239,7 @@ def _drain(
     """Send the results of all open goals before the node is destroyed."""
     node.stop_accepting()
     node.get_logger().info(f"stopping: finishing {node.open_goals} open goals")
-    finished = generator.stop()
-    published = finished.result()
+    published = generator.stop().result()
     if status is not None:
         status.close()  # answers the goals that wait for a rollout
     while node.open_goals:

@@ -25,9 +25,8 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
 SOURCES = Path(__file__).resolve().parent
@@ -51,6 +50,7 @@ WHEELS = (
 )
 # The middleware is installed as an extra of rclpy.
 REQUIREMENT = dict.fromkeys(("ros_rclpy", "ros_rmw_fastrtps_cpp"), "ros-rclpy[fastrtps]")
+BOOTSTRAPPED = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 TAIL_LINES = 40
 
 VERIFY = """
@@ -66,34 +66,29 @@ class StageFailed(Exception):
     """Raised when a command of the build fails; its output is at the end of the log."""
 
     def __init__(self, stage: str, log: Path) -> None:
-        super().__init__(stage)
-        self.stage = stage
-        self.log = log
-
-    def __str__(self) -> str:
-        lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
         tail = "\n".join(f"    {line}" for line in lines[-TAIL_LINES:])
-        return f"{tail}\nfailed: {self.stage}\nthe full log: {self.log}"
+        super().__init__(f"{tail}\nfailed: {stage}\nthe full log: {log}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Build if necessary, print what happened, and return the exit code."""
     options = _parse(argv)
     digest = fingerprint()
-    if not options.force and is_current(digest):
-        print(f"interfaces: up to date in {PREFIX}")
-        return 0
-    faults = missing(os.environ)
-    if faults:
-        print("\n".join(faults), file=sys.stderr)
-        return 1
     try:
-        with _only_one_build():
-            # Another build may have finished while this one waited.
-            if not options.force and is_current(digest):
-                print(f"interfaces: up to date in {PREFIX}")
-            else:
-                _build_somewhere(options.build_dir, digest)
+        if options.force or not is_current(digest):
+            faults = missing(os.environ)
+            if faults:
+                print("\n".join(faults), file=sys.stderr)
+                return 1
+            RECORD.parent.mkdir(parents=True, exist_ok=True)
+            with RECORD.with_suffix(".lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                # Another build may have finished while this one waited.
+                if options.force or not is_current(digest):
+                    _build_somewhere(options.build_dir, digest)
+                    return 0
+        print(f"interfaces: up to date in {PREFIX}")
     except StageFailed as failure:
         print(failure, file=sys.stderr)
         return 3
@@ -149,21 +144,29 @@ def is_current(digest: str) -> bool:
 
 def missing(environ: Mapping[str, str]) -> list[str]:
     """Return what is missing for a build, with the remedy, as lines of text."""
-    return [*_missing_wheels(), *_missing_tools(environ), *_missing_rights()]
+    lines = []
+    wheels = [wheel for wheel in WHEELS if not any(SITE.glob(f"{wheel}-*.dist-info"))]
+    if wheels:
+        wanted = sorted({REQUIREMENT.get(wheel, wheel.replace("_", "-")) for wheel in wheels})
+        lines += [
+            f"Python packages are missing in {PREFIX}",
+            f"install with: {sys.executable} -m pip install {shlex.join(wanted)}",
+        ]
+    tools = _missing_tools(environ)
+    if tools:
+        lines += [
+            f"not found: {', '.join(tools)}",
+            f"install with: apt-get install {' '.join(sorted(set(tools.values())))}",
+        ]
+    if not os.access(PREFIX, os.W_OK):
+        remedy = "run this as its owner, or in an environment of your own"
+        lines.append(f"{PREFIX} is not writable; {remedy}")
+    return lines
 
 
-def _missing_wheels() -> list[str]:
-    absent = [wheel for wheel in WHEELS if not any(SITE.glob(f"{wheel}-*.dist-info"))]
-    if not absent:
-        return []
-    wanted = sorted({REQUIREMENT.get(wheel, wheel.replace("_", "-")) for wheel in absent})
-    return [
-        f"Python packages are missing in {PREFIX}",
-        f"install with: {sys.executable} -m pip install {shlex.join(wanted)}",
-    ]
+def _missing_tools(environ: Mapping[str, str]) -> dict[str, str]:
+    """Return the missing tools, each with the package that contains it."""
 
-
-def _missing_tools(environ: Mapping[str, str]) -> list[str]:
     def found(*names: str) -> bool:
         return any(shutil.which(name, path=environ.get("PATH", "")) for name in names)
 
@@ -172,54 +175,28 @@ def _missing_tools(environ: Mapping[str, str]) -> list[str]:
         return found(chosen[0]) if chosen else found(*names)
 
     header = Path(sysconfig.get_path("include")) / "Python.h"
-    absent = [
-        (tool, package)
-        for present, tool, package in (
-            (found("cmake"), "cmake", "cmake"),
-            (compiler("CC", "cc", "gcc", "clang"), "a C compiler", "build-essential"),
-            (compiler("CXX", "c++", "g++", "clang++"), "a C++ compiler", "build-essential"),
-            (found("ninja", "make"), "make or ninja", "build-essential"),
-            (header.is_file(), f"Python's headers ({header})", "python3-dev"),
-        )
-        if not present
-    ]
-    if not absent:
-        return []
-    packages = sorted({package for _, package in absent})
-    return [
-        f"not found: {', '.join(tool for tool, _ in absent)}",
-        f"install with: apt-get install {' '.join(packages)}",
-    ]
-
-
-def _missing_rights() -> list[str]:
-    if os.access(PREFIX, os.W_OK):
-        return []
-    return [f"{PREFIX} is not writable; run this as its owner, or in an environment of your own"]
-
-
-@contextmanager
-def _only_one_build() -> Iterator[None]:
-    RECORD.parent.mkdir(parents=True, exist_ok=True)
-    with RECORD.with_suffix(".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+    checks = (
+        (found("cmake"), "cmake", "cmake"),
+        (compiler("CC", "cc", "gcc", "clang"), "a C compiler", "build-essential"),
+        (compiler("CXX", "c++", "g++", "clang++"), "a C++ compiler", "build-essential"),
+        (found("ninja", "make"), "make or ninja", "build-essential"),
+        (header.is_file(), f"Python's headers ({header})", "python3-dev"),
+    )
+    return {tool: package for present, tool, package in checks if not present}
 
 
 def _build_somewhere(build_dir: Path | None, digest: str) -> None:
-    if build_dir is not None:
-        build_dir.mkdir(parents=True, exist_ok=True)
-        build(build_dir, digest)
-        return
-    folder = Path(tempfile.mkdtemp(prefix="demandops-interfaces-"))
-    failed = False
+    """Build in a folder, which is kept if the caller named it or a stage fails."""
+    folder = build_dir or Path(tempfile.mkdtemp(prefix="demandops-interfaces-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    keep = build_dir is not None
     try:
         build(folder, digest)
     except StageFailed:
-        failed = True
+        keep = True
         raise
     finally:
-        if not failed:
+        if not keep:
             shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -246,7 +223,12 @@ def build(folder: Path, digest: str) -> None:
         command = ["cmake", "--install", str(folder / package)]
         _stage(f"install {package}", command, folder / f"{package}.log")
     _stage("verify", [sys.executable, "-c", VERIFY], folder / "verify.log")
-    _record(digest, _installed(folder))
+    manifests = [folder / package / "install_manifest.txt" for package in PACKAGES]
+    installed = [Path(line) for file in manifests for line in file.read_text().splitlines()]
+    files = sorted(str(path.relative_to(PREFIX)) for path in installed)
+    draft = RECORD.with_suffix(".new")
+    draft.write_text(json.dumps({"digest": digest, "files": files}, indent=1), encoding="utf-8")
+    draft.replace(RECORD)
 
 
 def _configure(folder: Path, package: str) -> None:
@@ -285,15 +267,9 @@ def _stage(stage: str, command: list[str], log: Path) -> None:
 
 def _environ() -> dict[str, str]:
     """Return the environment of a stage, without variables that point to another ROS or prefix."""
-    foreign = (
-        "CMAKE_PREFIX_PATH",
-        "DESTDIR",
-        "PYTHONHOME",
-        "PYTHONPATH",
-        # The wheels set this once a Python has its library path. It is inherited, so it may come
-        # from another environment's wheels.
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
-    )
+    # The wheels set the last one once a Python has its library path. It is inherited, so it may
+    # come from another environment's wheels.
+    foreign = ("CMAKE_PREFIX_PATH", "DESTDIR", "PYTHONHOME", "PYTHONPATH", BOOTSTRAPPED)
     kept = {name: value for name, value in os.environ.items() if name not in foreign}
     return {**kept, "AMENT_PREFIX_PATH": str(PREFIX)}
 
@@ -313,21 +289,6 @@ def _remove_installed(package: str) -> None:
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
-
-
-def _installed(folder: Path) -> list[str]:
-    lines = [
-        line
-        for package in PACKAGES
-        for line in (folder / package / "install_manifest.txt").read_text().splitlines()
-    ]
-    return sorted(str(Path(line).relative_to(PREFIX)) for line in lines)
-
-
-def _record(digest: str, files: list[str]) -> None:
-    draft = RECORD.with_suffix(".new")
-    draft.write_text(json.dumps({"digest": digest, "files": files}, indent=1), encoding="utf-8")
-    draft.replace(RECORD)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.demand.application import Application, InputTopic
-from demandops.demand.demand_request import Demanded, Join, Place
+from demandops.demand.demand_request import Demanded, Join, place_in
 from demandops.errors import Refused
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
@@ -279,7 +279,7 @@ class TestParameters:
             {"point_cloud": (InputTopic(*CLOUD),)},
             MappingProxyType(parameters),
         )
-        request = Join(who, (Demanded(app, (who,), Place("applications[0]")),))
+        request = Join(who, (Demanded(app, (who,), place_in("applications[0]")),))
         return apply(ledger, request, NOW + timedelta(minutes=minute))[0]
 
     @staticmethod

@@ -132,6 +132,6 @@ def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, fur
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
     tree = trees.write(repo, None, files)
     who = commit_message.generator_signature(now)
-    text = "A fleet\n\nOperation: init\nRender-Version: 1\n"
+    text = "A fleet\n\nOperation: init\nRender-Version: 2\n"
     repo.create_commit("refs/heads/main", who, who, text, tree, [])
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)

@@ -491,7 +491,7 @@ class TestRollback:
 class TestVerifyByDifferences:
     """A row of commits, proven from one to the next."""
 
-    FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 1\n"
+    FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 2\n"
 
     def verdicts(self, demandops: Run, state: Any, *more: str) -> dict[str, Any]:
         ran = demandops("verify", "main~4..main", *more, "--state-repo", state.path,

@@ -582,7 +582,7 @@ class TestVerify:
     def test_what_was_tampered_with_does_not_hold(self, demandops: Run, joined: Any) -> None:
         (path,) = (path for path in joined.manifests() if "/od-" in path)
         changed = {path: joined.files()[path] + "# changed\n"}
-        joined.commit(changed, "Forged\n\nOperation: join\nRender-Version: 1\n")
+        joined.commit(changed, "Forged\n\nOperation: join\nRender-Version: 2\n")
         ran = demandops("verify", "--state-repo", joined.path)
         assert ran.code == 1
         assert ran.out.splitlines() == [
@@ -709,7 +709,7 @@ class TestStateRepo:
             )
 
     def test_a_newer_generators_state_repo_is_refused(self, demandops: Run, state: Any) -> None:
-        root = state.files()["demandops.yaml"].replace("renderVersion: 1", "renderVersion: 99")
+        root = state.files()["demandops.yaml"].replace("renderVersion: 2", "renderVersion: 99")
         state.commit({"demandops.yaml": root}, "Newer\n\nRender-Version: 99\n")
         before = state.tip
         ran = demandops("request", "-", "--state-repo", state.path, stdin=text(perception()))

@@ -9,16 +9,14 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 from demandops.errors import InvalidInput
-from demandops.service import http_server
-from demandops.service.http_server import HttpServer
-from demandops.service.push_webhook import PushWebhook, read_secret
+from demandops.service import push_webhook
+from demandops.service.push_webhook import PushWebhook
 
 SECRET = b"s3cret-of-the-hook"
 BODY = b'{"ref": "refs/heads/main"}'
@@ -34,31 +32,27 @@ class Heard:
         self.times += 1
 
 
-def listen(address: str, secret: bytes, heard: Callable[[], None]) -> HttpServer:
-    return HttpServer(address, [PushWebhook(secret, heard).route], local_only=not secret)
-
-
 @pytest.fixture
 def heard() -> Heard:
     return Heard()
 
 
 @pytest.fixture
-def signed(heard: Heard) -> Iterator[HttpServer]:
-    hook = listen("127.0.0.1:0", SECRET, heard)
+def signed(heard: Heard) -> Iterator[PushWebhook]:
+    hook = PushWebhook("127.0.0.1:0", SECRET, heard)
     yield hook
     hook.close()
 
 
 @pytest.fixture
-def unsigned(heard: Heard) -> Iterator[HttpServer]:
-    hook = listen("127.0.0.1:0", b"", heard)
+def unsigned(heard: Heard) -> Iterator[PushWebhook]:
+    hook = PushWebhook("127.0.0.1:0", b"", heard)
     yield hook
     hook.close()
 
 
 def send(
-    hook: HttpServer,
+    hook: PushWebhook,
     headers: dict[str, str] | None = None,
     *,
     method: str = "POST",
@@ -99,14 +93,14 @@ FORGED = {
 
 
 @pytest.mark.parametrize("server", GENUINE)
-def test_who_knows_the_secret_is_heard(signed: HttpServer, heard: Heard, server: str) -> None:
+def test_who_knows_the_secret_is_heard(signed: PushWebhook, heard: Heard, server: str) -> None:
     assert send(signed, GENUINE[server]) == (202, "fetching")
     assert heard.times == 1
 
 
 @pytest.mark.parametrize("case", FORGED)
 def test_who_does_not_is_refused_and_the_log_holds_nothing_of_it(
-    signed: HttpServer, heard: Heard, case: str, caplog: pytest.LogCaptureFixture
+    signed: PushWebhook, heard: Heard, case: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
     for _ in range(3):
@@ -119,14 +113,14 @@ def test_who_does_not_is_refused_and_the_log_holds_nothing_of_it(
 
 
 def test_without_a_secret_whoever_is_on_this_machine_is_heard(
-    unsigned: HttpServer, heard: Heard
+    unsigned: PushWebhook, heard: Heard
 ) -> None:
     assert send(unsigned) == (202, "fetching")
     assert send(unsigned, body=None, headers={"Content-Length": "0"})[0] == 202
     assert heard.times == 2
 
 
-def test_what_else_is_asked_is_answered_and_does_nothing(signed: HttpServer, heard: Heard) -> None:
+def test_what_else_is_asked_is_answered_and_does_nothing(signed: PushWebhook, heard: Heard) -> None:
     github = GENUINE["github"]
     assert send(signed, method="GET", path="/", body=None) == (200, "ok")
     assert send(signed, method="HEAD", path="/", body=None) == (200, "")
@@ -144,7 +138,7 @@ def test_what_else_is_asked_is_answered_and_does_nothing(signed: HttpServer, hea
     [("26214401", 413), ("9" * 400, 400), ("-1", 400), ("many", 400), ("\u00b2", 400)],
 )
 def test_a_body_without_bounds_is_not_read(
-    signed: HttpServer, heard: Heard, length: str, status: int
+    signed: PushWebhook, heard: Heard, length: str, status: int
 ) -> None:
     head = "POST /push HTTP/1.1\r\nHost: x\r\n"
     with _connected(signed) as raw:
@@ -153,7 +147,9 @@ def test_a_body_without_bounds_is_not_read(
     assert heard.times == 0
 
 
-def test_a_body_of_unknown_length_is_read_up_to_the_bound(signed: HttpServer, heard: Heard) -> None:
+def test_a_body_of_unknown_length_is_read_up_to_the_bound(
+    signed: PushWebhook, heard: Heard
+) -> None:
     head = "POST /push HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n"
     size = f"{len(BODY):x}\r\n".encode()
     with _connected(signed) as raw:
@@ -168,7 +164,7 @@ def test_a_body_of_unknown_length_is_read_up_to_the_bound(signed: HttpServer, he
     assert heard.times == 1
 
 
-def test_every_answer_ends_its_connection(signed: HttpServer) -> None:
+def test_every_answer_ends_its_connection(signed: PushWebhook) -> None:
     with _connected(signed) as raw:
         raw.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 3)
         answer = b""
@@ -179,9 +175,9 @@ def test_every_answer_ends_its_connection(signed: HttpServer) -> None:
 
 
 def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
-    signed: HttpServer, heard: Heard, monkeypatch: pytest.MonkeyPatch
+    signed: PushWebhook, heard: Heard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(http_server, "_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(push_webhook, "_TIMEOUT_S", 0.3)
     slow = [_connected(signed) for _ in range(40)]
     for number, raw in enumerate(slow):
         with suppress(ConnectionError):  # there are too many
@@ -193,7 +189,7 @@ def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
     assert heard.times == 1
 
 
-def test_there_are_only_so_many_connections(signed: HttpServer) -> None:
+def test_there_are_only_so_many_connections(signed: PushWebhook) -> None:
     held = [_connected(signed) for _ in range(16)]
     with _connected(signed) as one_more:
         assert _is_cut_off(one_more)
@@ -202,7 +198,7 @@ def test_there_are_only_so_many_connections(signed: HttpServer) -> None:
 
 
 def test_a_close_waits_for_no_slow_sender(heard: Heard) -> None:
-    hook = listen("127.0.0.1:0", SECRET, heard)
+    hook = PushWebhook("127.0.0.1:0", SECRET, heard)
     with _connected(hook) as raw:
         raw.sendall(b"POST /push HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\nx")
         began = time.monotonic()
@@ -212,7 +208,7 @@ def test_a_close_waits_for_no_slow_sender(heard: Heard) -> None:
         _connected(hook)
 
 
-def test_many_at_once_are_all_answered(unsigned: HttpServer, heard: Heard) -> None:
+def test_many_at_once_are_all_answered(unsigned: PushWebhook, heard: Heard) -> None:
     answers: list[int] = []
     threads = [threading.Thread(target=lambda: answers.append(send(unsigned)[0])) for _ in range(8)]
     for thread in threads:
@@ -229,7 +225,7 @@ def _is_cut_off(raw: socket.socket) -> bool:
         return True
 
 
-def _connected(hook: HttpServer) -> socket.socket:
+def _connected(hook: PushWebhook) -> socket.socket:
     parts = urlsplit(hook.url)
     return socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=10)
 
@@ -254,27 +250,16 @@ def _connected(hook: HttpServer) -> socket.socket:
 )  # fmt: skip
 def test_an_address_that_will_not_do_is_told(address: str, message: str) -> None:
     with pytest.raises(InvalidInput) as error:
-        listen(address, b"", lambda: None)
+        PushWebhook(address, b"", lambda: None)
     assert str(error.value) == f"--webhook: {message}"
 
 
-def test_a_port_in_use_is_told(unsigned: HttpServer) -> None:
+def test_a_port_in_use_is_told(unsigned: PushWebhook) -> None:
     taken = urlsplit(unsigned.url).netloc
     with pytest.raises(InvalidInput, match=f"'{taken}' cannot be listened on: Address already"):
-        listen(taken, b"", lambda: None)
+        PushWebhook(taken, b"", lambda: None)
 
 
 def test_with_a_secret_others_may_be_listened_to(heard: Heard) -> None:
-    hook = listen("0.0.0.0:0", SECRET, heard)
+    hook = PushWebhook("0.0.0.0:0", SECRET, heard)
     hook.close()
-
-
-def test_the_secret_comes_from_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "secret"
-    path.write_bytes(SECRET + b"\n")
-    assert read_secret(path) == SECRET
-    path.write_bytes(b" \n")
-    with pytest.raises(InvalidInput, match="is empty; put there the secret"):
-        read_secret(path)
-    with pytest.raises(InvalidInput, match="cannot be read: No such file"):
-        read_secret(tmp_path / "none")

@@ -323,7 +323,7 @@ class TestVerify:
     ) -> None:
         state.commit({SIGNERS: listed(key)})
         since = state.tip
-        forged = "Forged\n\nOperation: join\nRender-Version: 1\n"
+        forged = "Forged\n\nOperation: join\nRender-Version: 2\n"
         state.commit({SIGNERS: listed(keygen(tmp_path / "forger"))}, forged)
         (row,) = self.rows(demandops, state, since, 1)
         assert row["touched"] == [SIGNERS]

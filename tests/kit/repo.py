@@ -288,3 +288,18 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
     assert sorted(ids) == sorted(set(ids))
     before = made[-verify_last - 1].id if 0 < verify_last < len(made) else None
     assert differing(repo, before) == {}
+
+
+FIRST_VERSION = Path(__file__).parents[1] / "fixtures" / "first-version.bundle"
+"""A state repo that the first version wrote: render version 1, ledger ``demandops.ledger/v1``.
+
+Three joins of the experiment (tag ``three-joins``), then two overrides, of which one ended, a join
+by another request, a demand with a lease, and a shutdown.
+"""
+
+
+def first_version(path: Path, revision: str = "main") -> GitRepo:
+    """Return a bare copy of the first version's state repo, with ``main`` at a revision."""
+    git(path.parent, "clone", "--quiet", "--bare", str(FIRST_VERSION), str(path))
+    git(path, "update-ref", "refs/heads/main", f"{revision}^{{commit}}")
+    return GitRepo(path)

@@ -21,7 +21,7 @@ from demandops.demand.demand_request import Expire
 from demandops.errors import Fault, Refused
 from demandops.ledger import claim_file, recent_shutdowns
 from demandops.ledger.ledger import Ledger
-from demandops.service.timing.lease_expiry import LeaseClock
+from demandops.service.timing.expiry import LeaseExpiry
 from demandops.service.timing.rate_limit import RateLimit
 from pydantic import Field, model_validator
 
@@ -183,7 +183,7 @@ class World(MemoryRepo):
 
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
-        self._lease_clock = LeaseClock(self.clock)
+        self._lease_clock = LeaseExpiry(self.clock)
         self._throttle = RateLimit()
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:

@@ -16,7 +16,7 @@ from demandops.demand.claim import Claim
 from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
 from demandops.ledger import claim_file
 from demandops.plan.release import Release
-from demandops.plan.views.bookkeeping_diff import EntryChange
+from demandops.plan.views.bookkeeping import EntryChange
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry

@@ -13,8 +13,8 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, parse_file
-from demandops.errors import Fault, InvalidInput, fault
-from demandops.input_file import read_input
+from demandops.errors import InvalidInput, fault
+from demandops.input_file import read_input, read_secret
 
 
 class NoAccess(ValueError):
@@ -46,32 +46,26 @@ class ClusterAccess(FrozenModel):
         return self
 
     def secret(self) -> bytes | None:
-        """Return the secret of the webhook without a final line break.
+        """Return the secret of the webhook.
 
         Each call reads the file again, so that the secret can be replaced.
 
         Raises:
-            OSError: if the file cannot be read.
-            NoAccess: if the file is empty or readable by other users.
+            InvalidInput: if the file is empty, cannot be read, or can be read by other users.
         """
-        if self.secret_file is None:
-            return None
-        if self.secret_file.stat().st_mode & 0o007:
-            raise NoAccess("may be read by everybody on this machine; run chmod o= on it")
-        text = self.secret_file.read_bytes().removesuffix(b"\n").removesuffix(b"\r")
-        if not text:
-            raise NoAccess("is empty")
-        return text
+        return read_secret(self.secret_file, private=True) if self.secret_file else None
 
-    def client(self) -> Any:  # noqa: ANN401 - the library has no types
-        """Return a client of the cluster's API.
+    def api(self) -> Any:  # noqa: ANN401 - the library has no types
+        """Return the cluster's API for objects of any kind.
 
         Raises:
             ConfigException, OSError: by the library, if the kubeconfig cannot be used.
         """
-        from kubernetes import config  # noqa: PLC0415 - half a second; only when used
+        from kubernetes import client, config  # noqa: PLC0415 - half a second; only when used
 
-        return config.new_client_from_config(str(self.kubeconfig), self.context)
+        return client.CustomObjectsApi(
+            config.new_client_from_config(str(self.kubeconfig), self.context)
+        )
 
 
 class AccessFile(FileModel):
@@ -89,23 +83,14 @@ def read(path: Path) -> AccessFile:
     """
     name, text = read_input(path)
     content = parse_file(AccessFile, text, name)
-    faults = [
-        problem.within(name)
-        for cluster, access in content.clusters.items()
-        for problem in _secret_faults(cluster, access)
-    ]
+    faults = []
+    for cluster, access in content.clusters.items():
+        try:
+            access.secret()
+        except InvalidInput as error:
+            (problem,) = error.faults
+            field = f"clusters.{cluster}.secret_file"
+            faults.append(fault(field, f"{problem.file} {problem.message}").within(name))
     if faults:
         raise InvalidInput(faults)
     return content
-
-
-def _secret_faults(cluster: str, access: ClusterAccess) -> list[Fault]:
-    field = f"clusters.{cluster}.secret_file"
-    try:
-        access.secret()
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        return [fault(field, f"{access.secret_file} cannot be read: {reason}")]
-    except NoAccess as error:
-        return [fault(field, f"{access.secret_file} {error}")]
-    return []

@@ -11,7 +11,6 @@ import hmac
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from urllib.parse import quote, urlsplit
 
 from demandops import http_call
@@ -19,35 +18,36 @@ from demandops.cluster.access import NoAccess
 from demandops.http_call import NoAnswer
 from demandops.settings import MAIN_BRANCH
 
+_TIMEOUT_S = 5.0
 _SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")
 _NO_COMMIT = "0" * 40
 
 
-@dataclass(frozen=True, slots=True)
-class WebhookCall:
-    """A request to a webhook; ``signature_header`` names the header for the body's signature."""
+def call_flux(url: str, secret: bytes | None) -> None:
+    """Call a Receiver of Flux, which ignores the body.
 
-    body: bytes
-    signature_header: str
-    headers: dict[str, str] = field(default_factory=dict)
-
-
-def flux_call() -> WebhookCall:
-    """Return the call for a Receiver of Flux, which ignores the body."""
-    return WebhookCall(b"{}", "X-Signature")
+    Raises:
+        NoAnswer: if the controller does not answer, rejects the call or redirects it.
+    """
+    _send(url, b"{}", secret, "X-Signature", {})
 
 
-def argocd_call(repo: str, before: str, after: str, paths: Iterable[str] | None) -> WebhookCall:
-    """Return the call for Argo CD: it reports that a repository's main branch moved.
+def call_argocd(
+    url: str, secret: bytes | None, repo: str, before: str, after: str, paths: Iterable[str] | None
+) -> None:
+    """Report to Argo CD that a repository's main branch moved.
 
     Args:
+        url: the webhook of Argo CD.
+        secret: the key that signs the call, if any.
         repo: the URL from which Argo CD fetches the state repo.
         before: the commit of the last call; empty if there was none.
         after: the commit that was pushed.
         paths: the changed files; with ``None``, Argo CD refreshes all Applications of the repo.
 
     Raises:
-        NoAccess: if the URL names no host, by which Argo CD identifies the repo.
+        NoAccess: if the repo's URL names no host, by which Argo CD identifies the repo.
+        NoAnswer: if the controller does not answer, rejects the call or redirects it.
     """
     event = {
         "ref": f"refs/heads/{MAIN_BRANCH}",
@@ -56,9 +56,8 @@ def argocd_call(repo: str, before: str, after: str, paths: Iterable[str] | None)
         "repository": {"html_url": web_address(repo), "default_branch": MAIN_BRANCH},
         "commits": [] if paths is None else [{"id": after, "modified": sorted(paths)}],
     }
-    return WebhookCall(
-        json.dumps(event).encode(), "X-Hub-Signature-256", {"X-GitHub-Event": "push"}
-    )
+    body = json.dumps(event).encode()
+    _send(url, body, secret, "X-Hub-Signature-256", {"X-GitHub-Event": "push"})
 
 
 def web_address(repo: str) -> str:
@@ -85,15 +84,12 @@ def signature(secret: bytes, body: bytes) -> str:
     return f"sha256={hmac.new(secret, body, hashlib.sha256).hexdigest()}"
 
 
-def send(url: str, call: WebhookCall, secret: bytes | None, timeout: float) -> None:
-    """Send a call.
-
-    Raises:
-        NoAnswer: if the controller does not answer, rejects the call or redirects it.
-    """
-    headers = {"Content-Type": "application/json", **call.headers}
+def _send(
+    url: str, body: bytes, secret: bytes | None, signature_header: str, headers: dict[str, str]
+) -> None:
+    headers["Content-Type"] = "application/json"
     if secret is not None:
-        headers[call.signature_header] = signature(secret, call.body)
-    answer = http_call.call("POST", url, headers, call.body, timeout)
+        headers[signature_header] = signature(secret, body)
+    answer = http_call.call("POST", url, headers, body, _TIMEOUT_S)
     if not answer.is_success:
         raise NoAnswer(f"it answered {answer.status}")

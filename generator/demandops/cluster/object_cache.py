@@ -8,7 +8,8 @@ from functools import partial
 from typing import Any
 
 from demandops.cluster.access import ClusterAccess
-from demandops.cluster.health import Key, ObjectSelector
+from demandops.cluster.health import health_reader
+from demandops.cluster.health.release_health import ClusterDomain, Health, Key, ObjectSelector
 from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
@@ -35,7 +36,7 @@ class ObjectCache:
         on_change: Callable[[], None],
         runtime: Runtime = REAL,
     ) -> None:
-        self.name, self._runtime = name, runtime
+        self._name, self._runtime = name, runtime
         self._access = access
         self._on_change = on_change
         self._lock = runtime.lock()
@@ -46,12 +47,6 @@ class ObjectCache:
         self._closed = runtime.event()
         self._client: Any = None
 
-    @property
-    def read_error(self) -> str:
-        """Why some objects cannot be read at present; empty if all can."""
-        with self._lock:
-            return next((self._errors[selector] for selector in sorted(self._errors)), "")
-
     def watch(self, wanted: Iterable[ObjectSelector]) -> None:
         """Watch these objects too."""
         for selector in wanted:
@@ -59,7 +54,7 @@ class ObjectCache:
                 if selector in self._watched or self._closed.is_set():
                     continue
                 self._watched.add(selector)
-            name = f"watch-{self.name}-{selector.kind}"
+            name = f"watch-{self._name}-{selector.kind}"
             self._runtime.start_thread(name, partial(self._keep_watching, selector))
 
     def objects(self) -> dict[Key, dict[str, Any]]:
@@ -77,12 +72,19 @@ class ObjectCache:
                     return "it has not been read yet"
         return ""
 
+    def unread(self, domain: ClusterDomain) -> Health | None:
+        """Return that a domain's objects are unknown now, and why; None if they are known."""
+        reason = self.why_unknown(health_reader(domain).objects_to_watch(domain))
+        if not reason:
+            return None
+        return Health("waiting", f"cannot be read: {reason}", f"cluster {self._name}")
+
     def read_once(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read these objects once, without a watch; set ``read_error`` if that fails."""
+        """Read these objects once, without a watch; :meth:`why_unknown` says what failed."""
         selectors = list(wanted)
         for selector in selectors:
             try:
-                self._replace(selector, self._list(selector)["items"])
+                self.refresh([selector])
             except Exception as error:
                 if not _is_answer(error):  # the cluster is away, so do not wait for the others
                     self._errors |= dict.fromkeys(selectors, _reason(selector, error))
@@ -96,7 +98,7 @@ class ObjectCache:
             Exception: by the library, if the cluster does not answer.
         """
         for selector in wanted:
-            self._replace(selector, self._list(selector)["items"])
+            self._read(selector)
 
     def why_unavailable(self, namespace: str, deployment: str) -> str:
         """Return why a Deployment's pods do not run; empty if that is not known.
@@ -132,65 +134,49 @@ class ObjectCache:
         pause = _FIRST_PAUSE_S
         while not self._closed.is_set():
             try:
-                self._list_and_watch(selector)
+                self._read_and_watch(selector)
                 pause = _FIRST_PAUSE_S
             except Exception as error:  # the library raises errors of many kinds
                 self._set_error(selector, _reason(selector, error))
                 self._closed.wait(pause)
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
 
-    def _list_and_watch(self, selector: ObjectSelector) -> None:
+    def _read_and_watch(self, selector: ObjectSelector) -> None:
         from kubernetes import watch  # noqa: PLC0415 - half a second; only when used
 
-        listed = self._list(selector)
-        self._replace(selector, listed["items"])
+        version = self._read(selector)
         self._set_error(selector, "")
-        group, version, plural = _KINDS[selector.kind]
-        watcher = watch.Watch()
-        for event in watcher.stream(
+        for event in watch.Watch().stream(
             self._api().list_namespaced_custom_object,
-            group,
-            version,
-            selector.namespace,
-            plural,
-            resource_version=listed["metadata"]["resourceVersion"],
+            **_request(selector),
+            resource_version=version,
             timeout_seconds=_WATCH_S,
             _request_timeout=(_CONNECT_S, _WATCH_S + 30),
-            **_name_filter(selector),
         ):
             if self._closed.is_set():
                 return
             self._apply(selector, event)
 
     def _api(self) -> Any:  # noqa: ANN401 - the library has no types
-        from kubernetes import client  # noqa: PLC0415 - half a second; only when used
-
         with self._lock:
             if self._client is None:
-                self._client = client.CustomObjectsApi(self._access.client())
+                self._client = self._access.api()
             return self._client
 
-    def _list(self, selector: ObjectSelector) -> Any:  # noqa: ANN401
-        group, version, plural = _KINDS[selector.kind]
-        return self._api().list_namespaced_custom_object(
-            group,
-            version,
-            selector.namespace,
-            plural,
-            _request_timeout=(_CONNECT_S, _WATCH_S),
-            **_name_filter(selector),
+    def _read(self, selector: ObjectSelector) -> str:
+        """Replace the selected objects by those of the cluster; return the list's version."""
+        listed = self._api().list_namespaced_custom_object(
+            **_request(selector), _request_timeout=(_CONNECT_S, _WATCH_S)
         )
-
-    def _replace(self, selector: ObjectSelector, items: Iterable[dict[str, Any]]) -> None:
-        """Replace the selected objects by ``items``."""
         kind, namespace, name = selector
         with self._lock:
             for key in list(self._objects):
                 if key[:2] == (kind, namespace) and name in ("", key[2]):
                     del self._objects[key]
-            for item in items:
+            for item in listed["items"]:
                 self._objects[kind, namespace, item["metadata"]["name"]] = item
             self._known.add(selector)
+        return str(listed["metadata"]["resourceVersion"])
 
     def _apply(self, selector: ObjectSelector, event: dict[str, Any]) -> None:
         item = event["object"]
@@ -215,13 +201,18 @@ class ObjectCache:
             else:
                 self._errors.pop(selector, None)
         if is_new:
-            log.warning("cluster '%s' cannot be read (%s); retrying", self.name, reason)
+            log.warning("cluster '%s' cannot be read (%s); retrying", self._name, reason)
         self._on_change()
 
 
-def _name_filter(selector: ObjectSelector) -> dict[str, str]:
-    """Return the arguments that limit a request to one object, which needs fewer rights."""
-    return {"field_selector": f"metadata.name={selector.name}"} if selector.name else {}
+def _request(selector: ObjectSelector) -> dict[str, str]:
+    """Return the arguments that select objects; one object alone needs fewer rights."""
+    names = ("group", "version", "plural")
+    request = {
+        **dict(zip(names, _KINDS[selector.kind], strict=True)),
+        "namespace": selector.namespace,
+    }
+    return request | ({"field_selector": f"metadata.name={selector.name}"} if selector.name else {})
 
 
 def _is_answer(error: Exception) -> bool:

@@ -15,6 +15,7 @@ from demandops.cluster.access import ClusterAccess, NoAccess
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
 from demandops.config.repo_settings import RepoSettings
+from demandops.errors import InvalidInput
 from demandops.http_call import NoAnswer
 from demandops.render.gitops.argocd import project_of
 from demandops.render.gitops.paths import domain_folder, domains_in_use
@@ -50,9 +51,7 @@ class ReconcileTrigger:
         self._config: Config | None = None
         self._apis: dict[str, Any] = {}
         self._due = runtime.event()
-        self._stopping = False
         self._stop = runtime.event()
-        self._woken_at = -_SPACING_S
         self._thread = runtime.start_thread("wake", self._run)
 
     def __call__(self, config: Config) -> None:
@@ -62,7 +61,6 @@ class ReconcileTrigger:
 
     def close(self) -> None:
         """Wake the clusters for the last push, if that is still due, and stop."""
-        self._stopping = True
         self._stop.set()
         self._due.set()  # lets the thread run once more
         self._thread.join(2 * _TIMEOUT_S)
@@ -70,13 +68,13 @@ class ReconcileTrigger:
     def _run(self) -> None:
         missed: set[str] = set()
         pause: float | None = None
+        woken_at = -_SPACING_S
         while True:
             fresh = self._due.wait(pause)
             self._due.clear()
-            if not self._stopping:
-                self._stop.wait(self._seconds_until_next())
-            self._woken_at = self._runtime.monotonic()
-            stopping = self._stopping
+            # pushes come in bursts
+            self._stop.wait(max(0.0, woken_at + _SPACING_S - self._runtime.monotonic()))
+            woken_at, stopping = self._runtime.monotonic(), self._stop.is_set()
             if fresh:
                 missed, pause = set(self._clusters), _FIRST_RETRY_S
             elif pause is not None:
@@ -107,61 +105,40 @@ class ReconcileTrigger:
                     )
         return missed
 
-    def _seconds_until_next(self) -> float:
-        """Return how long to wait before the next wake, because pushes come in bursts."""
-        return max(0.0, self._woken_at + _SPACING_S - self._runtime.monotonic())
-
     def _wake(self, name: str, access: ClusterAccess, config: Config) -> None:
         argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
         if argocd and access.webhook:
-            self._call_argocd(name, access.webhook, access, config, argocd.url)
-        elif access.receiver and not argocd:
-            controller_webhook.send(
-                access.receiver, controller_webhook.flux_call(), access.secret(), _TIMEOUT_S
+            before = self._reported.get(name, "")
+            commit, paths = self._changes_since(before)
+            if paths is not None:
+                # always a file of each domain's folder: an Application that is not refreshed
+                # never reports the new commit
+                paths = [path for path in paths if _concerns(path, name)]
+                folders = [domain_folder(name, domain) for domain in _domains(name, config)]
+                paths += [f"{folder}/_domain.yaml" for folder in folders]
+            controller_webhook.call_argocd(
+                access.webhook, access.secret(), argocd.url, before, commit, paths
             )
+            self._reported[name] = commit
+        elif access.receiver and not argocd:
+            controller_webhook.call_flux(access.receiver, access.secret())
         elif access.kubeconfig:
-            self._annotate_sources(name, access, config)
+            if name not in self._apis:
+                self._apis[name] = access.api()
+            now = self._runtime.now().isoformat()
+            for domain in _domains(name, config):
+                self._apis[name].patch_namespaced_custom_object(
+                    **_refresh_patch(domain, config.repo_settings, now), _request_timeout=_TIMEOUT_S
+                )
         else:
             missing = "webhook" if argocd else "receiver"
             raise NoAccess(f"it has neither a kubeconfig nor a {missing}")
 
-    def _call_argocd(
-        self, name: str, url: str, access: ClusterAccess, config: Config, repo: str
-    ) -> None:
-        """Call Argo CD's webhook.
-
-        Argo CD refreshes the Applications whose folders changed. The call always lists a file of
-        each domain's folder: an Application that is not refreshed never reports the new commit.
-        """
-        before = self._reported.get(name, "")
-        commit, paths = self._changes_since(before)
-        if paths is not None:
-            paths = [path for path in paths if _concerns(path, name)]
-            paths += [
-                f"{domain_folder(name, domain)}/_domain.yaml" for domain in _domains(name, config)
-            ]
-        call = controller_webhook.argocd_call(repo, before, commit, paths)
-        controller_webhook.send(url, call, access.secret(), _TIMEOUT_S)
-        self._reported[name] = commit
-
-    def _annotate_sources(self, name: str, access: ClusterAccess, config: Config) -> None:
-        now = self._runtime.now().isoformat()
-        for domain in _domains(name, config):
-            self._api(name, access).patch_namespaced_custom_object(
-                *_refresh_patch(domain, config.repo_settings, now), _request_timeout=_TIMEOUT_S
-            )
-
-    def _api(self, name: str, access: ClusterAccess) -> Any:  # noqa: ANN401
-        if name not in self._apis:
-            from kubernetes import client  # noqa: PLC0415 - half a second; only when used
-
-            self._apis[name] = client.CustomObjectsApi(access.client())
-        return self._apis[name]
-
 
 def _reason(error: Exception) -> str:
     """Return why a cluster was not woken, without URLs or other secrets."""
-    return str(error) if isinstance(error, NoAccess | NoAnswer) else type(error).__name__
+    told = isinstance(error, NoAccess | NoAnswer | InvalidInput)
+    return str(error) if told else type(error).__name__
 
 
 def _domains(cluster: str, config: Config) -> list[AccessDomain]:
@@ -177,16 +154,21 @@ def _concerns(path: str, cluster: str) -> bool:
     return rest.startswith(f"{cluster}/") if first == "clusters" else first != "ledger"
 
 
-def _refresh_patch(
-    domain: AccessDomain, repository: RepoSettings, now: str
-) -> tuple[str, str, str, str, str, dict[str, Any]]:
+def _refresh_patch(domain: AccessDomain, repository: RepoSettings, now: str) -> dict[str, Any]:
     """Return the object of a domain that fetches from Git, and the patch that makes it fetch."""
     if repository.gitops == "argocd" and repository.argocd:
-        kind = ("argoproj.io", "v1alpha1", repository.argocd.namespace, "applications")
-        return *kind, project_of(domain, repository), _annotation(_REFRESH, "normal")
-    kind = ("source.toolkit.fluxcd.io", "v1", domain.namespace, "gitrepositories")
-    return *kind, repository.source, _annotation(_REQUESTED_AT, now)
-
-
-def _annotation(name: str, value: str) -> dict[str, Any]:
-    return {"metadata": {"annotations": {name: value}}}
+        group, version, plural = "argoproj.io", "v1alpha1", "applications"
+        namespace, name = repository.argocd.namespace, project_of(domain, repository)
+        annotation = {_REFRESH: "normal"}
+    else:
+        group, version, plural = "source.toolkit.fluxcd.io", "v1", "gitrepositories"
+        namespace, name = domain.namespace, repository.source
+        annotation = {_REQUESTED_AT: now}
+    return {
+        "group": group,
+        "version": version,
+        "namespace": namespace,
+        "plural": plural,
+        "name": name,
+        "body": {"metadata": {"annotations": annotation}},
+    }

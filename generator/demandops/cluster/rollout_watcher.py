@@ -14,14 +14,14 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from demandops.cluster.access import ClusterAccess
-from demandops.cluster.health import (
+from demandops.cluster.health import health_reader
+from demandops.cluster.health.release_health import (
     ClusterDomain,
     Health,
     History,
     Level,
     Objects,
     Target,
-    health_reader,
     worst,
 )
 from demandops.cluster.object_cache import ObjectCache
@@ -183,9 +183,9 @@ class RolloutWatcher:
         if kind == "Deployment":
             namespace, _, deployment = name.partition("/")
             with suppress(Exception):
-                for target in rollout.targets:
-                    if target.domain.namespace == namespace:
-                        cache = self._caches[target.domain.cluster]
+                for domain in rollout.domains:
+                    if domain.namespace == namespace:
+                        cache = self._caches[domain.cluster]
                         reason = cache.why_unavailable(namespace, deployment)
                         if reason:
                             health = replace(health, reason=f"{health.reason}; {reason}")
@@ -200,31 +200,17 @@ class RolloutWatcher:
         rollout.future.set_result(health)
 
     def _health(self, rollout: _Rollout, objects: Mapping[str, Objects]) -> Health:
-        commit = rollout.commit
-        health = worst([self._domain_health(domain, commit, objects) for domain in rollout.domains])
-        if health.state == "waiting" or not rollout.domains:
-            return health
-        return worst([self._release_health(target, commit, objects) for target in rollout.targets])
+        def of(target: Target) -> Health:
+            cluster = target.domain.cluster
+            return self._caches[cluster].unread(target.domain) or health_reader(
+                target.domain
+            ).health(target, rollout.commit, objects[cluster], self._history)
 
-    def _domain_health(
-        self, domain: ClusterDomain, commit: str, objects: Mapping[str, Objects]
-    ) -> Health:
-        reader = health_reader(domain)
-        reason = self._caches[domain.cluster].why_unknown(reader.objects_to_watch(domain))
-        if reason:
-            return Health("waiting", f"cannot be read: {reason}", f"cluster {domain.cluster}")
-        return reader.domain_health(domain, commit, objects[domain.cluster], self._history)
-
-    def _release_health(
-        self, target: Target, commit: str, objects: Mapping[str, Objects]
-    ) -> Health:
-        reader = health_reader(target.domain)
-        return reader.release_health(target, commit, objects[target.domain.cluster], self._history)
+        return worst([of(target) for target in rollout.targets])
 
     @staticmethod
     def _report(rollout: _Rollout, health: Health) -> None:
-        reached = [level for level in ("reconciled", "healthy") if health.reaches(level)]
-        states = [(level, level) for level in reached]
+        states = [(level, level) for level in ("reconciled", "healthy") if health.reaches(level)]
         if health.failing:
             states.append(("failing", f"{health.object}: {health.reason}"))
         for state, text in states:

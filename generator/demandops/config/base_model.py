@@ -109,10 +109,15 @@ def field_path(location: tuple[int | str, ...]) -> str:
     return path if path.isprintable() else path.encode("unicode_escape").decode()
 
 
-def faults_of(error: ValidationError, model: type[BaseModel], file: str = "") -> list[Fault]:
-    """Return every fault of a failed validation."""
+def faults_of(
+    error: ValidationError,
+    model: type[BaseModel],
+    file: str = "",
+    place: tuple[int | str, ...] = (),
+) -> list[Fault]:
+    """Return every fault of a failed validation of the value at ``place`` in a file."""
     return [
-        fault(field_path(item["loc"]), _message(dict(item), model)).within(file)
+        fault(field_path((*place, *item["loc"])), _message(dict(item), model)).within(file)
         for item in error.errors(include_url=False)
     ]
 
@@ -179,5 +184,5 @@ def parse_file(model: type[Model], text: str, file: str) -> Model:
     data = strict_yaml.load(text, file)
     if not isinstance(data, dict):
         message = f"must be a mapping that starts with apiVersion: {API_VERSION}"
-        raise InvalidInput([fault("", message).within(file)])
+        raise InvalidInput.at("", message, file=file)
     return parse(model, data, file)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from demandops.config.appdef import ApplicationDefinition, Service
 from demandops.config.inventory import Broker, Cluster, Node
@@ -12,7 +12,7 @@ from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import Chart, Image
 from demandops.config.repo_settings import RepoSettings
-from demandops.errors import Refused, fault
+from demandops.errors import Refused
 
 CLUSTERS_FILE = "inventory/clusters.yaml"
 NODES_FILE = "inventory/nodes.yaml"
@@ -45,10 +45,6 @@ class Config:
     files: Mapping[str, str]
     overrides: Mapping[str, Override] = field(default_factory=dict)
 
-    def without_overrides(self) -> Config:
-        """Return the configuration without any override."""
-        return replace(self, overrides={})
-
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
         """Return a node and its access domain.
 
@@ -63,7 +59,7 @@ class Config:
                 f"demandops decommission {shlex.quote(id)}"
             )
             file = NODES_FILE if node is None else DOMAINS_FILE
-            raise Refused([fault("node", message, code="unknown-node").within(file)])
+            raise Refused.at("node", message, code="unknown-node", file=file)
         return node, domain
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:

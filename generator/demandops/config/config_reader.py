@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from demandops import strict_yaml
-from demandops.config.base_model import DnsLabel, faults_of, parse, parse_file
+from demandops.config.base_model import DnsLabel, faults_of, field_path, parse, parse_file
 from demandops.errors import Fault, InvalidInput, fault, suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
-Raw = TypeVar("Raw", list[Any], dict[str, Any])
+Valid = TypeVar("Valid")
 
 _NAME = TypeAdapter(DnsLabel)
 
@@ -42,52 +42,39 @@ class ConfigReader:
             self.faults += error.faults
             return None
 
-    def read_list(
-        self, file: str, whole: type[BaseModel], field: str, item: type[Model], key: str
+    def read_items(
+        self, file: str, whole: type[BaseModel], field: str, item: type[Model], key: str = ""
     ) -> dict[str, Model]:
-        """Return the valid items of a file's list, by name; add the faults of invalid ones."""
-        items: dict[str, Model] = {}
-        positions: dict[str, str] = {}
-        raw = self._collection(file, whole, field, list)
-        complete = raw is not None
-        for index, entry in enumerate(raw or ()):
-            name = entry.get(key) if isinstance(entry, dict) else None
-            if isinstance(name, str) and name in positions:
-                self.add_fault(
-                    file, f"{field}[{index}].{key}", f"'{name}' appears twice; remove one"
-                )
-                continue
-            parsed = self._item(file, f"{field}[{index}]", item, entry)
-            if parsed is None or not isinstance(name, str):
-                complete = False
-                continue
-            items[name], positions[name] = parsed, f"{field}[{index}]"
-        self._positions[file] = positions
-        if not complete:
-            self._incomplete.add(file)
-        return items
+        """Return the valid items of a file, by name; add the faults of invalid ones.
 
-    def read_mapping(
-        self, file: str, whole: type[BaseModel], field: str, item: type[Model]
-    ) -> dict[str, Model]:
-        """Return the valid items of a file's map, by name; add the faults of invalid ones."""
+        Args:
+            file: the file.
+            whole: its model.
+            field: its field that has the items, a list or a mapping.
+            item: the model of an item.
+            key: the field with an item's name; empty if ``field`` is a mapping.
+        """
         items: dict[str, Model] = {}
-        raw = self._collection(file, whole, field, dict)
-        for name, entry in (raw or {}).items():
-            parsed = self._item(file, f"{field}.{name}", item, entry)
-            try:
-                _NAME.validate_python(name)
-            except ValidationError as error:
-                self.faults += [
-                    fault(f"{field}.{name}", found.message).within(file)
-                    for found in faults_of(error, item)
-                ]
-                parsed = None
-            if parsed is not None:
-                items[name] = parsed
-        self._positions[file] = {name: f"{field}.{name}" for name in items}
-        if raw is None or len(items) < len(raw):
+        positions = self._positions[file] = {}
+        raw = self._collection(file, whole, field, list if key else dict)
+        if raw is None:
             self._incomplete.add(file)
+            return items
+        for place, entry in enumerate(raw) if key else raw.items():
+            name: Any = place
+            if key:
+                name = entry.get(key) if isinstance(entry, dict) else None
+                if isinstance(name, str) and name in positions:
+                    where = field_path((field, place, key))
+                    self.add_fault(file, where, f"'{name}' appears twice; remove one")
+                    continue
+            at = (field, place)
+            parsed = self._valid(item.model_validate, entry, item, file, at)
+            label = key or self._valid(_NAME.validate_python, name, item, file, at)
+            if parsed is None or label is None:
+                self._incomplete.add(file)
+            else:
+                items[name], positions[name] = parsed, field_path(at)
         return items
 
     def place_of(self, file: str, name: str) -> str:
@@ -105,35 +92,30 @@ class ConfigReader:
             known = suggestion(name, self._positions[known_in])
             self.add_fault(file, field, f"'{name}' is not in {where}{known}")
 
-    def _collection(
-        self, file: str, whole: type[BaseModel], field: str, kind: type[Raw]
-    ) -> Raw | None:
+    def _valid(
+        self,
+        validate: Callable[[Any], Valid],
+        value: object,
+        model: type[BaseModel],
+        file: str,
+        place: tuple[int | str, ...],
+    ) -> Valid | None:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            self.faults += faults_of(error, model, file, place)
+            return None
+
+    def _collection(self, file: str, whole: type[BaseModel], field: str, kind: type[Any]) -> Any:  # noqa: ANN401 - raw data of the kind
         """Return the raw value of ``field``; add the faults of the file's other fields."""
-        text = self.files.get(file)
-        if text is None:
-            self.read_file(file, whole)
-            return None
+        raw = None
         try:
-            data = strict_yaml.load(text, file)
-        except InvalidInput as error:
-            self.faults += error.faults
-            return None
-        raw = data.get(field) if isinstance(data, dict) else None
-        if not isinstance(data, dict) or not isinstance(raw, kind):
-            self.read_file(file, whole)
-            return None
-        try:
+            data = strict_yaml.load(self.files.get(file, ""), file)
+            raw = data.get(field) if isinstance(data, dict) else None
+            if not isinstance(raw, kind):
+                self.read_file(file, whole)
+                return None
             parse(whole, {**data, field: kind()}, file)
         except InvalidInput as error:
             self.faults += error.faults
         return raw
-
-    def _item(self, file: str, place: str, model: type[Model], raw: object) -> Model | None:
-        try:
-            return model.model_validate(raw)
-        except ValidationError as error:
-            for found in faults_of(error, model):
-                inner = found.field
-                glue = "" if not inner or inner.startswith("[") else "."
-                self.faults.append(fault(f"{place}{glue}{inner}", found.message).within(file))
-            return None

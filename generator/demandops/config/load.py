@@ -64,16 +64,16 @@ def load(files: Mapping[str, str]) -> Config:
             f"is missing, but gitops is {repository.gitops}; add it with the url that the "
             "clusters fetch this repo from",
         )
-    nodes = reader.read_list(NODES_FILE, NodesFile, "nodes", Node, "id")
-    domains = reader.read_list(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
+    nodes = reader.read_items(NODES_FILE, NodesFile, "nodes", Node, "id")
+    domains = reader.read_items(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
     config = Config(
         repo_settings=repository or _ANY,
-        clusters=reader.read_list(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
+        clusters=reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
         nodes=nodes,
-        brokers=reader.read_list(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
+        brokers=reader.read_items(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
         domains=domains,
-        charts=reader.read_mapping(CHARTS_FILE, ChartsFile, "charts", Chart),
-        images=reader.read_mapping(IMAGES_FILE, ImagesFile, "images", Image),
+        charts=reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart),
+        images=reader.read_items(IMAGES_FILE, ImagesFile, "images", Image),
         appdefs=_read_appdefs(reader),
         domain_of=_domains_of_nodes(reader, nodes, domains),
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),

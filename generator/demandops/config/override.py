@@ -1,7 +1,7 @@
 """Overrides: a person's declared deviations, one file each in ``overrides/``.
 
 This module has the model and the rules for one override. Conflicts between two are in
-:mod:`demandops.config.override_conflict`, effects on releases and claims in ``plan/overrides``.
+:mod:`demandops.config.cross_check`, effects on releases and claims in ``plan/overrides``.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from demandops.config.base_model import (
     without,
 )
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
+from demandops.config.policy import matches
 from demandops.config.registry import Digest, Image, Repository, Tag
 from demandops.errors import quoted
 from demandops.identifiers import id_problem
@@ -131,6 +132,12 @@ class Selector(FrozenModel):
                 f"nothing matches both connections and {others[0]}; write two selectors"
             )
         return self
+
+    def takes(self, service: str, appdef: str) -> bool:
+        """Return whether ``services`` and ``appdefs`` let a service of an appdef match."""
+        return (not self.services or matches(service, self.services)) and (
+            not self.appdefs or matches(appdef, self.appdefs)
+        )
 
 
 class ImagePin(FrozenModel):

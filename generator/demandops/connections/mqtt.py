@@ -17,16 +17,16 @@ from demandops import naming
 from demandops.config.config import BROKERS_FILE, IMAGES_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Broker
-from demandops.connections.communication_client import ClientKey, End
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
+    ClientKey,
     Connections,
     ConnectionType,
+    End,
     make_end,
-    unplannable,
 )
 from demandops.connections.route import Route
-from demandops.errors import Fault, fault, quoted
+from demandops.errors import Fault, Refused, fault, quoted
 
 CA_FILE = "/tls/ca.crt"
 """The path where the certificate of the broker's authority is mounted."""
@@ -82,7 +82,7 @@ class Mqtt(ConnectionType):
         broker = choose_broker(connection, config)
         if broker is None:
             message = f"connection '{key.id}' has no broker; add one to {BROKERS_FILE}"
-            raise unplannable("broker", message, _NO_BROKER)
+            raise Refused.at("broker", message, code=_NO_BROKER)
         channel = naming.object_name(self.word, key.id)
         return make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
 

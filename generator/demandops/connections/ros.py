@@ -15,17 +15,17 @@ from typing import Any
 from demandops import naming
 from demandops.config.config import NODES_FILE, Config
 from demandops.config.inventory import Node, Wan
-from demandops.connections.communication_client import ClientKey, End
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,
+    ClientKey,
     Connections,
     ConnectionType,
+    End,
     make_end,
-    unplannable,
 )
 from demandops.connections.route import Route
-from demandops.errors import Fault, fault
+from demandops.errors import Fault, Refused, fault
 
 _LOCAL, _WAN = "local", "wan"
 
@@ -79,7 +79,7 @@ class Ros(ConnectionType):
         listener = _listener(connection, config)
         if listener is None or listener.wan is None:
             message = f"connection '{key.id}' has no end with a wan address any longer; restore one"
-            raise unplannable("connections", message)
+            raise Refused.at("connections", message, code=UNSUPPORTED)
         port = _port(key.id, listener.wan)
         for other in connections.at(listener.id):
             if other == key.id or _port(other, listener.wan) != port:
@@ -91,7 +91,7 @@ class Ros(ConnectionType):
                     f"'{listener.id}', but '{other}' listens there; use another connection id, or "
                     f"widen firstPort and lastPort under wan of '{listener.id}'"
                 )
-                raise unplannable("connections", message)
+                raise Refused.at("connections", message, code=UNSUPPORTED)
         connection = replace(connection, topics=typed)
         return make_end(
             RosEnd, key, connection, config, listener=listener.id, wan=listener.wan, port=port

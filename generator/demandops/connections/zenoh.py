@@ -17,15 +17,15 @@ from demandops import naming
 from demandops.config.config import NODES_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Node
-from demandops.connections.communication_client import Client, ClientKey
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,
+    Client,
+    ClientKey,
     Connections,
     ConnectionType,
-    unplannable,
 )
-from demandops.errors import Fault, fault
+from demandops.errors import Fault, Refused, fault
 
 
 class Zenoh(ConnectionType):
@@ -103,7 +103,7 @@ class Zenoh(ConnectionType):
                         f"existing claim: '{other}' carries it from '{key.id}' with rate {rate}, "
                         "and the node's bridge has one rate for each topic; use the same rate"
                     )
-                    raise unplannable("connections", message, "conflict")
+                    raise Refused.at("connections", message, code="conflict")
         if not peers:
             return None
         node, domain = config.node_and_domain(key.id)
@@ -137,7 +137,7 @@ def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
             f"'{node.id}' carries Zenoh connections, but has no zenoh in {NODES_FILE} any longer; "
             "restore it"
         )
-        raise unplannable("node", message)
+        raise Refused.at("node", message, code=UNSUPPORTED)
     endpoints = set(node.zenoh.connect)
     for id in peers:
         peer = config.nodes.get(id)

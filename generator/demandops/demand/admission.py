@@ -5,16 +5,20 @@ It uses appdefs, inventory, brokers and access domains, but not the ledger.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
+from demandops.connections import connection_types
+from demandops.connections import route as routes
 from demandops.connections.connection import Connection
-from demandops.demand import connection_type_choice
-from demandops.demand import demand_request as shape
 from demandops.demand.application import Application
-from demandops.demand.demand_request import DemandRequest
+from demandops.demand.claim import OVERRIDE_PREFIX
+from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put, Release, Renew
+from demandops.demand.lease import LONGEST_S
 from demandops.errors import Fault, fault, quoted, suggestion
+from demandops.identifiers import id_problem, topic_problem
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
@@ -22,43 +26,88 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 
     A shutdown may name nodes that are not in the inventory, so that their claims can be released.
     """
-    yield from shape.faults(request)
+    if request.id and request.id != request.demand:  # without an id, it is the demand's
+        yield from _id("id" if request.is_reference else "request", request.id)
+    if not request.is_reference:
+        yield from _own_fields(request)
+    if not request.demanded and not isinstance(request, Release | Renew):
+        yield fault(
+            "id" if request.is_reference else "applications",
+            "the request lists no application and no connection; list at least one",
+            code="empty",
+        )
     for one in request.demanded:
+        found = [*_id("id", one.held.id), *_requesters(one.requesters)]
         if isinstance(one.held, Application):
-            found = _application(one.held, config, request.adds_claims)
+            found += _application(one.held, config, request.adds_claims)
         else:
-            found = _connection(one.held, config) if request.adds_claims else iter(())
-        yield from (replace(each, field=one.place.at(each.field)) for each in found)
+            found += _connection(one.held, config, request.adds_claims)
+        yield from (replace(each, field=one.place(each.field)) for each in found)
+
+
+def _own_fields(request: DemandRequest) -> Iterator[Fault]:
+    """Yield the faults of the fields that only our own requests have."""
+    yield from _id("demand", request.demand)
+    if request.demand.startswith(OVERRIDE_PREFIX):
+        message = (
+            f"starts with '{OVERRIDE_PREFIX}', which only overrides may use; choose another "
+            "demand id"
+        )
+        yield fault("demand", message)
+    if not request.demanded:  # else each of them is checked
+        yield from _requesters(request.own_requesters)
+    lease_s = request.lease_s if isinstance(request, Put) else None
+    if lease_s is not None and not 0 < lease_s <= LONGEST_S:
+        yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
 
 
 def _application(app: Application, config: Config, claiming: bool) -> Iterator[Fault]:
+    inputs = [
+        (f"inputs.{role}[{position}]", topic)
+        for role, topics in app.inputs.items()
+        for position, topic in enumerate(topics)
+    ]
+    if claiming or app.node:
+        yield from _id("node", app.node)
+    for where, topic in inputs:
+        problem = topic_problem(topic.topic)
+        if problem:
+            yield fault(f"{where}.topic", problem)
+        if claiming or topic.source:
+            yield from _id(f"{where}.source", topic.source)
+        if topic.type:
+            yield from _id(f"{where}.type", topic.type)
     appdef = config.appdefs.get(app.appdef)
     if appdef is None:
         yield _unknown_application(app.appdef, config)
     else:
-        for role, topics in app.inputs.items():
-            if role not in appdef.inputs and topics:
-                message = f"{appdef.name} has no such input" + suggestion(role, appdef.inputs)
-                yield fault(f"inputs.{role}", message)
-        for name in app.parameters:
-            if name not in appdef.parameters:
-                known = suggestion(name, appdef.parameters)
-                yield fault(f"parameters.{name}", f"{appdef.name} has no such parameter{known}")
-        if app.version and app.version not in config.versions_of(appdef.name):
-            yield fault(
-                "version",
-                f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
-                "registry/charts.yaml" + suggestion(app.version, config.versions_of(appdef.name)),
-            )
+        yield from _of_appdef(app, appdef, config)
     if not claiming:
         return
     yield from _node("node", app.node, config)
-    for role, topics in app.inputs.items():
-        for position, topic in enumerate(topics):
-            yield from _node(f"inputs.{role}[{position}].source", topic.source, config)
+    for where, topic in inputs:
+        yield from _node(f"{where}.source", topic.source, config)
     if appdef is not None and not any(app.inputs.values()):
         roles = " or ".join(sorted(appdef.inputs))
         yield fault("inputs", f"is empty; list at least one topic of {roles}")
+
+
+def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) -> Iterator[Fault]:
+    for role, topics in app.inputs.items():
+        if role not in appdef.inputs and topics:
+            message = f"{appdef.name} has no such input" + suggestion(role, appdef.inputs)
+            yield fault(f"inputs.{role}", message)
+    for name in app.parameters:
+        if name not in appdef.parameters:
+            known = suggestion(name, appdef.parameters)
+            yield fault(f"parameters.{name}", f"{appdef.name} has no such parameter{known}")
+    versions = config.versions_of(appdef.name)
+    if app.version and app.version not in versions:
+        yield fault(
+            "version",
+            f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
+            f"registry/charts.yaml{suggestion(app.version, versions)}",
+        )
 
 
 def _unknown_application(name: str, config: Config) -> Fault:
@@ -75,20 +124,39 @@ def _unknown_application(name: str, config: Config) -> Fault:
     return fault("appdef", message, code="unknown-application")
 
 
-def _connection(connection: Connection, config: Config) -> Iterator[Fault]:
-    yield from _node("source", connection.source, config)
-    yield from _node("target", connection.target, config)
+def _connection(connection: Connection, config: Config, claiming: bool) -> Iterator[Fault]:
+    ends = {"source": connection.source, "target": connection.target}
+    for end, node in ends.items():
+        if claiming or node:
+            yield from _id(end, node)
+    if connection.broker:
+        yield from _id("broker", connection.broker)
+    if claiming and not connection.topics:
+        yield fault("topics", "is empty; a connection carries at least one topic, list it")
+    yield from routes.faults("topics", connection.topics)
+    same_place = connection.source and connection.source == connection.target
+    for index, route in enumerate(connection.topics):
+        if claiming and same_place and route.source == route.target:
+            yield fault(
+                f"topics[{index}].target",
+                f"{quoted(route.target)} would feed itself, because source and target are both "
+                f"{quoted(connection.source)}; name another target node or topic",
+            )
+    if not claiming:
+        return
+    for end, node in ends.items():
+        yield from _node(end, node, config)
     if connection.type is not None:
-        yield from connection_type_choice.type_faults(connection.type, connection, config)
-    elif {*connection.nodes} <= config.nodes.keys() and connection_type_choice.choose_type(
+        yield from connection_types.type_faults(connection.type, connection, config)
+    elif {*connection.nodes} <= config.nodes.keys() and connection_types.choose_type(
         connection, config
     ) is None:
-        yield connection_type_choice.no_type_fault(connection, config)
+        yield connection_types.no_type_fault(connection, config)
 
 
 def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
     if not node:
-        return  # the request's own checks report it
+        return  # reported as an empty id
     if node not in config.nodes:
         yield fault(
             where,
@@ -102,3 +170,35 @@ def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
             "policy/access-domains.yaml",
             code="no-access-domain",
         )
+
+
+def _id(where: str, value: str) -> Iterator[Fault]:
+    problem = id_problem(value)
+    if problem:
+        yield fault(where, problem)
+
+
+def _requesters(requesters: tuple[str, ...]) -> Iterator[Fault]:
+    for index, requester in enumerate(requesters):
+        yield from _id(f"requesters[{index}]", requester)
+    if not requesters:
+        yield fault("requesters", "is empty; list at least one requester")
+
+
+def with_chosen_types(
+    request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
+) -> AnyRequest:
+    """Return ``request`` with a type for each connection that has none.
+
+    A claimed connection keeps its current type. A new one gets the first type that can carry it
+    (:func:`connection_types.type_faults`); if no type can, it still has none.
+    """
+
+    def chosen(one: Demanded) -> Demanded:
+        if not isinstance(one.held, Connection) or one.held.type is not None:
+            return one
+        claimed = current(one.held.id)
+        found = claimed.type if claimed else connection_types.choose_type(one.held, config)
+        return replace(one, held=replace(one.held, type=found))
+
+    return replace(request, demanded=tuple(map(chosen, request.demanded)))

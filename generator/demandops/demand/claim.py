@@ -145,6 +145,11 @@ class Claim:
         return kept if replace(kept, lease=current.lease) == current else self
 
 
+def requesters_of(claims: Iterable[Claim]) -> tuple[str, ...]:
+    """Return the requesters of claims, sorted."""
+    return tuple(sorted({who for claim in claims for who in claim.requesters}))
+
+
 def demand_id(request: str, requesters: Iterable[str]) -> str:
     """Return a demand id for a request of the reference's action, which has none.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
@@ -21,7 +22,7 @@ from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import RouteOptions
 from demandops.demand.application import Application, InputTopic
-from demandops.demand.demand_request import Demanded, DemandRequest, Place, Put, Release, Renew
+from demandops.demand.demand_request import Demanded, DemandRequest, Put, Release, Renew
 from demandops.demand.goal_validation import parse_valid_part
 from demandops.errors import Fault, fault, quoted
 from demandops.identifiers import absolute_topic
@@ -130,26 +131,23 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         Demanded(
             _application(f"applications[{index}]", app, faults),
             requesters,
-            _Place(f"applications[{index}]"),
+            partial(_field, f"applications[{index}]"),
             connect=app.connect,
         )
         for index, app in enumerate(goal.applications)
     )
     connections = (
-        Demanded(_connection(connection), requesters, _Place(f"connections[{index}]"))
+        Demanded(_connection(connection), requesters, partial(_field, f"connections[{index}]"))
         for index, connection in enumerate(goal.connections)
     )
     return Put(**head, demanded=(*applications, *connections), lease_s=lease_s), faults
 
 
-class _Place(Place):
-    """The field of a goal's application or connection; the goal has one list of requesters."""
-
-    def at(self, path: str) -> str:
-        """Return the goal's field for a field below it."""
-        if path.startswith("requesters"):
-            return path
-        return f"{self.field}.{'type' if path == 'appdef' else path}"
+def _field(item: str, path: str) -> str:
+    """Return the goal's field for a field of an item; the goal has one list of requesters."""
+    if path.startswith("requesters"):
+        return path
+    return f"{item}.{'type' if path == 'appdef' else path}"
 
 
 def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:

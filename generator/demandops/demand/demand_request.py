@@ -1,34 +1,29 @@
 """Demand requests: one class for each operation on the ledger.
 
-Goals of ROS actions and YAML files are parsed into these values. :func:`faults` yields all faults
-of their contents. How each is carried out: :mod:`demandops.ledger.apply`.
+Goals of ROS actions and YAML files are parsed into these values, and
+:mod:`demandops.demand.admission` checks them. :mod:`demandops.ledger.apply` carries them out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
-from demandops.connections import route as routes
 from demandops.connections.connection import Connection
-from demandops.demand.application import Application, InputTopic
-from demandops.demand.claim import OVERRIDE_PREFIX
-from demandops.demand.lease import LONGEST_S, Term
-from demandops.errors import Fault, fault, quoted
-from demandops.identifiers import id_problem, topic_problem
+from demandops.demand.application import Application
+from demandops.demand.lease import Term
+from demandops.errors import Fault, Refused, fault
+from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
+Place = Callable[[str], str]
+"""Maps a field of an application or connection (``inputs.ego_data[2].source``) to the goal's."""
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """The field of a goal that lists an application or a connection, to locate faults."""
 
-    field: str
-
-    def at(self, path: str) -> str:
-        """Return the goal's name for a field of the item (``inputs.ego_data[2].source``)."""
-        return f"{self.field}.{path}"
+def place_in(field: str) -> Place:
+    """Return the place of an item whose fields have the same names in the goal's ``field``."""
+    return lambda path: f"{field}.{path}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +39,7 @@ class Demanded:
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
         """Return a fault of a field of this item."""
-        return fault(self.place.at(path), message, code=code)
+        return fault(self.place(path), message, code=code)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +128,8 @@ class Expire(DemandRequest):
 class Decommission(DemandRequest):
     """An operator removes a node or a requester, named by ``id``, for good.
 
-    ``kinds`` are ``node``, ``requester`` or both. ``by`` is the operator.
+    ``kinds`` are ``node``, ``requester`` or both. ``by`` is the operator, ``name <email>``. The
+    request is plain data in the journal only; neither an action nor a demand file contains it.
     """
 
     kinds: frozenset[str] = frozenset()
@@ -141,94 +137,25 @@ class Decommission(DemandRequest):
 
     operation = "decommission"
 
+    @staticmethod
+    def is_goal(data: object) -> bool:
+        """Return whether plain data is a request to decommission."""
+        return isinstance(data, dict) and data.get("kind") == "Decommission"
 
-def faults(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of a request that show without configuration and ledger."""
-    if request.id and request.id != request.demand:  # without an id, it is the demand's
-        yield from _id("id" if request.is_reference else "request", request.id)
-    if not request.is_reference:
-        yield from _own_fields(request)
-    if not request.demanded and not isinstance(request, Release | Renew):
-        yield fault(
-            "id" if request.is_reference else "applications",
-            "the request lists no application and no connection; list at least one",
-            code="empty",
-        )
-    for one in request.demanded:
-        yield from _id(one.place.at("id"), one.held.id)
-        yield from _requesters(one.place.at("requesters"), one.requesters)
-        if isinstance(one.held, Application):
-            yield from _application(one.place, one.held, request.adds_claims)
-        else:
-            yield from _connection(one.place, one.held, request.adds_claims)
+    def goal(self) -> dict[str, Any]:
+        """Return the request as plain data."""
+        return {"kind": "Decommission", "name": self.id, "as": sorted(self.kinds), "by": self.by}
 
+    @classmethod
+    def parse(cls, data: dict[str, Any]) -> Decommission:
+        """Return the request of plain data.
 
-def _own_fields(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of the fields that only our own requests have."""
-    yield from _id("demand", request.demand)
-    if request.demand.startswith(OVERRIDE_PREFIX):
-        yield fault(
-            "demand",
-            f"starts with '{OVERRIDE_PREFIX}', which only overrides may use; choose "
-            "another demand id",
-        )
-    if not request.demanded:  # else each of them is checked
-        yield from _requesters("requesters", request.own_requesters)
-    lease_s = request.lease_s if isinstance(request, Put) else None
-    if lease_s is not None and not 0 < lease_s <= LONGEST_S:
-        yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
-
-
-def _application(place: Place, app: Application, claiming: bool) -> Iterator[Fault]:
-    if claiming or app.node:
-        yield from _id(place.at("node"), app.node)
-    for role, topics in app.inputs.items():
-        for position, topic in enumerate(topics):
-            yield from _input(place, f"inputs.{role}[{position}]", topic, claiming)
-
-
-def _input(place: Place, path: str, topic: InputTopic, claiming: bool) -> Iterator[Fault]:
-    problem = topic_problem(topic.topic)
-    if problem:
-        yield fault(place.at(f"{path}.topic"), problem)
-    if claiming or topic.source:
-        yield from _id(place.at(f"{path}.source"), topic.source)
-    if topic.type:
-        yield from _id(place.at(f"{path}.type"), topic.type)
-
-
-def _connection(place: Place, connection: Connection, claiming: bool) -> Iterator[Fault]:
-    for end, node in (("source", connection.source), ("target", connection.target)):
-        if claiming or node:
-            yield from _id(place.at(end), node)
-    if connection.broker:
-        yield from _id(place.at("broker"), connection.broker)
-    if claiming and not connection.topics:
-        yield fault(
-            place.at("topics"), "is empty; a connection carries at least one topic, list it"
-        )
-    for found in routes.faults("topics", connection.topics):
-        yield fault(place.at(found.field), found.message, code=found.code)
-    same_place = connection.source and connection.source == connection.target
-    for index, route in enumerate(connection.topics):
-        if claiming and same_place and route.source == route.target:
-            yield fault(
-                place.at(f"topics[{index}].target"),
-                f"{quoted(route.target)} would feed itself, because source and target are both "
-                f"{quoted(connection.source)}; name another target node or topic",
-            )
-
-
-def _id(where: str, value: str) -> Iterator[Fault]:
-    problem = id_problem(value)
-    if problem:
-        yield fault(where, problem)
-
-
-def _requesters(where: str, requesters: Iterable[str]) -> Iterator[Fault]:
-    empty = True
-    for index, requester in enumerate(requesters):
-        empty = False
-        yield from _id(f"{where}[{index}]", requester)
-    if empty:
-        yield fault(where, "is empty; list at least one requester")
+        Raises:
+            Refused: if the name is invalid.
+        """
+        name = data.get("name")
+        problem = id_problem(name) if isinstance(name, str) else "must be text"
+        if problem:
+            raise Refused.at("name", problem)
+        kinds = frozenset(kind for kind in data.get("as", ()) if kind in ("node", "requester"))
+        return cls(id=str(name), kinds=kinds, by=str(data.get("by") or ""))

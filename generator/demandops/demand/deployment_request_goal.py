@@ -8,7 +8,7 @@ Faults name the fields of the message (``apps[0].header.node_id``).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Annotated
 
@@ -21,7 +21,7 @@ from demandops.connections.connection_type import ConnectionType
 from demandops.connections.connection_types import by_number, type_numbered
 from demandops.connections.route import Route
 from demandops.demand.application import Application, InputTopic
-from demandops.demand.demand_request import Demanded, DemandRequest, Join, Place, Shutdown
+from demandops.demand.demand_request import Demanded, DemandRequest, Join, Shutdown
 from demandops.demand.goal_validation import parse_valid_part
 from demandops.errors import Fault, fault
 from demandops.identifiers import absolute_topic
@@ -87,43 +87,33 @@ _BODY = "object_detection_fusion_app"
 _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
-@dataclass(frozen=True, slots=True)
-class _ApplicationPlace(Place):
-    """An application of the message; ``lists`` maps roles to its lists of topics."""
-
-    lists: tuple[tuple[str, str], ...]
-
-    def at(self, path: str) -> str:
-        """Return the message's field for a field of the application."""
-        name, _, rest = path.partition(".")
-        if name in ("id", "node"):
-            return f"{self.field}.header.{'id' if name == 'id' else 'node_id'}"
-        if name.startswith("requesters"):
-            return f"{self.field}.{_BODY}.requester_ids{name.removeprefix('requesters')}"
-        if name == "appdef":
-            return f"{self.field}.type"
-        if name != "inputs":
-            return f"{self.field}.{path}"
-        role, bracket, place = rest.partition("[")
-        place = place.replace("].topic", "].topic_name").replace("].source", "].source_node_id")
-        field = f".{dict(self.lists).get(role, role)}" if role else ""
-        return f"{self.field}.{_BODY}{field}{bracket}{place}"
+def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
+    """Return the message's field for a field of an application; ``lists`` maps roles to lists."""
+    name, _, rest = path.partition(".")
+    if name in ("id", "node"):
+        return f"{item}.header.{'id' if name == 'id' else 'node_id'}"
+    if name.startswith("requesters"):
+        return f"{item}.{_BODY}.requester_ids{name.removeprefix('requesters')}"
+    if name == "appdef":
+        return f"{item}.type"
+    if name != "inputs":
+        return f"{item}.{path}"
+    role, bracket, place = rest.partition("[")
+    place = place.replace("].topic", "].topic_name").replace("].source", "].source_node_id")
+    field = f".{lists.get(role, role)}" if role else ""
+    return f"{item}.{_BODY}{field}{bracket}{place}"
 
 
-@dataclass(frozen=True, slots=True)
-class _ConnectionPlace(Place):
-    """A connection of the message, which has the topics in two lists."""
-
-    def at(self, path: str) -> str:
-        """Return the message's field for a field of the connection."""
-        if path.startswith("requesters"):
-            return f"{self.field}.requester_ids{path.removeprefix('requesters')}"
-        if path in ("source", "target", "broker"):
-            return f"{self.field}.{path}_node_id"
-        if path.startswith("topics"):
-            place, _, name = path.removeprefix("topics").partition(".")
-            return f"{self.field}.{'target' if name == 'target' else 'source'}_topics{place}"
-        return f"{self.field}.{path}"
+def _connection_field(item: str, path: str) -> str:
+    """Return the message's field for a field of a connection, whose topics are two lists."""
+    if path.startswith("requesters"):
+        return f"{item}.requester_ids{path.removeprefix('requesters')}"
+    if path in ("source", "target", "broker"):
+        return f"{item}.{path}_node_id"
+    if path.startswith("topics"):
+        place, _, name = path.removeprefix("topics").partition(".")
+        return f"{item}.{'target' if name == 'target' else 'source'}_topics{place}"
+    return f"{item}.{path}"
 
 
 def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | None, list[Fault]]:
@@ -155,20 +145,16 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
             known = ", ".join(known.label for known in by_number())
             message = f"{connection.type} is not a connection type; known: {known}"
             faults.append(fault(f"{where}.type", message, code="unknown-connection-type"))
-    # without a valid "shutdown", only the rules of both operations apply, which are a shutdown's
-    operation = Shutdown if goal.shutdown or "shutdown" in faulty else Join
-    request = operation(id=goal.id, demanded=tuple(demanded))
-    for index, connection in enumerate(goal.connections):
         sources, targets = len(connection.source_topics), len(connection.target_topics)
         if sources != targets:
-            faults.append(
-                fault(
-                    f"connections[{index}].target_topics",
-                    f"has {targets} names for {sources} in source_topics; source topic i goes to "
-                    "target topic i, so list as many of each",
-                )
+            message = (
+                f"has {targets} names for {sources} in source_topics; source topic i goes to "
+                "target topic i, so list as many of each"
             )
-    return request, faults
+            faults.append(fault(f"{where}.target_topics", message))
+    # without a valid "shutdown", only the rules of both operations apply, which are a shutdown's
+    operation = Shutdown if goal.shutdown or "shutdown" in faulty else Join
+    return operation(id=goal.id, demanded=tuple(demanded)), faults
 
 
 def form_faults(data: object) -> list[Fault]:
@@ -182,18 +168,12 @@ def _not_a_mapping() -> Fault:
     return fault("", "a request is a mapping with id, apps, connections and shutdown")
 
 
-def _wire_inputs(appdef: ApplicationDefinition | None) -> Mapping[str, str]:
-    """Return the appdef's mapping of the message's topic lists to roles."""
-    if appdef is None or appdef.deployment_request is None:
-        return {}
-    return {str(name): role for name, role in appdef.deployment_request.inputs.items()}
-
-
 def _application(
     where: str, app: WireApplication, appdef: ApplicationDefinition | None
 ) -> Demanded:
     body = app.object_detection_fusion_app
-    roles = _wire_inputs(appdef)
+    wire = appdef.deployment_request if appdef else None
+    roles = {str(name): role for name, role in wire.inputs.items()} if wire else {}
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for name in ("ego_data_topics", "pointcloud_topics"):
         topics: list[WireTopic] = getattr(body, name)
@@ -208,7 +188,7 @@ def _application(
             inputs=MappingProxyType(inputs),
         ),
         tuple(dict.fromkeys(body.requester_ids)),
-        _ApplicationPlace(where, tuple((role, name) for name, role in roles.items())),
+        partial(_application_field, where, {role: name for name, role in roles.items()}),
     )
 
 
@@ -225,17 +205,16 @@ def _connection(where: str, connection: WireConnection, kind: ConnectionType | N
     pairs = zip(
         [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
     )
+    held = Connection(
+        id=connection.id,
+        type=kind,
+        source=connection.source_node_id,
+        target=connection.target_node_id,
+        topics=tuple(Route(absolute_topic(one), absolute_topic(other)) for one, other in pairs),
+        broker=connection.broker_node_id,
+    )
     return Demanded(
-        Connection(
-            id=connection.id,
-            type=kind,
-            source=connection.source_node_id,
-            target=connection.target_node_id,
-            topics=tuple(
-                Route(absolute_topic(source), absolute_topic(target)) for source, target in pairs
-            ),
-            broker=connection.broker_node_id,
-        ),
+        held,
         tuple(dict.fromkeys(connection.requester_ids)),
-        _ConnectionPlace(where),
+        partial(_connection_field, where),
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeAlias
 
 from demandops.config.config import Config
@@ -15,19 +16,16 @@ from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named
 from demandops.connections.route import Route
 from demandops.demand.application import Application, InputTopic
-from demandops.demand.demand_request import AnyRequest, Demanded, Place
+from demandops.demand.demand_request import AnyRequest, Demanded
 from demandops.identifiers import topic_problem
 from demandops.ledger.ledger import Ledger
 from demandops.plan.planner import outputs
 from demandops.plan.release import ServiceKey
 
 
-class _InputPlace(Place):
-    """The input that needs a connection; faults of the connection name its field."""
-
-    def at(self, path: str) -> str:
-        """Return the input's field, also for a fault of the connection; requesters keep theirs."""
-        return path if path.startswith("requesters") else self.field
+def _input_field(field: str, path: str) -> str:
+    """Return the input's field for a fault of its connection; requesters keep theirs."""
+    return path if path.startswith("requesters") else field
 
 
 def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
@@ -55,7 +53,7 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
             if (app.node, topic.topic) in brought or not _is_valid(app, topic, config):
                 continue
             needed = _connection(app, one.connect, topic, ledger)
-            place = _InputPlace(one.place.at(foreign.field))
+            place = partial(_input_field, one.place(foreign.field))
             ends = (needed.id, *needed.nodes)
             first.setdefault(ends, replace(one, held=needed, place=place, connect="none"))
             routes.setdefault(ends, {}).update(dict.fromkeys(needed.topics))

@@ -5,7 +5,9 @@ Keys come from :mod:`demandops.plan.release_keys`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from demandops import naming
@@ -13,19 +15,19 @@ from demandops.config.appdef import ApplicationDefinition, Parameter, Scaling, S
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.config.registry import ChartSource
+from demandops.connections import route as routes
+from demandops.connections.connection import Connection
+from demandops.connections.connection_type import ConnectionType
+from demandops.connections.connection_types import route_faults
+from demandops.connections.route import Route
 from demandops.demand.application import InputTopic
-from demandops.demand.claim import Claim
-from demandops.errors import Refused, fault
+from demandops.demand.claim import Claim, requesters_of
+from demandops.errors import Refused
 from demandops.ledger.world import World
-from demandops.plan import connection_clients, parameters
 from demandops.plan.overrides import release_overrides
-from demandops.plan.overrides.suspended_claims import without_suspended
+from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
-from demandops.plan.release_keys import (
-    ReleaseKey,
-    appdef_of,
-    claims_needing,
-)
+from demandops.plan.release_keys import ReleaseKey, appdef_of, claims_needing
 
 
 def plan(world: World, key: ReleaseKey) -> Release | None:
@@ -51,7 +53,7 @@ def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | 
 def _unshaped(world: World, key: ReleaseKey) -> Release | None:
     if isinstance(key, ServiceKey):
         return _service(world, key)
-    return connection_clients.client_at(world, key)
+    return key.type.client(key, _ClaimedConnections(world, key.type), world.config)
 
 
 def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
@@ -70,7 +72,7 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     definitions: dict[str, Parameter] = {}
     for name in sorted({claim.application.appdef for claim in claims}, reverse=True):
         definitions |= appdef_of(config, name).parameters
-    values = parameters.merged(definitions, claims)
+    values = _merged_parameters(definitions, claims)
     return ServiceRelease(
         key=key,
         name=service_name(config, service, key),
@@ -88,16 +90,11 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         parameters=MappingProxyType(values),
         replicas=_replicas(service.scaling, sum(map(len, inputs.values()))),
         applications=users,
-        requesters=_requesters(claims),
+        requesters=requesters_of(claims),
     )
 
 
 def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSource:
-    """Return the chart in the version that the claims request, or the default version.
-
-    Raises:
-        Refused: if applications that share the service ask for different versions.
-    """
     chart = config.charts[service.chart]
     wanted = {claim.application.version for claim in claims}
     charts = {version: chart.at(version) or chart for version in wanted}
@@ -108,12 +105,8 @@ def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSo
         message = (
             f"demands that share {service.chart} request versions {versions}; request the same one"
         )
-        raise Refused([fault("version", message, code="conflict")])
+        raise Refused.at("version", message, code="conflict")
     return next(iter(charts.values()))
-
-
-def _requesters(claims: Iterable[Claim]) -> tuple[str, ...]:
-    return tuple(sorted({who for claim in claims for who in claim.requesters}))
 
 
 def _shared_input(claims: Iterable[Claim], role: str, key: ServiceKey) -> tuple[InputTopic, ...]:
@@ -123,10 +116,7 @@ def _shared_input(claims: Iterable[Claim], role: str, key: ServiceKey) -> tuple[
 
 
 def _application_inputs(
-    config: Config,
-    appdef: ApplicationDefinition,
-    service: Service,
-    claims: tuple[Claim, ...],
+    config: Config, appdef: ApplicationDefinition, service: Service, claims: Iterable[Claim]
 ) -> dict[str, tuple[InputTopic, ...]]:
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for role, origin in sorted(service.inputs.items()):
@@ -194,3 +184,105 @@ def _replicas(scaling: Scaling, topics: int) -> int:
         return scaling.min
     needed = -(-topics // scaling.topics_per_replica)
     return max(scaling.min, min(scaling.max, needed))
+
+
+def _merged_parameters(
+    definitions: Mapping[str, Parameter], claims: tuple[Claim, ...]
+) -> dict[str, object]:
+    """Return the value of every parameter; the appdef says how several values become one."""
+    values: dict[str, object] = {}
+    for name, parameter in sorted(definitions.items()):
+        given = [claim for claim in claims if name in claim.application.parameters]
+        values[name] = _merged_value(name, parameter, given) if given else parameter.default
+    return values
+
+
+def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> object:
+    given = [claim.application.parameters[name] for claim in claims]
+    if parameter.merge == "latest":
+        latest = max(claims, key=lambda claim: (claim.booked, claim.demand))
+        return latest.application.parameters[name]
+    if parameter.merge == "union":
+        items = [
+            item for value in given for item in (value if isinstance(value, list) else [value])
+        ]
+        unique = {json.dumps(item, sort_keys=True): item for item in items}
+        return [unique[key] for key in sorted(unique)]
+    if parameter.merge in ("max", "min"):
+        numbers = [
+            value
+            for value in given
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        ]
+        if len(numbers) != len(given):
+            odd = next(value for value in given if value not in numbers)
+            message = (
+                f"{odd!r} is not a number, but the application definition takes the "
+                f"{parameter.merge}"
+            )
+            raise Refused.at(f"parameters.{name}", message)
+        return max(numbers) if parameter.merge == "max" else min(numbers)
+    if any(value != given[0] for value in given):
+        shown = " and ".join(
+            f"{json.dumps(claim.application.parameters[name])} for {', '.join(claim.requesters)}"
+            for claim in claims[:3]
+        )
+        message = (
+            f"demands contradict each other: {shown}; agree, or have the application definition "
+            "say how to merge them"
+        )
+        raise Refused.at(f"parameters.{name}", message, code="conflict")
+    return given[0]
+
+
+@dataclass(frozen=True, slots=True)
+class _ClaimedConnections:
+    """The connections that the ledger has of one type."""
+
+    world: World
+    type: ConnectionType
+
+    def at(self, node: str) -> Iterable[str]:
+        """Return the connections that end at a node, sorted."""
+        return self.world.ledger.connections_at(self.type, node)
+
+    def get(self, id: str) -> Connection | None:
+        """Return a connection, or ``None`` if it is not claimed with this type.
+
+        Raises:
+            Refused: if a person wrote a claim that its type cannot carry, or removed what it needs
+                from the inventory.
+        """
+        first, claims = self.world.ledger.connection(id), self.world.ledger.connection_claims(id)
+        if first is None or first.type is not self.type:
+            return None
+        topics = tuple(
+            route
+            for route in connection_topics(claims)
+            if not is_bridged(route, *first.nodes, self.world.config)
+        )
+        problems = list(route_faults(self.type, topics, first.nodes, self.world.config))
+        if problems:
+            raise Refused(
+                replace(one, field="connections", message=f"'{id}': {one.message}")
+                for one in problems
+            )
+        brokers = (claim.connection.broker for claim in claims)
+        return replace(first, broker=next(filter(None, brokers), ""), topics=topics)
+
+
+def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
+    """Return the routes of all claims on a connection, sorted by source topic."""
+    return routes.merged_routes(route for claim in claims for route in claim.connection.topics)
+
+
+def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
+    """Return whether the initial deployment already carries a topic between two ends.
+
+    It keeps topic names, so it does not carry a route that renames the topic.
+    """
+    sender, receiver = route.sender_and_receiver(source, target)
+    node = config.nodes.get(sender)
+    if node is None or route.source != route.target:
+        return False
+    return route.read_topic in node.bridged.get(receiver, ())

@@ -11,7 +11,7 @@ from demandops.config.inventory import Node
 from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import ChartSource
-from demandops.connections.communication_client import Client
+from demandops.connections.connection_type import Client
 from demandops.demand.application import InputTopic
 from demandops.demand.claim import Claim
 from demandops.ledger.ledger import Ledger

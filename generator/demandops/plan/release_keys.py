@@ -11,14 +11,13 @@ from dataclasses import replace
 
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
-from demandops.connections.communication_client import ClientKey
+from demandops.connections.connection_type import ClientKey
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim
-from demandops.errors import Refused, fault
+from demandops.errors import Refused
 from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.ledger.world import World
-from demandops.plan import connection_clients
-from demandops.plan.overrides.suspended_claims import without_suspended
+from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import ServiceKey
 from demandops.subject import Subject, SubjectKind
 
@@ -45,10 +44,15 @@ def keys_of_claims(
         for key in (
             _service_keys(world, claim, strict)
             if claim.is_on_application
-            else connection_clients.client_keys(world.ledger, claim.subject.id)
+            else _client_keys(world, claim)
         )
     )
     yield from dict.fromkeys(keys)
+
+
+def _client_keys(world: World, claim: Claim) -> Iterable[ClientKey]:
+    first = world.ledger.connection(claim.subject.id) or claim.connection
+    return first.known_type.keys(first.id, *first.nodes)
 
 
 def _service_keys(world: World, claim: Claim, strict: bool) -> Iterator[ServiceKey]:
@@ -168,13 +172,7 @@ def appdef_of(config: Config, name: str) -> ApplicationDefinition:
     """
     appdef = config.appdefs.get(name)
     if appdef is None:
-        raise Refused(
-            [
-                fault(
-                    "appdef",
-                    f"'{name}' is in use, but appdefs/{name} is gone; restore it",
-                    code="unknown-application",
-                ).within(f"appdefs/{name}/appdef.yaml")
-            ]
-        )
+        message = f"'{name}' is in use, but appdefs/{name} is gone; restore it"
+        file = f"appdefs/{name}/appdef.yaml"
+        raise Refused.at("appdef", message, code="unknown-application", file=file)
     return appdef

@@ -20,6 +20,7 @@ from demandops.plan.release_keys import ReleaseKey, keys_of
 from demandops.subject import Subject
 
 T = TypeVar("T")
+Unit = TypeVar("Unit", bound="_Unit")
 
 _Unit: TypeAlias = "Subject | ReleaseKey"
 _Read: TypeAlias = "Subject | tuple[str, ...]"
@@ -56,9 +57,7 @@ class TracedPlan:
         for subject in ledger.claims:
             if subject in stale or subject not in self._keys:
                 self._keys[subject] = self._traced(
-                    ledger,
-                    subject,
-                    lambda seen, of=subject: tuple(keys_of(seen, of, strict=True)),  # type: ignore[misc]
+                    ledger, subject, lambda seen, of: tuple(keys_of(seen, of, strict=True))
                 )
         for subject in [unit for unit in stale if unit in self._keys]:
             if subject not in ledger.claims:
@@ -67,15 +66,11 @@ class TracedPlan:
         gone = self._planned - needed
         found: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
         for key in sorted(needed - self._planned | (needed & stale), key=repr):
-            found[key] = self._traced(
-                ledger,
-                key,
-                lambda seen, of=key: plan(seen, of),  # type: ignore[misc]
-            )
+            found[key] = self._traced(ledger, key, plan)
         self._planned = needed
         return found
 
-    def _traced(self, ledger: Ledger, unit: _Unit, work: Callable[[World], T]) -> T:
+    def _traced(self, ledger: Ledger, unit: Unit, work: Callable[[World, Unit], T]) -> T:
         reads: set[_Read] = set()
         traced = Ledger(
             cast(Any, _Recording(ledger.claims, reads)),
@@ -83,7 +78,7 @@ class TracedPlan:
             cast(Any, None),  # planning does not read when leases end
             ledger.ended,
         )
-        result = work(World(self._config, traced))
+        result = work(World(self._config, traced), unit)
         for read in reads:
             self._readers.setdefault(read, set()).add(unit)
         return result

@@ -17,9 +17,8 @@ import jsonschema_rs
 
 from demandops.config.base_model import field_path
 from demandops.config.config import IMAGES_FILE, Config
-from demandops.connections.communication_client import Client
-from demandops.connections.connection_type import unplannable
-from demandops.errors import InvalidInput, fault
+from demandops.connections.connection_type import UNSUPPORTED, Client
+from demandops.errors import InvalidInput, Refused, fault
 from demandops.render.engine import Engine
 from demandops.settings import data_folder
 
@@ -34,7 +33,7 @@ def render(client: Client, config: Config, engine: Engine) -> str:
     kind, node = client.type, client.node
     if kind.image not in config.images:
         message = f"'{kind.image}' is in use, but not in {IMAGES_FILE}; add it there"
-        raise unplannable("images", message)
+        raise Refused.at("images", message, code=UNSUPPORTED)
     configuration = client.configuration()
     check_configuration(kind.word, configuration, client.name)
     restarts = client.written(client.needs_restart(configuration))

@@ -2,15 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from datetime import datetime, timezone
 
+from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
+from demandops.config.override import Override
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.demand_request import Demanded, Join
 from demandops.errors import Fault, InvalidInput
+from demandops.ledger.apply import apply
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
-from demandops.plan.checks import trial_demands
+from demandops.plan.overrides.release_overrides import apply_effects, effects_on
+from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
+from demandops.plan.release_keys import affected_keys
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
+
+_NEVER = datetime.fromtimestamp(0, timezone.utc)
+
+
+def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
+    """Return appdef → its services for a trial demand on the first node, without overrides.
+
+    Raises:
+        Refused: if one cannot be planned.
+    """
+    node = next(iter(sorted(config.domain_of)), None)
+    if node is None:
+        return {}
+    plain = replace(config, overrides={})
+    return {appdef.name: list(_services(appdef, node, plain)) for appdef in config.appdefs.values()}
+
+
+def _services(appdef: ApplicationDefinition, node: str, config: Config) -> Iterator[ServiceRelease]:
+    inputs = {
+        role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", node),) for role in appdef.inputs
+    }
+    app = Application(f"rehearsal/{appdef.name}", appdef.name, node, inputs)
+    request = Join("rehearsal", (Demanded(app, ("rehearsal",), str),))
+    ledger, changes = apply(Ledger(), request, _NEVER)
+    before, after = World(config, Ledger()), World(config, ledger)
+    for key in affected_keys(before, after, changes.claims):
+        release = plan(after, key)
+        if isinstance(release, ServiceRelease):
+            yield release
+
+
+def overridden_releases(
+    override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
+) -> Iterator[ServiceRelease]:
+    """Yield the trial releases of an appdef that an override may select, with its effects."""
+    for release in trials:
+        effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
+        if effects and any(
+            not selector.connections and selector.takes(release.key.service, appdef)
+            for selector in override.select
+        ):
+            shaped = apply_effects(release, [(override, effects)], config)
+            if isinstance(shaped, ServiceRelease):
+                yield shaped
 
 
 def render_trial_demands(world: World, engine: Engine) -> None:
@@ -23,7 +77,7 @@ def render_trial_demands(world: World, engine: Engine) -> None:
         Refused, InvalidInput: naming the template, the values or the override that does not work.
     """
     config = world.config
-    invented = trial_demands.trial_releases(config)
+    invented = trial_releases(config)
     faults = [
         fault
         for releases in invented.values()
@@ -31,7 +85,7 @@ def render_trial_demands(world: World, engine: Engine) -> None:
     ]
     for override in () if faults else world.overrides:
         overridden = [
-            list(trial_demands.overridden_releases(override, releases, appdef, config))
+            list(overridden_releases(override, releases, appdef, config))
             for appdef, releases in invented.items()
         ]
         failed = [_render_faults(releases, config, engine) for releases in overridden if releases]

@@ -106,9 +106,7 @@ class Demands:
     def wait(self, timeout: float | None) -> bool:
         """Wait for a demand, :meth:`wake` or ``timeout``; return False once closed and empty."""
         with self._changed:
-            if not self.must_not_wait and not self._woken:
-                self._changed.wait(timeout)
-            self._woken = False
+            self._wait(timeout, self.must_not_wait)
             return self.has_waiting or not self._closed
 
     def journal_arrivals(self, timeout: float) -> list[Ticket]:
@@ -118,10 +116,13 @@ class Demands:
             The new demands; none after ``timeout`` seconds, a withdrawal or :meth:`wake`.
         """
         with self._changed:
-            if not self._arrived and not self._woken:
-                self._changed.wait(timeout)
-            self._woken = False
+            self._wait(timeout, bool(self._arrived))
             return self._journal_arrived()
+
+    def _wait(self, timeout: float | None, has_work: bool) -> None:
+        if not has_work and not self._woken:
+            self._changed.wait(timeout)
+        self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
         """Journal all arrived demands, and fill ``batch`` with up to ``limit`` demands."""

@@ -6,10 +6,9 @@ A demand that fails gets its error as the answer. The other demands of the batch
 from __future__ import annotations
 
 import logging
-from datetime import datetime
 
 from demandops.decision import Decision, Outcome, decide
-from demandops.demand import decommission_goal
+from demandops.demand.demand_request import Decommission
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
 from demandops.service.approvals.approvals import Approvals
@@ -20,7 +19,7 @@ from demandops.service.ticket import Receipt, Ticket, receipt_of
 from demandops.service.timing.rate_limit import RateLimit
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import SigningFailed
-from demandops.staterepo.history import commit_log
+from demandops.staterepo.history.commit_log import RecordedOutcome, operations_since
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.write.commit_batch import CommitBatch
 
@@ -45,7 +44,7 @@ class Evaluator:
         self,
         commits: CommitBatch,
         ticket: Ticket,
-        published: dict[str, commit_log.RecordedOutcome],
+        published: dict[str, RecordedOutcome],
     ) -> Receipt | DemandOpsError | Decision:
         """Decide a demand, commit it on the commit batch and return its result.
 
@@ -80,7 +79,13 @@ class Evaluator:
             self._approvals.withdraw_replaced(decision.request)
             before = commits.head.state
             targets = targets_of_decision(before, decision) if self._with_targets else ()
-            commit = _commit(commits, ticket, decision, self._repository.runtime.now())
+            if decision.files:
+                now = self._repository.runtime.now()
+                commit = commits.commit(decision, ticket.operation, ticket.received, now)
+                ticket.notify("committed", f"committed {commit}")
+            else:
+                commits.note_settled(ticket.operation, "Unchanged")
+                commit = str(commits.head.commit)
             return receipt_of(ticket, decision, commit, targets)
         except InvalidInput as error:
             if ticket.has_released:  # a proposal, which held no claims yet
@@ -95,40 +100,27 @@ class Evaluator:
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
-    def published_before(
-        self, start: Snapshot, batch: list[Ticket]
-    ) -> dict[str, commit_log.RecordedOutcome]:
+    def published_before(self, start: Snapshot, batch: list[Ticket]) -> dict[str, RecordedOutcome]:
         """Return the demands that are published but not answered, by operation id.
 
         This happens if the connection or the process ends after the remote accepted the push.
         """
-        bases = {ticket.base for ticket in batch if ticket.maybe_published}
-        published: dict[str, commit_log.RecordedOutcome] = {}
-        for base in bases:
-            published |= commit_log.operations_since(self._repository.objects, start.commit, base)
+        published: dict[str, RecordedOutcome] = {}
+        for base in {ticket.base for ticket in batch if ticket.maybe_published}:
+            published |= operations_since(self._repository.objects, start.commit, base)
         return published
 
 
-def _commit(commits: CommitBatch, ticket: Ticket, decision: Decision, now: datetime) -> str:
-    if not decision.files:
-        commits.note_settled(ticket.operation, "Unchanged")
-        return str(commits.head.commit)
-    commit = commits.commit(decision, ticket.operation, ticket.received, now)
-    ticket.notify("committed", f"committed {commit}")
-    return commit
-
-
-def _receipt_of_published(
-    ticket: Ticket, arrival: commit_log.RecordedOutcome
-) -> Receipt | DemandOpsError:
+def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt | DemandOpsError:
     if arrival.outcome == "refused":
         message = "was refused, but the reason was lost with the connection; send it again"
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal
-    releases = is_release(goal) or decommission_goal.is_decommission(goal)
-    outcome: Outcome = "released" if releases else "booked"
-    if rollback_goal.is_rollback(goal):
-        outcome = "restored"
+    outcome: Outcome = "booked"
     if arrival.outcome == "unchanged":
         outcome = "unchanged"
+    elif rollback_goal.is_rollback(goal):
+        outcome = "restored"
+    elif is_release(goal) or Decommission.is_goal(goal):
+        outcome = "released"
     return Receipt(ticket.operation, name_of(goal), outcome, arrival.commit)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import re
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 
 from demandops import settings
 from demandops.config.config import Config
+from demandops.errors import Refused, fault
 from demandops.runtime import REAL, Runtime
 from demandops.service.approvals.approvals import Approvals
 from demandops.service.demand_lifecycle import Demands
-from demandops.service.remote_status import StateRepoStatus
-from demandops.service.ticket import Listener, Ticket, new_ticket
+from demandops.service.remote_status import RemoteStatus
+from demandops.service.ticket import Listener, Ticket
 from demandops.service.worker import Worker
 from demandops.staterepo.git import repository_choice
 from demandops.staterepo.git.signing import Signer
@@ -24,6 +27,7 @@ from demandops.staterepo.write.slot import Slot
 log = logging.getLogger("demandops")
 
 _STOP_TIMEOUT_S = 20.0
+_OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
 
 class Generator:
@@ -96,15 +100,14 @@ class Generator:
         return self._worker.snapshot
 
     @property
-    def state_repo_status(self) -> StateRepoStatus:
-        """The status of the state repo; any thread may read it."""
-        snapshot = self.snapshot
-        return StateRepoStatus(
-            self._worker.remote.status,
-            snapshot.problems,
-            self._demands.unpublished,
-            str(snapshot.commit),
-        )
+    def remote_status(self) -> RemoteStatus:
+        """Whether the remote can be reached; any thread may read it."""
+        return self._worker.remote.status
+
+    @property
+    def unpublished(self) -> int:
+        """How many demands are in the journal and do not await approval; from any thread."""
+        return self._demands.unpublished
 
     @property
     def operations(self) -> tuple[str, ...]:
@@ -134,11 +137,20 @@ class Generator:
 
         Raises:
             ShuttingDown, QueueFull: if the demand is not accepted at all.
+            ValueError: for an operation id that a commit trailer cannot carry.
         """
-        ticket = new_ticket(goal, operation, listener, self._runtime)
-        if not ticket.future.done():
-            ticket.base = str(self.snapshot.commit)
-            self._demands.arrive(ticket)
+        operation = operation or self._runtime.fresh_id()
+        if not _OPERATION.fullmatch(operation):
+            message = f"{operation!r} is not an operation id; use letters, digits and dashes"
+            raise ValueError(message)
+        ticket = Ticket(operation, goal, self._runtime.now(), listener)
+        try:
+            ticket.goal = json.loads(json.dumps(goal))
+        except (TypeError, ValueError, RecursionError):
+            ticket.future.set_exception(Refused([fault("", "the goal is not plain data")]))
+            return ticket
+        ticket.base = str(self.snapshot.commit)
+        self._demands.arrive(ticket)
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:

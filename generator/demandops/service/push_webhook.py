@@ -1,26 +1,37 @@
 """The inbound webhook: a Git server reports a push, and the generator fetches at once.
 
-Notifications are untrusted: only the signature is checked, and the content is not read.
+Notifications are untrusted: only the signature is checked, and the content is not read. Anyone who
+reaches the address may connect. So the server limits the number of open connections, and cuts each
+off after some seconds, even if its sender is very slow.
 """
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import hmac
+import ipaddress
 import logging
+import socket
 from collections.abc import Callable
-from pathlib import Path
+from typing import Any
 
+import uvicorn
+from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse
 from starlette.routing import Route
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from demandops.errors import InvalidInput, fault
 from demandops.runtime import REAL
 
 log = logging.getLogger("demandops")
 
-PATH = "/push"
+_PATH = "/push"
+_TIMEOUT_S = 10.0
+_AT_ONCE = 16
+_STOP_TIMEOUT_S = 1
 _MAX_BODY = 25 << 20
 """The most that GitHub sends; the body is hashed, not stored."""
 _WARN_EVERY_S = 60.0
@@ -29,35 +40,47 @@ _SIGNATURES = ("X-Hub-Signature-256", "X-Gitea-Signature", "X-Forgejo-Signature"
 _TOKEN = "X-Gitlab-Token"  # noqa: S105 - a header's name
 
 
-def read_secret(path: Path) -> bytes:
-    """Return the secret in a file, without surrounding white space.
-
-    Raises:
-        InvalidInput: if the file cannot be read or is empty.
-    """
-    try:
-        secret = path.read_bytes().strip()
-    except OSError as error:
-        message = f"cannot be read: {error.strerror or error}; put the webhook's secret there"
-        raise InvalidInput([fault("", message).within(str(path))]) from None
-    if not secret:
-        message = "is empty; put there the secret that the Git server signs with"
-        raise InvalidInput([fault("", message).within(str(path))])
-    return secret
-
-
 class PushWebhook:
-    """Handles notifications.
+    """A running server, in a thread of its own; it answers ``/`` with ok, for health checks."""
 
-    Args:
-        secret: the key that signs notifications; empty: unsigned ones are accepted.
-        on_push: called for each notification; must return at once.
-    """
+    def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:
+        """Start the server.
 
-    def __init__(self, secret: bytes, on_push: Callable[[], None]) -> None:
+        Args:
+            address: ``host:port``; port 0 picks a free port.
+            secret: the key that signs notifications; empty: those of this machine are accepted.
+            on_push: called for each notification; must return at once.
+
+        Raises:
+            InvalidInput: if it cannot or must not listen on the address.
+        """
         self._secret, self._on_push = secret, on_push
         self._warned = float("-inf")
-        self.route = Route(PATH, self._handle, methods=["POST"])
+        self._socket = _listening(address, local_only=not secret)
+        host, port = self._socket.getsockname()[:2]
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}{_PATH}"
+        app = Starlette(routes=[Route("/", _health), Route(_PATH, self._handle, methods=["POST"])])
+        app.router.redirect_slashes = False
+        config = uvicorn.Config(
+            app,
+            http=_BoundedConnection,
+            ws="none",
+            lifespan="off",
+            log_config=None,
+            log_level="error",  # whoever connects could fill the log with warnings
+            access_log=False,  # paths and headers may hold secrets
+            proxy_headers=False,  # anyone may write them
+            server_header=False,
+            headers=[("Connection", "close")],  # the time limit is for one request
+            timeout_graceful_shutdown=_STOP_TIMEOUT_S,
+        )
+        self._server = uvicorn.Server(config)
+        self._thread = REAL.start_thread("webhook", lambda: self._server.run([self._socket]))
+
+    def close(self) -> None:
+        """Stop the server and wait for its end."""
+        self._server.should_exit = True
+        self._thread.join()
 
     async def _handle(self, request: Request) -> PlainTextResponse:
         """Check a notification and report the push."""
@@ -94,6 +117,61 @@ class PushWebhook:
                 "here and at the Git server?",
                 sender,
             )
+
+
+class _BoundedConnection(H11Protocol):
+    """A connection; the server refuses it if there are too many, and cuts it off in time."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        limit = _TIMEOUT_S if len(self.connections) <= _AT_ONCE else 0.0
+        self._cut_off = asyncio.get_running_loop().call_later(limit, transport.abort)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._cut_off.cancel()
+        super().connection_lost(exc)
+
+
+async def _health(request: Request) -> PlainTextResponse:
+    return PlainTextResponse("ok\n")
+
+
+def _listening(address: str, *, local_only: bool) -> socket.socket:
+    host, colon, port = address.rpartition(":")
+    if not colon or not host or not (port.isascii() and port.isdigit()) or int(port) > 0xFFFF:
+        raise _invalid(f"'{address}' is not an address to listen on; write one like 127.0.0.1:8090")
+    host = host.removeprefix("[").removesuffix("]")
+    family, bound = _resolved(host, int(port), address)
+    if local_only and not ipaddress.ip_address(bound[0].partition("%")[0]).is_loopback:
+        raise _invalid(
+            f"'{address}' can be reached from other machines, so notifications must be "
+            "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1"
+        )
+    listener = socket.socket(family)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(bound)
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        raise _invalid(
+            f"'{address}' cannot be listened on: {error.strerror}; choose another port"
+        ) from None
+    return listener
+
+
+def _resolved(host: str, port: int, address: str) -> tuple[socket.AddressFamily, Any]:
+    try:
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except (OSError, UnicodeError):
+        raise _invalid(
+            f"'{address}': host '{host}' cannot be resolved; write an address of this machine"
+        ) from None
+    return addresses[0][0], addresses[0][4]
+
+
+def _invalid(message: str) -> InvalidInput:
+    return InvalidInput([fault("--webhook", message)])
 
 
 def _bytes(text: str) -> bytes:

@@ -1,4 +1,4 @@
-"""Whether the remote can be reached and the state repo is valid, for logs and diagnostics."""
+"""Whether the remote can be reached, for logs and diagnostics."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from demandops.errors import Fault
 from demandops.runtime import Runtime
 
 log = logging.getLogger("demandops")
@@ -27,20 +26,6 @@ class RemoteStatus:
     last_push: datetime | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class StateRepoStatus:
-    """The status of the state repo.
-
-    ``problems`` are the faults in its files, ``unpublished`` the number of demands in the journal
-    that do not await approval, ``commit`` the newest commit that the generator has read.
-    """
-
-    remote: RemoteStatus
-    problems: tuple[Fault, ...]
-    unpublished: int
-    commit: str
-
-
 class RemoteMonitor:
     """Records and logs whether the remote can be reached; any thread may read ``status``."""
 
@@ -48,26 +33,21 @@ class RemoteMonitor:
         self._address, self._runtime = address, runtime
         self.status = RemoteStatus()
 
-    @property
-    def is_unreachable(self) -> bool:
-        """Whether the last attempt to reach the remote failed."""
-        return bool(self.status.unreachable)
-
     def record_unreachable(self, reason: str) -> None:
         """Record that the remote cannot be reached; warn if it could be before."""
-        if not self.is_unreachable:
+        since = self.status.unreachable_since
+        if since is None:
             log.warning("%s; trying again until it is back", reason)
-            self.status = replace(self.status, unreachable_since=self._runtime.now())
         else:
             log.debug("%s", reason)
-        self.status = replace(self.status, unreachable=reason)
+        since = since or self._runtime.now()
+        self.status = replace(self.status, unreachable=reason, unreachable_since=since)
 
     def record_reached(self, *, pushed: bool = False) -> None:
         """Record that the remote was reached; log it if it could not be before."""
-        now = self._runtime.now()
-        before = self.status
-        if before.unreachable:
-            away = (now - (before.unreachable_since or now)).total_seconds()
+        now, before = self._runtime.now(), self.status
+        if before.unreachable_since is not None:
+            away = (now - before.unreachable_since).total_seconds()
             log.info("%s is back after %.0f s", self._address, away)
         self.status = RemoteStatus(
             push_denied="" if pushed else before.push_denied,

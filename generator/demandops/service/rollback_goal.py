@@ -48,12 +48,6 @@ def to_restoration(
     if not repository.includes(str(head.commit), to):
         message = f"commit {to} is not in the history of the state repo; roll back to one that is"
         raise Refused([fault("", message)])
-    name, email = goal["by"]
-    return restoration(
-        repository.objects,
-        to,
-        drop_newer=bool(goal["dropNewer"]),
-        reason=goal["reason"],
-        by=name,
-        email=email,
-    )
+    by, email = goal["by"]
+    more = {"drop_newer": bool(goal["dropNewer"]), "reason": goal["reason"]}
+    return restoration(repository.objects, to, **more, by=by, email=email)

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from demandops.cluster.health import ClusterDomain, ObjectName, Target
+from demandops.cluster.health.release_health import ClusterDomain, ObjectName, Target
 from demandops.config.repo_settings import RepoSettings
 from demandops.decision import Decision, State
-from demandops.demand.demand_request import DemandRequest
 from demandops.errors import Refused
-from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, keys_of
 from demandops.render.gitops.argocd import project_of
-from demandops.subject import Subject
 
 
 def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:
     """Return the releases that a demand needs, and those that it removes."""
-    after = decision.state
-    requested = _requested_subjects(decision.request, after.ledger)
-    subjects = [*requested, *decision.changes.subjects()]
+    after, request = decision.state, decision.request
+    subjects = [claim.subject for claim in after.ledger.claims_of_demand(request.demand)]
+    if request.adds_claims:
+        subjects += request.subjects()
+    subjects += decision.changes.subjects()
     keys: dict[ReleaseKey, None] = {}
     for subject in dict.fromkeys(subjects):
         keys |= dict.fromkeys(keys_of(after, subject))
@@ -28,13 +27,10 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
     targets = []
     for key in keys:
         new = plan(after, key)
-        old = None
-        if new is None:
-            try:
-                old = plan(before, key)
-            except Refused:
-                continue
-        release = new or old
+        try:
+            release = new or plan(before, key)
+        except Refused:
+            continue
         if release is not None:
             targets.append(_target(release, after.config.repo_settings, wanted=new is not None))
     return tuple(dict.fromkeys(targets))
@@ -49,13 +45,6 @@ def targets_of_state(state: State) -> list[tuple[Release, Target]]:
             target = _target(release, state.config.repo_settings, wanted=True)
             releases.append((release, target))
     return sorted(releases, key=lambda pair: (pair[1].domain.cluster, pair[1].name))
-
-
-def _requested_subjects(request: DemandRequest, ledger: Ledger) -> list[Subject]:
-    subjects = [claim.subject for claim in ledger.claims_of_demand(request.demand)]
-    if request.adds_claims:
-        subjects += request.subjects()
-    return subjects
 
 
 def _target(release: Release, repository: RepoSettings, *, wanted: bool) -> Target:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import re
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
-from demandops.cluster.health import Target
+from demandops.cluster.health.release_health import Target
 from demandops.decision import Decision, Outcome
-from demandops.errors import Refused, fault
 from demandops.ledger.ledger import ClaimChange
-from demandops.runtime import Runtime
 from demandops.staterepo.write.journal import JournalEntry
 
 log = logging.getLogger("demandops")
@@ -26,8 +22,6 @@ Listener = Callable[[Stage, str], None]
 
 State = Literal["arrived", "waiting", "committed", "proposed", "withdrawn", "done"]
 """See :mod:`demandops.service.demand_lifecycle`, which alone changes it."""
-
-_OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +73,7 @@ class Ticket:
     operation: str
     goal: Any
     received: datetime
-    listener: Listener
+    listener: Listener = lambda stage, text: None
     future: Future[Receipt] = field(default_factory=Future)
     base: str = ""
     maybe_published: bool = False
@@ -133,27 +127,9 @@ def receipt_of(
     )
 
 
-def new_ticket(goal: object, operation: str | None, listener: Listener, runtime: Runtime) -> Ticket:
-    """Return a ticket for a goal; its future has failed already if the goal is not plain data.
-
-    Raises:
-        ValueError: for an operation id that a commit trailer cannot carry.
-    """
-    operation = operation or runtime.fresh_id()
-    if not _OPERATION.fullmatch(operation):
-        raise ValueError(f"{operation!r} is not an operation id; use letters, digits and dashes")
-    ticket = Ticket(operation, goal, runtime.now(), listener)
-    try:
-        ticket.goal = json.loads(json.dumps(goal))
-    except (TypeError, ValueError, RecursionError):
-        ticket.future.set_exception(Refused([fault("", "the goal is not plain data")]))
-    return ticket
-
-
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
     """Return a ticket for a demand that an earlier run left in the journal."""
-    received = datetime.fromisoformat(entry.received)
-    ticket = Ticket(entry.operation, entry.goal, received, lambda stage, text: None)
+    ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
     ticket.mark_maybe_published(entry.base)
     if entry.proposal is not None:
         record = entry.proposal

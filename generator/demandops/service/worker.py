@@ -18,8 +18,7 @@ from demandops.service.evaluation import Evaluator
 from demandops.service.remote_status import RemoteMonitor
 from demandops.service.ticket import Receipt, Ticket
 from demandops.service.timing.backoff import LIMIT_EMBEDDED, LIMIT_REMOTE, Backoff
-from demandops.service.timing.lease_expiry import LONGEST_WAIT_S, LeaseExpiry
-from demandops.service.timing.override_expiry import OverrideExpiry
+from demandops.service.timing.expiry import LONGEST_WAIT_S, LeaseExpiry, OverrideExpiry
 from demandops.service.timing.polling import PollTimer
 from demandops.staterepo.git.repository import (
     FetchInterrupted,
@@ -33,6 +32,7 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 log = logging.getLogger("demandops")
 
 _TIDY_EVERY = 300
+"""After how many commits to pack the repository; each adds about twenty loose objects."""
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
 
@@ -62,10 +62,8 @@ class Worker:
         self._timer = PollTimer(
             fetch_interval, repository.runtime, embedded=repository.always_current
         )
-        self._lease_expiry, self._override_expiry = (
-            LeaseExpiry(repository.runtime),
-            OverrideExpiry(),
-        )
+        self._lease_expiry = LeaseExpiry(repository.runtime)
+        self._override_expiry = OverrideExpiry()
         self._ahead = ReadAhead()
         self._batch_limit = LIMIT_EMBEDDED if repository.always_current else LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
@@ -107,7 +105,9 @@ class Worker:
                 self._publish(batch)
                 if self.snapshot.problems:  # a release may have made a change possible
                     self._try_to_carry_out_changes()
-                self._tidy()
+                if self._commits_since_tidy >= _TIDY_EVERY:
+                    self._commits_since_tidy = 0
+                    self._repository.tidy()
             else:
                 self._follow()
             self._check_proposals()
@@ -131,12 +131,6 @@ class Worker:
         fetch = self._timer.seconds_until_due()
         return seconds if fetch is None else min(seconds, fetch)
 
-    def _tidy(self) -> None:
-        """Pack the repository every few hundred commits; each adds about twenty loose objects."""
-        if self._commits_since_tidy >= _TIDY_EVERY:
-            self._commits_since_tidy = 0
-            self._repository.tidy()
-
     # ---- publishing demands ----
 
     def _publish(self, batch: list[Ticket]) -> None:
@@ -152,7 +146,8 @@ class Worker:
             try:
                 wait = self._attempt(batch, backoff)
             except RemoteAway as error:
-                _mark_maybe_published(batch, self.snapshot)
+                for ticket in batch:
+                    ticket.mark_maybe_published(str(self.snapshot.commit))
                 self._record_unreachable(error)
                 self._tip_is_fresh = self._repository.always_current
                 wait = backoff.unreachable()
@@ -174,7 +169,7 @@ class Worker:
             The seconds to wait before the next attempt, or None to continue at once.
         """
         # fetch first: a demand that was committed can no longer be withdrawn
-        if self._must_fetch or self.remote.is_unreachable:
+        if self._must_fetch or self.remote.status.unreachable:
             self._repository.refresh()
             self._must_fetch, self._tip_is_fresh = False, True
         self._demands.answer_withdrawn(batch)
@@ -194,19 +189,19 @@ class Worker:
             if self._repository.refresh() != commits.start.commit:
                 return None
         if self._publish_commits(commits, results):
-            self._answer(results)
             del batch[: len(part)]
             backoff.published()
             return None
         log.info("the state repo has moved; evaluating %d demands again", len(part))
-        _mark_maybe_published(part, commits.start)
+        for ticket in part:
+            ticket.mark_maybe_published(str(commits.start.commit))
         self._must_fetch = True
         return backoff.overtaken(
             len(part), evaluated - began, self._runtime.monotonic() - evaluated
         )
 
     def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
-        """Publish a commit batch; return False if another writer was first.
+        """Publish a commit batch and answer; return False if another writer was first.
 
         If the remote rejects the push for another reason, all demands get that error as the answer.
         """
@@ -215,30 +210,27 @@ class Worker:
         except PushDenied as error:
             results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
             self.remote.record_push_denied(str(error))
-            return True
-        if not published:
-            return False
-        self._record_reached(pushed=not commits.is_empty)
-        self._set_snapshot(commits.head)
-        self._commits_since_tidy += len(results)
-        return True
-
-    def _answer(self, results: list[Result]) -> None:
-        """Answer the demands that have a final result; propose those that need approval."""
+        else:
+            if not published:
+                return False
+            self._record_reached(pushed=not commits.is_empty)
+            self._set_snapshot(commits.head)
+            self._commits_since_tidy += len(results)
         final = [(ticket, result) for ticket, result in results if not isinstance(result, Decision)]
         self._demands.answer(final)
         for ticket, result in results:
             if isinstance(result, Decision):
                 self._approvals.add(ticket, result)
+        return True
 
     def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
         """Wait; meanwhile journal new demands and report to them why they wait."""
         end = self._runtime.monotonic() + seconds
         to_notify = list(batch)
         while not self._stopped_retrying.is_set():
-            if self.remote.is_unreachable:
-                for ticket in to_notify:
-                    ticket.notify("away", f"waiting: {self.remote.status.unreachable}")
+            unreachable = self.remote.status.unreachable
+            for ticket in to_notify if unreachable else ():
+                ticket.notify("away", f"waiting: {unreachable}")
             self._demands.answer_withdrawn(batch)
             left = end - self._runtime.monotonic()
             if left <= 0:
@@ -261,7 +253,7 @@ class Worker:
             new = override_is_due or self._repository.tip() != self.snapshot.commit
             self._record_reached(pushed=new and self._carry_out_changes())
         except FetchInterrupted:
-            self._timer.interrupted()
+            self._timer.request()  # it is still due
         except StateRepoError as error:
             self._record_unreachable(error)
             self._override_expiry.postpone(self._runtime.now())
@@ -342,8 +334,3 @@ class Worker:
         self._demands.blocked = str(error)
         self.remote.record_unreachable(str(error))
         self._timer.finished(reached=False)
-
-
-def _mark_maybe_published(batch: list[Ticket], start: Snapshot) -> None:
-    for ticket in batch:
-        ticket.mark_maybe_published(str(start.commit))

@@ -100,8 +100,7 @@ def test_healthy_means_that_a_chart_edited_in_its_folder_runs(
 def test_a_call_with_another_signature_or_none_is_refused(
     world: World, rig: Rig, secret: bytes | None
 ) -> None:
-    call = controller_webhook.argocd_call(rig.git_url(world.name), "", world.tip(), None)
-    url = f"{rig.url(SERVER)}/api/webhook"
+    url, pushed = f"{rig.url(SERVER)}/api/webhook", (rig.git_url(world.name), "", world.tip(), None)
     with pytest.raises(NoAnswer, match=r"^it answered 400$"):
-        controller_webhook.send(url, call, secret, 5)
-    controller_webhook.send(url, call, WEBHOOK_SECRET.encode(), 5)
+        controller_webhook.call_argocd(url, secret, *pushed)
+    controller_webhook.call_argocd(url, WEBHOOK_SECRET.encode(), *pushed)

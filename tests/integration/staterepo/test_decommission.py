@@ -59,7 +59,7 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
         rig.wait_until(
             lambda: "vehicle01" not in generator.snapshot.state.config.nodes, "it is taken in"
         )
-        assert generator.state_repo_status.problems == ()
+        assert generator.snapshot.problems == ()
         assert rig.git(bare, "ls-tree", "main", ".demandops") == ""
         assert made in [c.id for c in rig.commits(bare)]
         rig.book(generator, goal(3))
@@ -192,12 +192,13 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     url: str, bare: Path, demandops: Run
 ) -> None:
     """As for any demand: it is in the outbox, and the next start carries it out."""
-    from demandops.demand import decommission_goal
+    from demandops.demand.demand_request import Decommission
 
     generator = Generator(url)
     rig.book(generator, goal(1))
     away = bare.rename(bare.with_name("away.git"))
-    generator.submit(decommission_goal.as_data("vehicle01", ("node",), ""), "op-leave")
+    leaving = Decommission("vehicle01", kinds=frozenset({"node"}))
+    generator.submit(leaving.goal(), "op-leave")
     assert generator.close(timeout=0.3) is False
     away.rename(bare)
     assert rig.restart(url) is True

@@ -205,7 +205,7 @@ def test_a_broken_change_is_reported_with_its_commit_until_it_is_mended(
         assert told and all(problem["since"] == made for problem in told)
         assert {problem["author"] for problem in told} == {"Petra Platform <petra@example.org>"}
         assert all(problem["file"].startswith(where) for problem in told), told
-        rig.wait_until(lambda: generator.state_repo_status.problems, "diagnostics tell it")
+        rig.wait_until(lambda: generator.snapshot.problems, "diagnostics tell it")
         assert rig.git(bare, "rev-parse", "main:clusters") == standing
         report = rig.git(bare, "rev-parse", f"main:{problem_report.PATH}")
         rig.book(generator, goal(3), goal(6), leave(3))
@@ -215,7 +215,7 @@ def test_a_broken_change_is_reported_with_its_commit_until_it_is_mended(
         assert len(logged) == len(set(logged)) == len(told)
         followed(bare, person.change(mended, "Mend it"))
         assert problems(bare) == []
-        rig.wait_until(lambda: not generator.state_repo_status.problems, "diagnostics tell it")
+        rig.wait_until(lambda: not generator.snapshot.problems, "diagnostics tell it")
     assert rig.books(bare) == rig.books_after([goal(1), goal(2), goal(6)])
     rig.assert_sound(bare)
 
@@ -229,7 +229,7 @@ def test_a_problem_that_stands_at_a_restart_is_reported_no_second_time(
         rig.book(generator, goal(6))  # of the same application as goal 1
     tip = rig.tip(bare)
     with rig.running(url, fetch_interval=SOON_S) as generator:
-        rig.wait_until(lambda: generator.state_repo_status.problems, "it is seen again")
+        rig.wait_until(lambda: generator.snapshot.problems, "it is seen again")
         assert rig.tip(bare) == tip
         assert rig.book(generator, leave(6))[0].outcome == "released"
     rig.assert_sound(bare)
@@ -273,7 +273,7 @@ def test_two_generators_follow_a_change_once(
         commit = followed(bare, person.change(_move_broker(bare)))
         for generator in (one, two):
             rig.wait_until(
-                lambda generator=generator: generator.state_repo_status.commit == commit.id,
+                lambda generator=generator: str(generator.snapshot.commit) == commit.id,
                 "both have taken it in",
             )
     assert newest(bare).id == commit.id
@@ -286,12 +286,12 @@ def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> 
         rig.running(url, fetch_interval=SOON_S, data=tmp_path / "other") as on,
     ):
         rig.book(off, goal(1))
-        known = off.state_repo_status.commit
+        known = str(off.snapshot.commit)
         commit = followed(bare, person.change(_move_broker(bare)))
-        rig.wait_until(lambda: on.state_repo_status.commit == commit.id, "the other follows")
-        assert off.state_repo_status.commit == known
+        rig.wait_until(lambda: str(on.snapshot.commit) == commit.id, "the other follows")
+        assert str(off.snapshot.commit) == known
         off.fetch_now()  # as a webhook would
-        rig.wait_until(lambda: off.state_repo_status.commit == commit.id, "it follows now")
+        rig.wait_until(lambda: str(off.snapshot.commit) == commit.id, "it follows now")
 
 
 # ---- the remote is slow, or away ----
@@ -307,7 +307,7 @@ def test_a_look_that_hangs_holds_up_no_demand(http: str, server: Server, bare: P
         ticket = generator.submit(goal(2), listener=stages)
         rig.wait_until(lambda: "committed" in stages.names, "it is judged although the look hangs")
         assert talking.poll() is not None, "the look was ended for it"
-        assert not generator.state_repo_status.remote.unreachable
+        assert not generator.remote_status.unreachable
         server.faults.hang = None
         hang.set()
         assert rig.receipt(ticket).outcome == "booked"
@@ -333,14 +333,12 @@ def test_a_remote_away_is_logged_once_and_once_when_it_is_back(
         rig.book(generator, goal(1))
         server.faults.away = True
         rig.wait_until(lambda: server.refused > 2, "it was looked at again and again")
-        assert "503" in generator.state_repo_status.remote.unreachable
+        assert "503" in generator.remote_status.unreachable
         made = person.change(_move_broker(bare))
         server.faults.away = False
         generator.fetch_now()
         followed(bare, made)
-        rig.wait_until(
-            lambda: not generator.state_repo_status.remote.unreachable, "it is known to be back"
-        )
+        rig.wait_until(lambda: not generator.remote_status.unreachable, "it is known to be back")
     told = [record.getMessage() for record in caplog.records]
     assert sum("trying again until it is back" in text for text in told) == 1
     assert sum(" is back after " in text for text in told) == 1
@@ -352,9 +350,7 @@ def test_a_goal_is_told_why_it_waits_and_can_be_taken_back_meanwhile(
     with rig.running(http, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
         server.faults.away = True
-        rig.wait_until(
-            lambda: generator.state_repo_status.remote.unreachable, "it is known to be away"
-        )
+        rig.wait_until(lambda: generator.remote_status.unreachable, "it is known to be away")
         stages = Stages()
         stays = generator.submit(goal(2), "op-2")
         goes = generator.submit(goal(3), "op-3", stages)
@@ -378,9 +374,7 @@ def test_a_goal_is_told_why_it_waits_and_can_be_taken_back_meanwhile(
 def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server, bare: Path) -> None:
     with rig.running(http, fetch_interval=SOON_S, queue_limit=3) as generator:
         server.faults.away = True
-        rig.wait_until(
-            lambda: generator.state_repo_status.remote.unreachable, "it is known to be away"
-        )
+        rig.wait_until(lambda: generator.remote_status.unreachable, "it is known to be away")
         tickets = []
         with pytest.raises(QueueFull, match=r"waiting already for the state repo: .*503"):
             for number in range(500):

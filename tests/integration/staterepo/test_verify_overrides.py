@@ -15,7 +15,7 @@ from tests.kit import rig
 from tests.kit.repo import read as file
 from tests.kit.rig import Person
 
-FORGED = "Forged\n\nOperation: {}\nDemand-Id: none\n{}Render-Version: 1"
+FORGED = "Forged\n\nOperation: {}\nDemand-Id: none\n{}Render-Version: 2"
 EDGE = "clusters/c-its/perception/edge"
 
 

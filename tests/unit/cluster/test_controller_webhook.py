@@ -158,9 +158,9 @@ def test_a_repository_without_a_host_cannot_be_named() -> None:
 @pytest.mark.parametrize(
     ("text", "mode", "message"),
     [
-        (None, 0, "{file} cannot be read: No such file or directory"),
-        ("", 0o600, "{file} is empty"),
-        ("\n", 0o600, "{file} is empty"),
+        (None, 0, "{file} cannot be read: No such file or directory; put the secret there"),
+        ("", 0o600, "{file} is empty; put the secret there"),
+        (" \r\n", 0o600, "{file} is empty; put the secret there"),
         (SECRET, 0o644, "{file} may be read by everybody on this machine; run chmod o= on it"),
     ],
 )

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from demandops.cluster.health import ClusterDomain, Health, Target, health_reader, worst
+from demandops.cluster.health import health_reader
+from demandops.cluster.health.release_health import ClusterDomain, Health, Target, worst
 
 from tests.kit.cluster import Letters, condition, deployment
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from demandops.cluster.access import ClusterAccess
-from demandops.cluster.health import ObjectSelector
+from demandops.cluster.health.release_health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 
 from tests.kit.http import Answer, Call, kubeconfig, serving
@@ -62,7 +62,6 @@ def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
     api.refused = "/argocd/"
     read = store(api)
     read.read_once([OVER, CHILDREN])
-    assert read.read_error == "applications in argocd: Forbidden"
     assert read.why_unknown([OVER]) == "applications in argocd: Forbidden"
     assert read.why_unknown([CHILDREN]) == ""
     assert read.why_unknown([DEPLOYMENTS]) == "it has not been read yet"

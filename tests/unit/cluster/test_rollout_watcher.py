@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from demandops.cluster.access import ClusterAccess
-from demandops.cluster.health import ClusterDomain, Target
+from demandops.cluster.health.release_health import ClusterDomain, Target
 from demandops.cluster.rollout_watcher import RolloutWatcher
 
 from tests.kit.cluster import Letters

@@ -74,7 +74,7 @@ EDITS: dict[str, tuple[str, str, str]] = {
     ),
     # demandops.yaml
     "a controller without its section": (ROOT, "gitops: flux", "gitops: argocd"),
-    "a newer generator's rendering": (ROOT, "renderVersion: 1", "renderVersion: 2"),
+    "a newer generator's rendering": (ROOT, "renderVersion: 2", "renderVersion: 3"),
     # inventory/clusters.yaml
     "a cluster twice": (CLUSTERS, "  - name: c-its", "  - name: c-its\n  - name: c-its"),
     "a cluster that is no folder": (CLUSTERS, "name: c-its", "name: ../c-its"),

@@ -18,9 +18,8 @@ import yaml
 from demandops import naming, settings
 from demandops.config.config import NODES_FILE, Config
 from demandops.connections import connection_types
-from demandops.connections.communication_client import Client, ClientKey
 from demandops.connections.connection import Connection
-from demandops.connections.connection_type import Connections, ConnectionType
+from demandops.connections.connection_type import Client, ClientKey, Connections, ConnectionType
 from demandops.decision import Decision
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file
@@ -185,7 +184,7 @@ def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
     subject = Subject(SubjectKind.CONNECTION, "c")
     (release,) = release_causes.releases(world.state, subject)
     assert release_causes.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
-    files = [(one.file, one.entry) for one in release_causes.shaping_files(release, world.config)]
+    files = [each[:2] for each in release_causes.shaping_files(release, world.config)]
     assert ("inventory/nodes.yaml", "edge.wan") in files
     assert ("registry/images.yaml", "images.relay") in files
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import pytest
 import yaml
 from demandops.config.load import load
-from demandops.connections.communication_client import ClientKey
+from demandops.connections.connection_type import ClientKey
 from demandops.connections.mqtt import MQTT
 from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH

@@ -120,7 +120,7 @@ def test_dropping_renewing_and_releasing_need_none() -> None:
 
 def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     from demandops.decision import decide
-    from demandops.demand.approval_rule import with_leases_from_approval
+    from demandops.demand.permission import with_leases_from_approval
     from demandops.ledger import claim_file
 
     from tests.kit.memory import NOW

@@ -120,10 +120,9 @@ Write = Callable[[Path], object]
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (lambda path: None, "cannot be read: No such file or directory"),
-        (lambda path: path.write_text("\n"), "must hold a token: one line of plain text"),
-        (lambda path: path.write_text("two\nlines"), "must hold a token: one line of plain text"),
-        (lambda path: path.write_bytes(b"\xff\xfe"), "cannot be read: it is not text"),
+        (lambda path: None, ": cannot be read: No such file or directory; put the secret there"),
+        (lambda path: path.write_text("two\nlines"), " must hold a token: one line of plain text"),
+        (lambda path: path.write_bytes(b"\xff\xfe"), " must hold a token: one line of plain text"),
     ],
 )
 def test_a_token_file_that_is_none_is_told(tmp_path: Path, write: Write, message: str) -> None:
@@ -132,7 +131,7 @@ def test_a_token_file_that_is_none_is_told(tmp_path: Path, write: Write, message
     configured = Proposals.model_validate({"forge": "github", "url": "https://github.com/a/b"})
     with pytest.raises(ForgeError) as error:
         forge_for(configured, file)
-    assert str(error.value) == f"the token file {file} {message}"
+    assert str(error.value) == f"the token file {file}{message}"
 
 
 def test_no_token_file_is_told_with_the_remedy() -> None:

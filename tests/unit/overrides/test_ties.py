@@ -10,19 +10,19 @@ from itertools import product
 from typing import Any
 
 from demandops.config.config import Config
-from demandops.config.load import load
-from demandops.config.override import Override, OverrideFile, Selector, merge_patch
-from demandops.config.override_conflict import (
+from demandops.config.cross_check import (
     can_meet,
     contested_effects,
     patches_commute,
     patterns_overlap,
 )
+from demandops.config.load import load
+from demandops.config.override import Override, OverrideFile, Selector, merge_patch
 from demandops.config.policy import matches
-from demandops.plan.checks import trial_demands
+from demandops.plan.overrides.claim_overrides import Traits, fits
 from demandops.plan.overrides.release_overrides import apply_effects, effects_on
-from demandops.plan.overrides.selectors import Traits, fits
 from demandops.plan.release import ServiceRelease
+from demandops.render.trial_render import trial_releases
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -179,7 +179,7 @@ effects = st.fixed_dictionaries(
 
 @lru_cache
 def _release() -> ServiceRelease:
-    (made,) = trial_demands.trial_releases(config()).values()
+    (made,) = trial_releases(config()).values()
     return made[0]
 
 

@@ -12,7 +12,7 @@ from demandops.connections.route import Route
 from demandops.demand.claim import Claim
 from demandops.demand.lease import Lease
 from demandops.ledger.ledger import Ledger
-from demandops.service.timing.lease_expiry import LeaseClock
+from demandops.service.timing.expiry import LeaseExpiry
 
 from tests.kit.clock import Clock
 from tests.scenarios.running import START, rebuilt
@@ -39,15 +39,15 @@ def clocks() -> Clock:
 
 
 @pytest.fixture
-def clock(clocks: Clock) -> LeaseClock:
-    return LeaseClock(clocks)
+def clock(clocks: Clock) -> LeaseExpiry:
+    return LeaseExpiry(clocks)
 
 
-def ended(clock: LeaseClock, ledger: Ledger) -> list[str]:
+def ended(clock: LeaseExpiry, ledger: Ledger) -> list[str]:
     return [claim.demand for claim in clock.ended_claims(ledger)[1]]
 
 
-def test_nothing_ends_before_its_slack_has_passed(clocks: Clock, clock: LeaseClock) -> None:
+def test_nothing_ends_before_its_slack_has_passed(clocks: Clock, clock: LeaseExpiry) -> None:
     ledger = leased(("b", 61, 0), ("a", 50, 10), ("c", 3600, 0))
     clocks.pass_(60)
     assert ended(clock, ledger) == []
@@ -60,7 +60,7 @@ def test_nothing_ends_before_its_slack_has_passed(clocks: Clock, clock: LeaseClo
     assert clock.ended_claims(ledger)[0] == clocks.now()
 
 
-def test_it_is_set_back_and_nothing_goes_early(clocks: Clock, clock: LeaseClock) -> None:
+def test_it_is_set_back_and_nothing_goes_early(clocks: Clock, clock: LeaseExpiry) -> None:
     ledger = leased(("a", 60, 0))
     clocks.set_by(-86_400)
     clocks.pass_(3600)
@@ -71,7 +71,7 @@ def test_it_is_set_back_and_nothing_goes_early(clocks: Clock, clock: LeaseClock)
 @pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
 def test_it_is_set_forward_and_a_full_term_is_granted(
     clocks: Clock,
-    clock: LeaseClock,
+    clock: LeaseExpiry,
     steps: list[int],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -90,7 +90,7 @@ def test_it_is_set_forward_and_a_full_term_is_granted(
     assert ended(clock, ledger) == ["short", "long"]
 
 
-def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: LeaseClock) -> None:
+def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: LeaseExpiry) -> None:
     ledger = leased(("a", 60, 0))
     clocks.pass_(50)
     clocks.set_by(3600)
@@ -100,14 +100,14 @@ def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: Lea
     assert ended(clock, ledger) == ["a"]
 
 
-def test_a_machine_that_slept_grants_a_full_term(clocks: Clock, clock: LeaseClock) -> None:
+def test_a_machine_that_slept_grants_a_full_term(clocks: Clock, clock: LeaseExpiry) -> None:
     ledger = leased(("a", 60, 0))
     clocks.set_by(8 * 3600)  # the steady clock stands still meanwhile
     assert ended(clock, ledger) == []
 
 
 def test_a_clock_that_is_drawn_on_slowly_is_no_step(
-    clocks: Clock, clock: LeaseClock, caplog: pytest.LogCaptureFixture
+    clocks: Clock, clock: LeaseExpiry, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
     ledger = leased(("a", 60, 0))
@@ -120,7 +120,7 @@ def test_a_clock_that_is_drawn_on_slowly_is_no_step(
 
 
 def test_none_of_a_demand_goes_while_a_part_is_granted_more(
-    clocks: Clock, clock: LeaseClock
+    clocks: Clock, clock: LeaseExpiry
 ) -> None:
     ledger = leased(("both", 60, 0), ("both", 600, 0), ("other", 60, 0))
     clocks.set_by(3600)
@@ -131,7 +131,7 @@ def test_none_of_a_demand_goes_while_a_part_is_granted_more(
     assert ended(clock, ledger) == ["both", "other", "both"]
 
 
-def test_it_looks_again_when_the_first_lease_ends(clocks: Clock, clock: LeaseClock) -> None:
+def test_it_looks_again_when_the_first_lease_ends(clocks: Clock, clock: LeaseExpiry) -> None:
     ledger = leased(("a", 20, 10), ("b", 600, 0))
     assert clock.seconds_until_due(ledger, 60.0) == pytest.approx(30.01)
     clocks.pass_(29.5)

@@ -60,14 +60,6 @@ def test_what_is_asked_for_many_times_is_one_look_and_one_after_it(clock: Clock)
     assert made.seconds_until_due() is None
 
 
-def test_a_look_that_was_cut_short_is_still_due(clock: Clock) -> None:
-    made = PollTimer(0, clock)
-    made.request()
-    assert made.start_if_due()
-    made.interrupted()
-    assert made.start_if_due()
-
-
 def test_a_repository_on_this_disk_is_looked_at_every_second(clock: Clock) -> None:
     made = PollTimer(30, clock, embedded=True)
     made.finished(reached=True)
@@ -105,7 +97,7 @@ def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCapt
     remote.record_reached()
     for _ in range(3):
         remote.record_unreachable("cannot be fetched: no route")
-    assert remote.is_unreachable and remote.status.unreachable == "cannot be fetched: no route"
+    assert remote.status.unreachable == "cannot be fetched: no route"
     clock.pass_(90)
     for _ in range(3):
         remote.record_reached(pushed=True)
@@ -113,13 +105,14 @@ def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCapt
         "cannot be fetched: no route; trying again until it is back",
         "https://git.example/state.git is back after 90 s",
     ]
-    assert not remote.is_unreachable and remote.status.last_push is not None
+    assert not remote.status.unreachable and remote.status.last_push is not None
 
 
 def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) -> None:
     remote = RemoteMonitor("somewhere", clock)
     remote.record_push_denied("takes no push: frozen")
     remote.record_reached()
-    assert remote.status.push_denied == "takes no push: frozen" and not remote.is_unreachable
+    assert remote.status.push_denied == "takes no push: frozen"
+    assert not remote.status.unreachable
     remote.record_reached(pushed=True)
     assert remote.status.push_denied == ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from demandops import strict_yaml
-from demandops.cluster.health import ObjectName
+from demandops.cluster.health.release_health import ObjectName
 from demandops.decision import decide
 from demandops.service import rollout_targets
 

@@ -44,7 +44,7 @@ def test_a_join_says_what_starts_for_whom_and_what_is_missing(desk: Any) -> None
         "Requester: station00\n"
         "Application: edge/fusion\n"
         "Request-Id: intersection\n"
-        "Render-Version: 1\n"
+        "Render-Version: 2\n"
     )
 
 
@@ -66,7 +66,7 @@ def test_a_further_requester_changes_nothing_that_runs(desk: Any) -> None:
         "Requester: vehicle01\n"
         "Application: edge/fusion\n"
         "Request-Id: intersection\n"
-        "Render-Version: 1\n"
+        "Render-Version: 2\n"
     )
 
 
@@ -109,7 +109,7 @@ def test_a_release_says_what_stops_and_what_was_not_held(desk: Any) -> None:
         "Requester: vehicle00\n"
         "Application: edge/fusion\n"
         "Request-Id: intersection\n"
-        "Render-Version: 1\n"
+        "Render-Version: 2\n"
     )
 
 
@@ -131,7 +131,7 @@ def test_following_people_says_what_changed_and_what_was_not_taken_in() -> None:
         "Operation: follow\n"
         f"Follows: {'c' * 40}\n"
         f"Since: {'b' * 40}\n"
-        "Render-Version: 1\n"
+        "Render-Version: 2\n"
     )
 
 

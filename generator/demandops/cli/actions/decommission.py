@@ -12,7 +12,7 @@ from demandops.cli.actions.ledger_change import show_consequences, started_gener
 from demandops.cli.json_output import claim_data, output_option, print_json
 from demandops.cli.output import console, progress, signing_option, state_repo_option
 from demandops.decision import decide
-from demandops.demand import decommission_goal
+from demandops.demand.demand_request import Decommission
 from demandops.errors import Refused
 from demandops.ledger.ledger import ClaimChange
 from demandops.runtime import REAL
@@ -49,9 +49,8 @@ def decommission(
     the claims that it shares with other requesters. If a node and a requester have the name, both
     are decommissioned.
     """
-    goal = decommission_goal.as_data(
-        name, (kinds,) if kinds else ("node", "requester"), str(authorship.operator())
-    )
+    chosen = frozenset([kinds] if kinds else ["node", "requester"])
+    goal = Decommission(name, kinds=chosen, by=str(authorship.operator())).goal()
     done = _dry_run(goal, state_repo, output) if dry_run else _book(goal, state_repo, signing_key)
     row = done or _row(name, "unchanged", None, ())
     if output == "json":

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Iterator
 
 from demandops.cli.output import printable
-from demandops.plan.views.bookkeeping_diff import EntryChange
+from demandops.plan.views.bookkeeping import EntryChange
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.changes.merge_preview import FileChange
 from demandops.staterepo.pull_request.merge_check import CheckResult

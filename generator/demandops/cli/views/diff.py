@@ -13,8 +13,7 @@ from demandops.cli.json_output import (
     release_change_data,
 )
 from demandops.cli.output import SIGNS, console, progress, state_repo_option, warn_of
-from demandops.plan.views.bookkeeping import bookkeeping
-from demandops.plan.views.bookkeeping_diff import EntryChange, bookkeeping_changes
+from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.changes.merge_preview import MergePreview, planned_releases, preview
 from demandops.render.gitops.paths import CLUSTERS_ROOT

@@ -14,7 +14,8 @@ from rich.table import Table
 from demandops.cli.json_output import output_option, print_json, release_data
 from demandops.cli.output import console, errors, progress, state_repo_option
 from demandops.cluster import access
-from demandops.cluster.health import Health, ObjectSelector, Target, health_reader
+from demandops.cluster.health import health_reader
+from demandops.cluster.health.release_health import Health, ObjectSelector, Target
 from demandops.cluster.object_cache import ObjectCache
 from demandops.runtime import REAL
 from demandops.service import rollout_targets
@@ -109,17 +110,12 @@ def _seen(
     store = stores.get(target.domain.cluster)
     if store is None:
         return Health("waiting", "no access to this cluster"), "", ""
-    read = health_reader(target.domain)
-    unread = store.why_unknown(read.objects_to_watch(target.domain))
+    unread = store.unread(target.domain)
     if unread:
-        reason = f"cannot be read: {unread}"
-        return Health("waiting", reason, f"cluster {store.name}"), "", ""
-    objects = store.objects()
-    health = read.domain_health(target.domain, commit, objects, repo)
-    if health.state != "waiting":
-        health = read.release_health(target, commit, objects, repo)
+        return unread, "", ""
+    read, objects = health_reader(target.domain), store.objects()
     return (
-        health,
+        read.health(target, commit, objects, repo),
         read.applied_commit(target.domain, objects),
         read.last_transition(target, objects),
     )

@@ -17,7 +17,7 @@ from demandops.cli.json_output import (
 from demandops.config.override import Override
 from demandops.demand.claim import Claim
 from demandops.ledger.world import World
-from demandops.plan.overrides.suspended_claims import suspended_by, without_suspended
+from demandops.plan.overrides.claim_overrides import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import release_causes
 from demandops.staterepo.history.commit_log import LogEntry
@@ -38,8 +38,8 @@ def release(snapshot: Snapshot, running: Release) -> dict[str, Any]:
         "requesters": sorted({who for claim in claims for who in claim.requesters}),
         "claims": [_claim(claim, world) for claim in claims],
         "shaped_by": [
-            {"file": each.file, "entry": each.entry or None, "what": each.what}
-            for each in release_causes.shaping_files(running, world.config)
+            {"file": file, "entry": entry or None, "what": what}
+            for file, entry, what in release_causes.shaping_files(running, world.config)
         ],
         "overrides": [override_data(*each) for each in running.shaping.by],
     }
@@ -81,7 +81,7 @@ def commits(repo: Reader, path: str, commit: str, most: int) -> dict[str, Any]:
 
 def _claim(claim: Claim, world: World) -> dict[str, Any]:
     suspended = suspended_by(claim, world)
-    kept = release_causes.keeping_override(claim, world.config)
+    kept = world.config.overrides.get(claim.keeping_override or "")
     return claim_data(claim) | {
         "release_by": release_causes.how_to_release(claim),
         "kept_by": override_data(kept, ("keep",)) if kept else None,

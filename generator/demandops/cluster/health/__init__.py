@@ -8,34 +8,7 @@ from __future__ import annotations
 
 from demandops.cluster.health.argocd import ArgoCd
 from demandops.cluster.health.flux import Flux
-from demandops.cluster.health.model import (
-    ClusterDomain,
-    Health,
-    History,
-    Key,
-    Level,
-    ObjectName,
-    Objects,
-    ObjectSelector,
-    Target,
-    worst,
-)
-from demandops.cluster.health.release_health import HealthReader
-
-__all__ = [
-    "ClusterDomain",
-    "Health",
-    "History",
-    "Key",
-    "Level",
-    "ObjectName",
-    "ObjectSelector",
-    "Objects",
-    "Target",
-    "health_reader",
-    "worst",
-]
-
+from demandops.cluster.health.release_health import ClusterDomain, HealthReader
 
 _ARGOCD, _FLUX = ArgoCd(), Flux()
 

@@ -7,18 +7,19 @@ current spec: ``status.sync.comparedTo`` holds the source that it is about.
 
 from __future__ import annotations
 
-from demandops.cluster.health.deployment import deployment_health
-from demandops.cluster.health.model import (
+from demandops.cluster.health.release_health import (
     ClusterDomain,
     Health,
+    HealthReader,
     History,
     Object,
     ObjectName,
     Objects,
     ObjectSelector,
     Target,
+    deployment_health,
+    name_of,
 )
-from demandops.cluster.health.release_health import HealthReader, name_of
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
@@ -104,12 +105,10 @@ def _applied_commits(app: Object) -> list[str]:
     if sync.get("status") == "Synced" and _same(compared, source):
         revisions.append(str(sync.get("revision", "")))
     result = operation.get("syncResult") or {}
-    partial = _requested_sync(operation).get("resources")
-    if (
-        operation.get("phase") == "Succeeded"
-        and not partial
-        and _same(result.get("source"), source)
-    ):
+    whole = operation.get("phase") == "Succeeded" and not _requested_sync(operation).get(
+        "resources"
+    )
+    if whole and _same(result.get("source"), source):
         revisions.append(str(result.get("revision", "")))
     return [revision for revision in revisions if revision]
 
@@ -128,9 +127,8 @@ def _why_outdated(
     if source.get("repoURL") != folder.get("repoURL"):
         return ""  # the chart is in a registry, and the source includes its version
     revision = str(sync.get("revision", ""))
-    if history.includes(revision, commit):
-        return ""
-    if history.unchanged(revision, commit, str(source.get("path", ""))):
+    path = str(source.get("path", ""))
+    if history.includes(revision, commit) or history.unchanged(revision, commit, path):
         return ""
     return "has not applied the commit's chart yet"
 
@@ -142,17 +140,16 @@ def _synced_health(app: Object, name: str, objects: Objects) -> Health:
             continue
         key = ("Deployment", str(item.get("namespace", "")), str(item.get("name", "")))
         if key not in objects:
-            return Health("reconciled", "does not exist yet", f"Deployment {key[1]}/{key[2]}")
+            return Health("reconciled", "does not exist yet", name_of(key))
         health = deployment_health(objects[key])
         if health.state != "healthy":
             return health
     reported = _status(app, "health")
     if reported.get("status") == "Healthy":
         return Health("healthy")
-    reason = str(
-        reported.get("message") or f"its health is {reported.get('status') or 'not known yet'}"
-    )
-    return Health("reconciled", reason, name, failing=reported.get("status") == "Degraded")
+    level = reported.get("status")
+    reason = str(reported.get("message") or f"its health is {level or 'not known yet'}")
+    return Health("reconciled", reason, name, failing=level == "Degraded")
 
 
 def _failure(app: Object) -> tuple[str, str]:

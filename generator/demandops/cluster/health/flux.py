@@ -6,17 +6,20 @@ Objects are plain data as the Kubernetes API returns them. Field names as of Flu
 
 from __future__ import annotations
 
-from demandops.cluster.health.deployment import condition, deployment_health
-from demandops.cluster.health.model import (
+from demandops.cluster.health.release_health import (
     ClusterDomain,
     Health,
+    HealthReader,
     History,
     Object,
     Objects,
     ObjectSelector,
     Target,
+    condition,
+    deployment_health,
+    name_of,
+    worst,
 )
-from demandops.cluster.health.release_health import HealthReader, name_of
 
 _HELM_NAME = "helm.toolkit.fluxcd.io/name"
 """The label that helm-controller sets on everything that it installs."""
@@ -72,11 +75,7 @@ class Flux(HealthReader):
             return Health("reconciled", str(ready.get("message", "")), name, failing=True)
         if not current or ready.get("status") != "True":
             return Health("reconciled", str(ready.get("message") or "is being installed"), name)
-        for deployment in self._deployments(target, objects):
-            health = deployment_health(deployment)
-            if health.state != "healthy":
-                return health
-        return Health("healthy")
+        return worst([deployment_health(each) for each in self._deployments(target, objects)])
 
     def _service_state(self, status: Object) -> Object:
         return condition(status, "Ready")

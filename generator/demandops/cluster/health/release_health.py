@@ -3,18 +3,101 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Protocol
 
-from demandops.cluster.health.deployment import condition, deployment_health
-from demandops.cluster.health.model import (
-    ClusterDomain,
-    Health,
-    History,
-    Key,
-    Object,
-    Objects,
-    ObjectSelector,
-    Target,
-)
+Level = Literal["pushed", "reconciled", "healthy"]
+State = Literal["waiting", "reconciled", "healthy"]
+
+_ORDER: dict[str, int] = {"waiting": 0, "pushed": 0, "reconciled": 1, "healthy": 2}
+
+
+class ObjectName(NamedTuple):
+    """The namespace and name of an object."""
+
+    namespace: str
+    name: str
+
+
+class ObjectSelector(NamedTuple):
+    """Selects objects of a kind: all in a namespace, or the one with this name."""
+
+    kind: str
+    namespace: str
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterDomain:
+    """An access domain on a cluster.
+
+    ``application`` is the Argo CD Application of its folder; with Flux it is ``None``.
+    """
+
+    cluster: str
+    name: str
+    namespace: str
+    application: ObjectName | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A release, and whether it should run.
+
+    With ``by_helm`` it is a service, otherwise the single Deployment of a communication client.
+    """
+
+    domain: ClusterDomain
+    name: str
+    by_helm: bool
+    wanted: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """The state of a domain or a release.
+
+    ``reason`` says why it has not reached the next level, if possible in the controller's words.
+    ``object`` is the object that the reason comes from. ``failing`` says whether the reason is a
+    failure.
+    """
+
+    state: State
+    reason: str = ""
+    object: str = ""
+    failing: bool = False
+
+    def reaches(self, level: Level) -> bool:
+        """Report whether the state is at least ``level``."""
+        return _ORDER[self.state] >= _ORDER[level]
+
+
+Key = tuple[str, str, str]
+"""Kind, namespace, name."""
+Object = Mapping[str, Any]
+Objects = Mapping[Key, Object]
+
+
+class History(Protocol):
+    """Queries on the state repo's commits."""
+
+    def includes(self, commit: str, other: str) -> bool:
+        """Report whether ``commit`` is ``other`` or comes after it."""
+        ...
+
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Report whether two commits have the same content under ``path``."""
+        ...
+
+
+def worst(healths: list[Health]) -> Health:
+    """Return the least advanced health; if several are equal, prefer a failing one."""
+    return min(
+        healths,
+        key=lambda health: (_ORDER[health.state], not health.failing),
+        default=Health("healthy"),
+    )
 
 
 class HealthReader(ABC):
@@ -37,6 +120,13 @@ class HealthReader(ABC):
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
         """Return how far a domain has applied a commit."""
+
+    def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
+        """Return how far a commit has started or removed a release: first applied, then started."""
+        domain = self.domain_health(target.domain, commit, objects, history)
+        if domain.state == "waiting":
+            return domain
+        return self.release_health(target, commit, objects, history)
 
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
@@ -85,7 +175,6 @@ class HealthReader(ABC):
         return kind, target.domain.namespace, target.name
 
     def _deployments(self, target: Target, objects: Objects) -> list[Object]:
-        """Return the Deployments of a service."""
         return [
             item
             for (kind, namespace, _), item in objects.items()
@@ -106,3 +195,26 @@ def name_of(key: Key) -> str:
     """Return the name of an object for people: ``Deployment perception/od-edge``."""
     kind, namespace, name = key
     return f"{kind} {namespace}/{name}"
+
+
+def deployment_health(deployment: Object) -> Health:
+    """Return whether all replicas of a Deployment are available with its current spec."""
+    metadata, status = deployment["metadata"], deployment.get("status") or {}
+    name = name_of(("Deployment", metadata.get("namespace"), metadata.get("name")))
+    wanted = (deployment.get("spec") or {}).get("replicas", 1)
+    current = status.get("observedGeneration", 0) >= metadata.get("generation", 0)
+    updated, available = status.get("updatedReplicas", 0), status.get("availableReplicas", 0)
+    if current and updated >= wanted and available >= wanted:
+        return Health("healthy")
+    for kind, bad in (("ReplicaFailure", "True"), ("Progressing", "False")):
+        problem = condition(status, kind)
+        if problem.get("status") == bad:
+            message = str(problem.get("message", ""))
+            return Health("reconciled", message, name, failing=True)
+    return Health("reconciled", f"{available} of {wanted} replicas are available", name)
+
+
+def condition(status: Object, kind: str) -> Object:
+    """Return the condition of a type; empty if there is none."""
+    conditions = status.get("conditions") or ()
+    return next((item for item in conditions if item.get("type") == kind), {})

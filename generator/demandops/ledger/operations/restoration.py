@@ -2,7 +2,7 @@
 
 It releases newer claims only if the request says so. A restored lease runs for its full term from
 now on, because its old end may have passed. Claims that an override keeps belong to no demand;
-:mod:`demandops.plan.overrides.kept_claims` updates them after every change.
+:mod:`demandops.plan.overrides.claim_overrides` updates them after every change.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from datetime import datetime
 
 from demandops.demand import admission, permission
 from demandops.demand.claim import Claim
-from demandops.demand.demand_request import Demanded, DemandRequest, Place, Put
+from demandops.demand.demand_request import Demanded, DemandRequest, Put
 from demandops.demand.lease import Lease, Term
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.claim_file import path_of
@@ -120,19 +120,11 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
             yield found.within(path_of(change.key))
 
 
-class _Claim(Place):
-    """A claim's own fields."""
-
-    def at(self, path: str) -> str:
-        """Return the field unchanged."""
-        return path
-
-
 def _request_for(claim: Claim) -> Put:
-    """Return a request that books this claim."""
+    """Return a request that books this claim; its faults name the claim's own fields."""
     return Put(
         id=claim.request,
-        demanded=(Demanded(claim.held, claim.requesters, _Claim("")),),
+        demanded=(Demanded(claim.held, claim.requesters, str),),
         demand=claim.demand,
         lease_s=claim.lease.seconds if claim.lease else None,
     )

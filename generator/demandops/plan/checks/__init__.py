@@ -1,1 +1,1 @@
-"""Checks of a booking by its plan (quotas, denials), and trial demands for a configuration."""
+"""Checks of a booking by its plan: quotas and denials."""

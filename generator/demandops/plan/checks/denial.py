@@ -17,8 +17,13 @@ from demandops.demand.demand_request import Demanded, DemandRequest
 from demandops.errors import Fault
 from demandops.ledger.ledger import Changes
 from demandops.ledger.world import World
-from demandops.plan.overrides.selectors import Traits, fits, has_labels, traits_of
-from demandops.plan.overrides.suspended_claims import suspended_by
+from demandops.plan.overrides.claim_overrides import (
+    Traits,
+    fits,
+    has_labels,
+    suspended_by,
+    traits_of,
+)
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import keys_of_claims
 

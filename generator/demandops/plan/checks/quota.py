@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from demandops.config.policy import AccessDomain
-from demandops.demand.application import Application
-from demandops.demand.claim import Claim
 from demandops.errors import Fault, fault
 from demandops.ledger.ledger import Changes
 from demandops.ledger.world import World
@@ -23,8 +21,9 @@ def faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
     domains = {(found.name, who): found for node, who in holders if (found := domain_of.get(node))}
     for (_, requester), domain in sorted(domains.items(), key=lambda pair: pair[0]):
         yield from _claims(requester, before, after, domain)
-    touched = [c.after or c.before for c in changes.claims]
-    for node in sorted(_nodes(claim for claim in touched if claim)):
+    touched = [claim for c in changes.claims if (claim := c.after or c.before)]
+    apps = [claim.application for claim in touched if claim.is_on_application]
+    for node in sorted({node for app in apps for node in app.needed_nodes()}):
         yield from _services(node, before, after)
 
 
@@ -68,8 +67,3 @@ def _exceeded(domain: AccessDomain, quota: str, most: int, usage: str) -> Fault:
         "something first, or ask for a change of policy/",
         code="quota",
     )
-
-
-def _nodes(claims: Iterable[Claim]) -> set[str]:
-    held = (claim.held for claim in claims)
-    return {node for one in held if isinstance(one, Application) for node in one.needed_nodes()}

@@ -15,7 +15,7 @@ from demandops.demand.claim import ClaimKey
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
-from demandops.plan.overrides import kept_claims
+from demandops.plan.overrides.claim_overrides import kept_subjects, update_kept_claims
 from demandops.subject import Subject
 
 
@@ -63,10 +63,8 @@ def update_ledger(
     for override in expired:
         files |= _marker(override)
     after = replace(after, ledger=replace(after.ledger, ended=ended))
-    kept = (*kept_claims.kept_subjects(before.ledger), *kept_claims.kept_subjects(after.ledger))
-    ledger, keys = kept_claims.update_kept_claims(
-        before.ledger, after, dict.fromkeys((*subjects, *kept)), now
-    )
+    kept = (*kept_subjects(before.ledger), *kept_subjects(after.ledger))
+    ledger, keys = update_kept_claims(before.ledger, after, dict.fromkeys((*subjects, *kept)), now)
     files |= changed_claim_files(after.ledger, ledger, keys)
     return LedgerUpdate(ledger, tuple(keys), files)
 

@@ -10,10 +10,9 @@ from dataclasses import replace
 
 from demandops.config.config import Config
 from demandops.config.override import Override, Shaping
-from demandops.demand.claim import Claim
+from demandops.demand.claim import Claim, requesters_of
 from demandops.ledger.world import World
-from demandops.plan.overrides.selectors import Traits, selects
-from demandops.plan.overrides.suspended_claims import denied_by
+from demandops.plan.overrides.claim_overrides import Traits, denied_by, selects
 from demandops.plan.release import Release, ServiceRelease, claims_of
 
 
@@ -91,5 +90,4 @@ def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:
             tuple(sorted(appdefs)),
             service=release.key.service,
         )
-    requesters = {who for claim in claims for who in claim.requesters}
-    return Traits(nodes, tuple(sorted(requesters)), connections=release.connections)
+    return Traits(nodes, requesters_of(claims), connections=release.connections)

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
+from demandops.demand.claim import requesters_of
 from demandops.ledger.world import World
-from demandops.plan.connection_clients import connection_topics
-from demandops.plan.overrides.suspended_claims import suspended_claims, without_suspended
+from demandops.plan.overrides.claim_overrides import suspended_claims, without_suspended
+from demandops.plan.planner import connection_topics
 from demandops.plan.release import ServiceRelease
 from demandops.plan.views import release_causes
 from demandops.subject import SubjectKind
@@ -21,13 +22,13 @@ from demandops.subject import SubjectKind
 class ServiceEntry:
     """One service: its requesters and its inputs (role → sorted topics)."""
 
-    applications: tuple[str, ...]
+    applications: list[str]
     service: str
     node: str
     source: str | None
     source_topic: str | None
     inputs: dict[str, list[str]]
-    requesters: tuple[str, ...]
+    requesters: list[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +37,8 @@ class ConnectionEntry:
 
     source: str
     target: str
-    topics: tuple[str, ...]
-    requesters: tuple[str, ...]
+    topics: list[str]
+    requesters: list[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ class SuspendedEntry:
     kind: str
     id: str
     demand: str
-    requesters: tuple[str, ...]
+    requesters: list[str]
     override: str
     reason: str
 
@@ -61,7 +62,7 @@ class Bookkeeping:
 
     services: dict[str, ServiceEntry]
     connections: dict[str, ConnectionEntry]
-    suspended: tuple[SuspendedEntry, ...] = ()
+    suspended: list[SuspendedEntry]
 
 
 def bookkeeping(world: World) -> Bookkeeping:
@@ -70,7 +71,7 @@ def bookkeeping(world: World) -> Bookkeeping:
     for release in release_causes.releases(world):
         if isinstance(release, ServiceRelease):
             services[release.name] = ServiceEntry(
-                applications=release.applications,
+                applications=list(release.applications),
                 service=release.key.service,
                 node=release.node.id,
                 source=release.key.source,
@@ -79,7 +80,7 @@ def bookkeeping(world: World) -> Bookkeeping:
                     role: sorted({topic.topic for topic in topics})
                     for role, topics in release.inputs.items()
                 },
-                requesters=release.requesters,
+                requesters=list(release.requesters),
             )
     connections = {}
     active = without_suspended(world).ledger
@@ -90,27 +91,21 @@ def bookkeeping(world: World) -> Bookkeeping:
         connections[id] = ConnectionEntry(
             source=claims[0].connection.source,
             target=claims[0].connection.target,
-            topics=tuple(route.source for route in connection_topics(claims)),
-            requesters=tuple(sorted({who for claim in claims for who in claim.requesters})),
+            topics=[route.source for route in connection_topics(claims)],
+            requesters=list(requesters_of(claims)),
         )
-    return Bookkeeping(
-        services=dict(sorted(services.items())),
-        connections=connections,
-        suspended=tuple(_suspended(world)),
-    )
-
-
-def _suspended(world: World) -> Iterator[SuspendedEntry]:
-    for claim, override in suspended_claims(world):
-        kind = claim.subject.kind.value[:-1]
-        yield SuspendedEntry(
-            kind,
+    suspended = [
+        SuspendedEntry(
+            claim.subject.kind.value[:-1],
             claim.subject.id,
             claim.demand,
-            claim.requesters,
+            list(claim.requesters),
             override.path,
             override.reason,
         )
+        for claim, override in suspended_claims(world)
+    ]
+    return Bookkeeping(dict(sorted(services.items())), connections, suspended)
 
 
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
@@ -118,14 +113,61 @@ def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
 
     ``suspended`` is left out if it is empty.
     """
-    data = asdict(view)
-    for entry in data["services"].values():
-        entry["applications"] = list(entry["applications"])
-        entry["requesters"] = list(entry["requesters"])
-    for entry in data["connections"].values():
-        entry["topics"] = sorted(entry["topics"])
-        entry["requesters"] = list(entry["requesters"])
-    suspended = data.pop("suspended")
-    if suspended:
-        data["suspended"] = [one | {"requesters": list(one["requesters"])} for one in suspended]
-    return data | {"commit": commit}
+    data = asdict(view) | {"commit": commit}
+    if not view.suspended:
+        del data["suspended"]
+    return data
+
+
+@dataclass(frozen=True, slots=True)
+class EntryChange:
+    """One service or connection that was added, changed or removed.
+
+    ``requesters`` are the current ones, or the last ones if it was removed. ``lost`` and ``gained``
+    list what changed.
+    """
+
+    kind: Literal["service", "connection"]
+    name: str
+    change: Literal["added", "changed", "removed"]
+    requesters: list[str]
+    lost: tuple[str, ...] = ()
+    gained: tuple[str, ...] = ()
+
+
+def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
+    """Return every entry that differs: services, then connections, each sorted by name."""
+    return (
+        *_changes("service", dict(old.services), dict(new.services)),
+        *_changes("connection", dict(old.connections), dict(new.connections)),
+    )
+
+
+_Entry = ServiceEntry | ConnectionEntry
+
+
+def _changes(
+    kind: Literal["service", "connection"], old: dict[str, _Entry], new: dict[str, _Entry]
+) -> Iterator[EntryChange]:
+    for name in sorted({*old, *new}):
+        if name not in new:
+            yield EntryChange(kind, name, "removed", old[name].requesters)
+        elif name not in old:
+            yield EntryChange(kind, name, "added", new[name].requesters)
+        elif old[name] != new[name]:
+            had, has = list(_facts(old[name])), list(_facts(new[name]))
+            lost = tuple(fact for fact in had if fact not in has)
+            gained = tuple(fact for fact in has if fact not in had)
+            yield EntryChange(kind, name, "changed", new[name].requesters, lost, gained)
+
+
+def _facts(entry: _Entry) -> Iterator[str]:
+    yield from (f"requester {requester}" for requester in entry.requesters)
+    if isinstance(entry, ConnectionEntry):
+        yield f"from {entry.source} to {entry.target}"
+        yield from (f"topic {topic}" for topic in entry.topics)
+        return
+    yield f"on {entry.node}"
+    yield from (f"for {application}" for application in entry.applications)
+    for role, topics in sorted(entry.inputs.items()):
+        yield from (f"{role} {topic}" for topic in topics)

@@ -11,8 +11,8 @@ from typing import Literal
 from demandops.config.override import Override, format_time
 from demandops.demand.claim import Claim
 from demandops.ledger.world import World
-from demandops.plan.overrides import kept_claims
-from demandops.plan.overrides.suspended_claims import suspended_by
+from demandops.plan.overrides import claim_overrides
+from demandops.plan.overrides.claim_overrides import suspended_by
 from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import all_keys
@@ -78,7 +78,7 @@ def _claims(world: World) -> dict[str, list[Claim]]:
     """Return override → the claims that it suspends or would keep."""
     found = defaultdict[str, list[Claim]](list)
     for claim in sorted(world.ledger, key=lambda one: (str(one.subject), one.demand)):
-        by = [suspended_by(claim, world), *kept_claims.keeping_overrides(claim, world)]
+        by = [suspended_by(claim, world), *claim_overrides.keeping_overrides(claim, world)]
         for name in {override.name for override in by if override is not None}:
             found[name].append(claim)
     return found

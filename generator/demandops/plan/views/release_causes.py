@@ -3,14 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
-from demandops.config.config import (
-    DOMAINS_FILE,
-    IMAGES_FILE,
-    NODES_FILE,
-    Config,
-)
+from demandops.config.config import DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.demand.claim import Claim, demand_id
@@ -22,19 +16,10 @@ from demandops.plan.release_keys import all_keys, keys_of
 from demandops.subject import Subject
 
 
-@dataclass(frozen=True, slots=True)
-class ShapingFile:
-    """A configuration file, its entry that shapes a release, and what the entry decides."""
-
-    file: str
-    entry: str
-    what: str
-
-
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
     """Yield the releases that run, all or those that claims on ``subject`` need."""
     keys = keys_of(world, subject) if subject else all_keys(world)
-    yield from filter(None, (plan(world, key) for key in dict.fromkeys(keys)))
+    yield from filter(None, (plan(world, key) for key in keys))
 
 
 def release_named(world: World, name: str) -> Release | None:
@@ -70,26 +55,20 @@ def how_to_release(claim: Claim) -> str:
     return f"send operation: release for demand '{claim.demand}'"
 
 
-def shaping_files(release: Release, config: Config) -> list[ShapingFile]:
-    """Return the entries of the configuration that shape a release."""
+def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
+    """Return (file, entry, what it decides) of the configuration that shapes a release."""
     images = [image for image in release.images if image in config.images]
     node, domain = release.node, release.domain
-    entries = [
+    return [
         (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
         *release.shaping_entries(config),
         *((IMAGES_FILE, f"images.{name}", config.images[name].reference()) for name in images),
         (NODES_FILE, node.id, f"in cluster {node.cluster}"),
         (DOMAINS_FILE, domain.name, f"namespace {domain.namespace}"),
     ]
-    return [ShapingFile(*entry) for entry in entries]
 
 
 def denied_release_named(world: World, name: str) -> tuple[Release, Override] | None:
     """Return the denied release with a name and the override that denies it, or ``None``."""
     denied = (denied_release(world, key) for key in all_keys(world))
     return next((found for found in denied if found and found[0].name == name), None)
-
-
-def keeping_override(claim: Claim, config: Config) -> Override | None:
-    """Return the override that keeps this claim, or ``None`` if a demand holds it."""
-    return config.overrides.get(claim.keeping_override or "")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -31,12 +31,13 @@ from demandops.service.approvals.proposal import (
     Proposal,
     admit_or_none,
     decide_in_turn,
-    decide_or_fault,
     is_release,
     key_of,
     name_of,
     pull_request_body,
-    push_option_description,
+    push_options,
+    releases,
+    title_of,
     waiting_text,
 )
 from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
@@ -53,7 +54,6 @@ from demandops.staterepo.write.proposal_branch import (
     BranchMoved,
     ProposalBranches,
     branch_name,
-    gitlab_options,
 )
 
 log = logging.getLogger("demandops")
@@ -125,7 +125,7 @@ class Approvals:
             request = _release_request(ticket, state)
             if request is None:
                 continue
-            for proposal in [p for p in self._proposals.values() if p.is_released_by(request)]:
+            for proposal in [p for p in self._proposals.values() if releases(request, p.requests)]:
                 self._demands.withdraw_proposed(proposal.tickets, RELEASED)
                 self._delete_branch(proposal, self._branches.heads())
                 self._end(proposal, Withdrawn(RELEASED))
@@ -140,12 +140,10 @@ class Approvals:
             state: the state on which ``by`` is evaluated.
         """
         request = _release_request(by, state) if earlier else None
-        for index, (ticket, result) in enumerate(earlier if request else ()):
-            if isinstance(result, Decision):
-                proposal = Proposal((), ProposalRecord(""), requests=[result.request])
-                if request and proposal.is_released_by(request):
-                    earlier[index] = (ticket, Withdrawn(RELEASED))
-                    by.has_released = True
+        for index, (ticket, result) in enumerate(earlier):
+            if request and isinstance(result, Decision) and releases(request, [result.request]):
+                earlier[index] = (ticket, Withdrawn(RELEASED))
+                by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
         """Add a demand that needs approval, to an existing proposal of the same demand if any."""
@@ -249,15 +247,8 @@ class Approvals:
         proposal.searched_to = tip
         read = CommitBatch(self._repository, snapshot).read
         head = heads.branches.get(proposal.branch, "")
-        verdict = proposal.verdict(
-            [
-                (ticket, decide_or_fault(snapshot.state, ticket, read))
-                for ticket in proposal.tickets
-            ],
-            on_main,
-            head,
-            self._forge.pull_request(proposal.branch),
-        )
+        pull_request = self._forge.pull_request(proposal.branch)
+        verdict = proposal.verdict(snapshot.state, read, on_main, head, pull_request)
         booked = [
             (ticket, self._receipt(ticket, decision, snapshot, on_main.get(ticket.operation)))
             for ticket, decision in verdict.booked
@@ -311,7 +302,7 @@ class Approvals:
         if forge.forge in ("github", "gitea"):
             message = self._branches.message(proposal.record.commits[-1])
             body = pull_request_body(message, proposal.reasons)
-            self._forge.open(forge, proposal.branch, message.split("\n", 1)[0], body)
+            self._forge.open(forge, proposal.branch, title_of(message), body)
             if not self._forge.has_answered(proposal.branch):
                 return True  # the requester is notified once the link is known
         request = self._forge.pull_request(proposal.branch)
@@ -322,8 +313,8 @@ class Approvals:
 
     def _rebuild(self, proposal: Proposal, left: Decided, snapshot: Snapshot, head: str) -> bool:
         """Commit the demands on main and push the branch, unless it is up to date."""
-        read = CommitBatch(self._repository, snapshot).read
-        steps, failed = decide_in_turn(left, snapshot.state, read)
+        commits = CommitBatch(self._repository, snapshot)
+        steps, failed = decide_in_turn(left, snapshot.state, commits.read)
         self._demands.answer(failed)
         proposal.drop(failed)
         if not steps:
@@ -332,25 +323,23 @@ class Approvals:
         files = {path: text for _, step in steps for path, text in step.files.items()}
         if head and self._branches.is_up_to_date(tip, head, old.base, files):
             return True
-        demands = [(ticket.operation, ticket.received, step) for ticket, step in steps]
-        commit = self._branches.commit(proposal.branch, snapshot, demands, self._runtime.now())
-        commits = (head, str(commit)) if head else (str(commit),)
-        record = replace(old, commits=commits, base=str(tip))
+        now, branch = self._runtime.now(), proposal.branch
+        for ticket, step in steps:
+            if step.files:
+                commits.commit(step, ticket.operation, ticket.received, now, branch)
+        commit = commits.head.commit
+        newest = (head, str(commit)) if head else (str(commit),)
+        record = replace(old, commits=newest, base=str(tip))
         if not self._journal(proposal, record):
             return False
-        options = self._push_options(proposal, snapshot, str(commit))
-        link = self._branches.put(proposal.branch, commit, head, options)
+        forge, options = snapshot.state.config.repo_settings.proposals, []
+        if forge.forge == "gitlab":
+            message = self._branches.message(str(commit))
+            options = push_options(message, proposal.reasons, forge.labels)
+        link = self._branches.put(branch, commit, head, options)
         self._journal(proposal, replace(record, pushed=True, link=link or old.link))
-        log.info("%s %s", proposal.branch, "was rebuilt" if head else "awaits approval")
+        log.info("%s %s", branch, "was rebuilt" if head else "awaits approval")
         return True
-
-    def _push_options(self, proposal: Proposal, snapshot: Snapshot, commit: str) -> Sequence[str]:
-        forge = snapshot.state.config.repo_settings.proposals
-        if forge.forge != "gitlab":
-            return ()
-        message = self._branches.message(commit)
-        description = push_option_description(message, proposal.reasons)
-        return gitlab_options(message.split("\n", 1)[0], description, forge.labels)
 
     def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
         """Journal a record for each demand; return False if one was withdrawn."""

@@ -9,11 +9,11 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from demandops.config.repo_settings import Proposals
-from demandops.forge import ForgeError, PullRequest, forge_for
+from demandops.forge import Forge, ForgeError, PullRequest, forge_for
 from demandops.runtime import Runtime, Thread
 from demandops.settings import MAIN_BRANCH
 
@@ -29,17 +29,17 @@ class _Task:
     branch: str
     title: str
     body: str
+    close: bool = False
 
 
 class ForgeWorker:
     """Opens, watches and closes pull requests; its public methods belong to the worker thread."""
 
     def __init__(
-        self, token_file: Path | None, on_news: Callable[[str], None], runtime: Runtime
+        self, token_file: Path | None, on_update: Callable[[str], None], runtime: Runtime
     ) -> None:
-        self._token_file, self._runtime = token_file, runtime
-        self._on_update = on_news
-        self._tasks: deque[tuple[_Task, bool]] = deque()
+        self._token_file, self._on_update, self._runtime = token_file, on_update, runtime
+        self._tasks: deque[_Task] = deque()
         self._due = runtime.event()
         self._wanted: dict[str, _Task] = {}
         self._pull_requests: dict[str, PullRequest | None] = {}
@@ -49,12 +49,11 @@ class ForgeWorker:
 
     def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
         """Open a pull request for a branch, unless that was requested before."""
-        if branch in self._wanted:
-            return
-        task = _Task(forge, branch, title, body)
-        with self._lock:
-            self._wanted[branch] = task
-        self._enqueue(task, close=False)
+        if branch not in self._wanted:
+            task = _Task(forge, branch, title, body)
+            with self._lock:
+                self._wanted[branch] = task
+            self._enqueue(task)
 
     def has_answered(self, branch: str) -> bool:
         """Return whether the forge was queried for a branch, successfully or not."""
@@ -70,10 +69,10 @@ class ForgeWorker:
             task = self._wanted.pop(branch, None)
             self._pull_requests.pop(branch, None)
         if task is not None and close:
-            self._enqueue(task, close=True)
+            self._enqueue(replace(task, close=True))
 
-    def _enqueue(self, task: _Task, *, close: bool) -> None:
-        self._tasks.append((task, close))
+    def _enqueue(self, task: _Task) -> None:
+        self._tasks.append(task)
         self._due.set()
         if self._thread is None:
             self._thread = self._runtime.start_thread("forge", self._run)
@@ -84,39 +83,36 @@ class ForgeWorker:
         while True:
             if not self._due.wait(POLL_S):
                 with self._lock:
-                    self._tasks.extend((task, False) for task in self._wanted.values())
+                    self._tasks.extend(self._wanted.values())
             self._due.clear()
             while self._tasks:
-                task, close = self._tasks.popleft()
-                self._handle(task, close=close)
+                task = self._tasks.popleft()
+                known = pull_request = self._pull_requests.get(task.branch)
+                try:
+                    forge = forge_for(task.forge, self._token_file)
+                    if forge is None:
+                        continue
+                    pull_request = self._handle(task, forge, known)
+                except ForgeError as error:
+                    if str(error) != self._last_error:
+                        log.warning("%s: %s", task.branch, error)
+                    self._last_error = str(error)
+                except Exception:
+                    log.exception("internal error at the pull request for %s", task.branch)
+                self._remember(task, pull_request)
 
-    def _handle(self, task: _Task, *, close: bool) -> None:
-        known = self._pull_requests.get(task.branch)
-        pull_request = known
-        try:
-            forge = forge_for(task.forge, self._token_file)
-            if forge is None:
-                return
-            if close:
-                pull_request = forge.find(task.branch, MAIN_BRANCH)
-                if pull_request is not None and pull_request.state == "open":
-                    forge.close(pull_request)
-                return
-            if known is None:
-                pull_request = forge.open(task.branch, MAIN_BRANCH, task.title, task.body)
-            else:
-                pull_request = forge.find(task.branch, MAIN_BRANCH) or known
-        except ForgeError as error:
-            if str(error) != self._last_error:
-                log.warning("%s: %s", task.branch, error)
-            self._last_error = str(error)
-        except Exception:
-            log.exception("internal error at the pull request for %s", task.branch)
-        self._remember(task, pull_request)
+    @staticmethod
+    def _handle(task: _Task, forge: Forge, known: PullRequest | None) -> PullRequest | None:
+        if not task.close and known is None:
+            return forge.open(task.branch, MAIN_BRANCH, task.title, task.body)
+        found = forge.find(task.branch, MAIN_BRANCH) or known
+        if task.close and found is not None and found.state == "open":
+            forge.close(found)
+        return found
 
     def _remember(self, task: _Task, pull_request: PullRequest | None) -> None:
         with self._lock:
-            if task.branch not in self._wanted:
+            if task.close or task.branch not in self._wanted:
                 return
             known = self._pull_requests
             changed = task.branch not in known or known[task.branch] != pull_request

@@ -7,18 +7,18 @@ the texts that describe it.
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from demandops.decision import Decision, State, admit, decide
-from demandops.demand import approval_rule
+from demandops.demand import permission
 from demandops.demand.demand_request import DemandRequest, Release
 from demandops.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
 from demandops.forge import PullRequest
 from demandops.render.changes.changeset import FileReader
 from demandops.service.ticket import ProposalRecord, Ticket
-from demandops.subject import Subject
+from demandops.settings import MAIN_BRANCH
 
 Key = tuple[str, ...]
 Decided: TypeAlias = list[tuple[Ticket, Decision]]
@@ -73,7 +73,8 @@ class Proposal:
 
     def verdict(
         self,
-        decisions: Iterable[tuple[Ticket, Decision | InvalidInput]],
+        state: State,
+        read: FileReader,
         on_main: Container[str],
         head: str,
         pull_request: PullRequest | None,
@@ -84,13 +85,19 @@ class Proposal:
         claims: a squash merge may lose the trailer.
 
         Args:
-            decisions: each demand with its decision on main.
+            state: the state of main.
+            read: reads a file of main.
             on_main: the operation ids of the new commits on main.
             head: the commit of the branch; empty if there is none.
             pull_request: the pull request, if it is known.
         """
         verdict = Verdict()
-        for ticket, decision in decisions:
+        for ticket in self.tickets:
+            decision: Decision | InvalidInput
+            try:
+                decision = decide(state, ticket.goal, ticket.received, read)
+            except InvalidInput as error:
+                decision = error
             changes_main = isinstance(decision, InvalidInput) or decision.files
             if ticket.operation in on_main or not changes_main:
                 verdict.booked.append((ticket, decision))
@@ -102,18 +109,15 @@ class Proposal:
                 verdict.rebuild.append((ticket, decision))
             else:
                 verdict.free.append(ticket)
-        why_not = "" if verdict.booked else self._turned_down_because(head, pull_request)
-        if why_not:
+        why_not = ""
+        if self.record.pushed and not head:
+            why_not = f"was turned down: {self.branch} is gone and was not merged"
+        elif pull_request is not None and pull_request.state == "closed":
+            why_not = f"was turned down: {pull_request.link} was closed"
+        if why_not and not verdict.booked:
             verdict.failed.extend((ticket, TurnedDown(why_not)) for ticket, _ in verdict.rebuild)
             verdict.rebuild.clear()
         return verdict
-
-    def _turned_down_because(self, head: str, pull_request: PullRequest | None) -> str:
-        if self.record.pushed and not head:
-            return f"was turned down: {self.branch} is gone and was not merged"
-        if pull_request is not None and pull_request.state == "closed":
-            return f"was turned down: {pull_request.link} was closed"
-        return ""
 
     def drop(self, answered: Iterable[tuple[Ticket, object]]) -> None:
         """Remove demands that have an answer."""
@@ -130,18 +134,14 @@ class Proposal:
         """Return the requesters of its demands."""
         return {name for request in self.requests for name in request.requesters()}
 
-    def subjects(self) -> set[Subject]:
-        """Return the applications and connections that it requests."""
-        return {subject for request in self.requests for subject in request.subjects()}
 
-    def is_released_by(self, request: DemandRequest) -> bool:
-        """Return whether a request by one of its requesters releases all of it."""
-        if key_of(request) not in map(key_of, self.requests) or not self.requesters() & set(
-            request.requesters()
-        ):
-            return False
-        whole = isinstance(request, Release)
-        return whole or self.subjects() <= set(request.subjects())
+def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
+    """Return whether a request by one of their requesters releases all of some pending ones."""
+    requesters = {name for each in pending for name in each.requesters()}
+    if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
+        return False
+    subjects = {subject for each in pending for subject in each.subjects()}
+    return isinstance(request, Release) or subjects <= set(request.subjects())
 
 
 def key_of(request: DemandRequest) -> Key:
@@ -149,14 +149,6 @@ def key_of(request: DemandRequest) -> Key:
     if request.is_reference:
         return ("request", request.id, *sorted(request.requesters()))
     return ("demand", request.demand)
-
-
-def decide_or_fault(state: State, ticket: Ticket, read: FileReader) -> Decision | InvalidInput:
-    """Return the decision on a demand in a state, or the error that refuses it."""
-    try:
-        return decide(state, ticket.goal, ticket.received, read)
-    except InvalidInput as error:
-        return error
 
 
 def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decided, Failed]:
@@ -168,7 +160,7 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
     written: dict[str, str | None] = {}
     steps, failed = Decided(), Failed()
     for ticket, decision in left:
-        request = approval_rule.with_leases_from_approval(decision.request)
+        request = permission.with_leases_from_approval(decision.request)
         try:
             step = decide(
                 state,
@@ -226,22 +218,37 @@ def pull_request_body(message: str, reasons: Iterable[str]) -> str:
     A fence keeps the ids in the message, which anyone may choose, from becoming links.
     """
     fence = _fence(message, 3)
-    why = ", ".join(reasons) or "an access policy"
     return (
-        f"A demand that needs approval, asked for by {why}. Merging carries it out; closing it or "
-        f"deleting the branch turns it down.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
+        f"{_asked_for_by(reasons)} Merging carries it out; closing it or deleting the branch turns "
+        f"it down.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
     )
 
 
-def push_option_description(message: str, reasons: Iterable[str]) -> str:
-    """Return the text of a merge request on one line, because a push option has only one."""
+def push_options(message: str, reasons: Iterable[str], labels: Iterable[str]) -> list[str]:
+    """Return the push options that make GitLab open a merge request; each is one line."""
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
     fence = _fence(why, 1)
-    asks = ", ".join(reasons) or "an access policy"
-    return (
-        f"A demand that needs approval, asked for by {asks}. {fence} {why} {fence} Merging carries "
-        "it out; deleting the branch turns it down."
+    description = (
+        f"{_asked_for_by(reasons)} {fence} {why} {fence} Merging carries it out; deleting the "
+        "branch turns it down."
     )
+    return [
+        "merge_request.create",
+        f"merge_request.target={MAIN_BRANCH}",
+        f"merge_request.title={title_of(message)}",
+        f"merge_request.description={description}",
+        "merge_request.remove_source_branch",
+        *(f"merge_request.label={label}" for label in labels),
+    ]
+
+
+def title_of(message: str) -> str:
+    """Return the title of a pull request with a commit's message."""
+    return message.split("\n", 1)[0]
+
+
+def _asked_for_by(reasons: Iterable[str]) -> str:
+    return f"A demand that needs approval, asked for by {', '.join(reasons) or 'an access policy'}."
 
 
 def _fence(text: str, shortest: int) -> str:

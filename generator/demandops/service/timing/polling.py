@@ -50,7 +50,7 @@ class PollTimer:
         self._requested = runtime.event()
 
     def request(self) -> None:
-        """Make the next fetch due now; several requests before it starts make one fetch."""
+        """Make a fetch due now; several requests before it starts make one fetch."""
         self._requested.set()
 
     def seconds_until_due(self) -> float | None:
@@ -75,7 +75,3 @@ class PollTimer:
             self._pause = self._interval if reached else min(self._pause * 2, longest)
             # a little less at random, so that generators do not fetch all at once
             self._next = self._last + self._pause * self._runtime.uniform(0.8, 1.0)
-
-    def interrupted(self) -> None:
-        """Keep the fetch due, because it was cut short."""
-        self._requested.set()

@@ -23,8 +23,7 @@ from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.overrides.lifecycle import expired_overrides, update_ledger
-from demandops.plan.views.bookkeeping import bookkeeping
-from demandops.plan.views.bookkeeping_diff import EntryChange, bookkeeping_changes
+from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 from demandops.plan.views.override_report import override_report, warnings
 from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview

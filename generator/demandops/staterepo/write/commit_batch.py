@@ -21,7 +21,7 @@ from demandops.decision import Decision, State, changeset_of_edit, rendered_file
 from demandops.demand.claim import ClaimKey
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
-from demandops.plan.overrides import kept_claims
+from demandops.plan.overrides import claim_overrides
 from demandops.plan.overrides.lifecycle import (
     LedgerUpdate,
     changed_claim_files,
@@ -177,7 +177,7 @@ class CommitBatch:
     def _rendered_subjects(self, accepted: Accepted, before: Snapshot, now: datetime) -> _Followed:
         """Render the subjects that people changed."""
         state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
-        ledger, keys = kept_claims.update_kept_claims(old, state, subjects, now)
+        ledger, keys = claim_overrides.update_kept_claims(old, state, subjects, now)
         files = changed_claim_files(state.ledger, ledger, keys)
         state = replace(state, ledger=ledger)
         change = changeset_of_edit(state, old, subjects, self.read)

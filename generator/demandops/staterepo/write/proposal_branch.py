@@ -16,7 +16,6 @@ import git
 import pygit2
 from pygit2 import Oid, Repository
 
-from demandops.decision import Decision
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
@@ -24,8 +23,6 @@ from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import MAIN, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
-from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write.commit_batch import CommitBatch
 
 PREFIX = "demand/"
 _HEADS = "refs/heads/"
@@ -70,7 +67,9 @@ class ProposalBranches:
             RemoteAway: the remote cannot be reached.
         """
         if self._remote is None:
-            found = _heads(Repository(self._repository.objects.path))
+            repo = Repository(self._repository.objects.path)
+            names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
+            found = {name: str(repo.references[name].target) for name in [MAIN, *names]}
         else:
             found = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
         named = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
@@ -135,27 +134,6 @@ class ProposalBranches:
         else:
             references.create(reference, commit)
 
-    def commit(
-        self,
-        branch: str,
-        tip: Snapshot,
-        demands: Iterable[tuple[str, datetime, Decision]],
-        now: datetime,
-    ) -> Oid:
-        """Commit demands for a branch on top of main; does not move the branch.
-
-        Args:
-            branch: its name, for the commits' trailers.
-            tip: main.
-            demands: the operation id, the time received and the decision of each.
-            now: the time of the commits.
-        """
-        commits = CommitBatch(self._repository, tip)
-        for operation, received, decision in demands:
-            if decision.files:
-                commits.commit(decision, operation, received, now, branch)
-        return commits.head.commit
-
     def message(self, commit: str) -> str:
         """Return a commit's message; empty if the commit is not here."""
         try:
@@ -188,31 +166,11 @@ class ProposalBranches:
         return not set(moved) & set(proposed)
 
 
-def _heads(repo: Repository) -> dict[str, str]:
-    names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
-    return {name: str(repo.references[name].target) for name in [MAIN, *names]}
-
-
 def _link(output: str) -> str:
     """Return the address of the merge request that GitLab prints, or an empty text."""
     lines = [line for line in output.splitlines() if line.startswith("remote:")]
     links = [found[0] for line in lines if (found := _LINK.search(line))]
     return next((link for link in links if "/merge_requests/" in link), "")
-
-
-def gitlab_options(title: str, description: str, labels: Iterable[str]) -> list[str]:
-    """Return the push options that make GitLab open a merge request.
-
-    Push options cannot hold line breaks, so the description has one line.
-    """
-    return [
-        "merge_request.create",
-        f"merge_request.target={MAIN_BRANCH}",
-        f"merge_request.title={title}",
-        f"merge_request.description={description}",
-        "merge_request.remove_source_branch",
-        *(f"merge_request.label={label}" for label in labels),
-    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,11 +192,11 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     Raises:
         RemoteAway: the remote cannot be reached.
     """
+    space = f"{_HEADS}{PREFIX}"
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
+        space = f"refs/remotes/origin/{PREFIX}"
     repo = Repository(repository.objects.path)
-    remote = isinstance(repository, RemoteRepository)
-    space = f"refs/remotes/origin/{PREFIX}" if remote else f"{_HEADS}{PREFIX}"
     main = repository.tip()
     for name in sorted(name for name in repo.references if name.startswith(space)):
         found = commit_log.commits(repo, repo.references[name].resolve().target, main)

@@ -1,4 +1,9 @@
-"""Pull requests at a forge, and the HTTP calls that GitHub and Gitea share."""
+"""Pull requests of proposals at a forge: GitHub, and Gitea or Forgejo.
+
+Knows pull requests and HTTP, but not demands or Git: the branch has already been pushed. GitLab
+needs no call: it opens a merge request because of the push's options
+(:mod:`demandops.staterepo.write.proposal_branch`).
+"""
 
 from __future__ import annotations
 
@@ -6,13 +11,18 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Literal
-from urllib.parse import quote
+from urllib.parse import quote, urlencode, urlsplit
 
 from demandops import http_call
-from demandops.errors import DemandOpsError, quoted
+from demandops.config.repo_settings import Proposals
+from demandops.errors import DemandOpsError, InvalidInput, quoted
+from demandops.input_file import read_secret
 
 _TIMEOUT_S = 15.0
+_NOT_FOUND = 404
+_NO_JSON = object()
 
 PullRequestState = Literal["open", "merged", "closed"]
 
@@ -93,13 +103,16 @@ class Forge(ABC):
             answer = http_call.call(method, self._api + path, headers, content, _TIMEOUT_S)
         except http_call.NoAnswer as error:
             raise ForgeError(f"{where}: {error}") from None
-        data, is_json = _json(answer.body)
+        try:
+            data = json.loads(answer.body or b"null")
+        except (ValueError, RecursionError):
+            data = _NO_JSON
         if not answer.is_success:
             reason = _reason(data if isinstance(data, dict) else {"message": answer.reason})
             moved = "; redirects are not followed: check the API's address"
             remedy = moved if answer.is_redirect else ""
             raise ForgeError(f"{where}: {answer.status} {reason}{remedy}", answer.status)
-        if not is_json:
+        if data is _NO_JSON:
             raise ForgeError(f"{where}: the answer is not JSON; check the API's address")
         return data
 
@@ -113,11 +126,88 @@ class Forge(ABC):
             raise ForgeError(message) from None
 
 
-def _json(body: bytes) -> tuple[Any, bool]:
+class GitHub(Forge):
+    """GitHub, by its REST API of version 2022-11-28: https://docs.github.com/en/rest/pulls/pulls."""
+
+    NAME = "GitHub"
+    HEADERS = {  # noqa: RUF012
+        "Accept": "application/vnd.github+json",
+        "Authorization": "Bearer {token}",
+        "X-GitHub-Api-Version": "2022-11-28",
+    }
+    EXISTS = 422
+
+    def find(self, branch: str, target: str) -> PullRequest | None:
+        """Return the newest pull request for a branch."""
+        query = {
+            "head": f"{self._owner}:{branch}",
+            "base": target,
+            "state": "all",
+            "sort": "created",
+            "direction": "desc",
+            "per_page": "1",
+        }
+        answer = self._call("GET", f"{self._pulls}?{urlencode(query)}")
+        return self._read(answer[0]) if isinstance(answer, list) and answer else None
+
+    def _is_merged(self, data: Any) -> bool:  # noqa: ANN401
+        return data["merged_at"] is not None
+
+
+class Gitea(Forge):
+    """Gitea or Forgejo, by the API v1 that ``/api/swagger`` of each instance describes."""
+
+    NAME = "Gitea"
+    HEADERS = {"Accept": "application/json", "Authorization": "token {token}"}  # noqa: RUF012
+    EXISTS = 409
+
+    def find(self, branch: str, target: str) -> PullRequest | None:
+        """Return the pull request for a branch."""
+        try:  # the branch ends the path, so its slash stays unquoted
+            path = f"{self._pulls}/{quote(target, safe='')}/{quote(branch, safe='/')}"
+            return self._read(self._call("GET", path))
+        except ForgeError as error:
+            if error.status == _NOT_FOUND:
+                return None
+            raise
+
+    def _is_merged(self, data: Any) -> bool:  # noqa: ANN401
+        return bool(data["merged"])
+
+
+def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:
+    """Return the forge that ``demandops.yaml`` names, or ``None`` if its API is not supported.
+
+    Each call reads the token again, so that it can be replaced while the generator runs.
+
+    Raises:
+        ForgeError: if the token cannot be read.
+    """
+    if proposals.forge not in ("github", "gitea") or proposals.url is None:
+        return None
+    owner, name = proposals.project
+    token = _token(token_file, proposals.forge)
+    if proposals.forge == "gitea":
+        root = proposals.url.strip("/").rsplit("/", 2)[0]
+        return Gitea(proposals.api or f"{root}/api/v1", token, owner, name)
+    scheme, host, *_ = urlsplit(proposals.url)
+    public = "https://api.github.com" if host == "github.com" else f"{scheme}://{host}/api/v3"
+    return GitHub(proposals.api or public, token, owner, name)
+
+
+def _token(file: Path | None, forge: str) -> str:
+    if file is None:
+        raise ForgeError(
+            f"proposals.forge is {forge}, but there is no token for it; set "
+            "DEMANDOPS_FORGE_TOKEN_FILE to a file that holds one"
+        )
     try:
-        return (json.loads(body) if body.strip() else None), True
-    except (ValueError, RecursionError):
-        return None, False
+        token = read_secret(file).decode("latin-1").strip()
+    except InvalidInput as error:
+        raise ForgeError(f"the token file {error}") from None
+    if not token.isascii() or not token.isprintable():
+        raise ForgeError(f"the token file {file} must hold a token: one line of plain text")
+    return token
 
 
 def _reason(answer: Mapping[str, Any]) -> str:

@@ -1,0 +1,238 @@
+"""The effects of overrides on claims: ``deny`` suspends them, ``keep`` holds claims of its own.
+
+A suspended claim stays booked but is not planned. The planner reads a view of the ledger, which
+checks each claim when it is read. So there is no second ledger to keep up to date.
+
+When the last claim on a subject is released, ``keep`` books a claim with the same content for the
+override's owner. It is removed when a demand asks for the subject again. Because it is a claim,
+bookkeeping and history show it like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, fields, replace
+from datetime import datetime
+
+from demandops.config.config import Config
+from demandops.config.override import Override, Selector
+from demandops.config.policy import matches
+from demandops.demand.application import Application
+from demandops.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey
+from demandops.demand.demand_request import Demanded
+from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.world import World
+from demandops.subject import Subject
+
+
+@dataclass(frozen=True, slots=True)
+class Traits:
+    """The values that a selector is compared with; only a service's release has a ``service``.
+
+    Without ``requesters``, those of a selector are ignored.
+    """
+
+    nodes: tuple[str, ...]
+    requesters: tuple[str, ...] | None
+    applications: tuple[str, ...] = ()
+    appdefs: tuple[str, ...] = ()
+    connections: tuple[str, ...] = ()
+    service: str = ""
+
+
+def traits_of(one: Claim | Demanded) -> Traits:
+    """Return the traits of a claimed or demanded application or connection."""
+    held = one.held
+    if isinstance(held, Application):
+        return Traits(held.nodes, one.requesters, (held.id,), (held.appdef,))
+    return Traits(held.nodes, one.requesters, connections=(held.id,))
+
+
+def fits(selector: Selector, traits: Traits, config: Config) -> bool:
+    """Return whether every field of a selector matches."""
+    fields = (
+        (selector.applications, traits.applications),
+        (selector.appdefs, traits.appdefs),
+        (selector.services, (traits.service,) if traits.service else ()),
+        (selector.connections, traits.connections),
+        (selector.nodes, traits.nodes),
+        (selector.requesters, traits.requesters),
+    )
+    for patterns, values in fields:
+        if patterns is None or values is None:
+            continue
+        if not any(matches(value, patterns) for value in values):
+            return False
+    return not selector.labels or any(has_labels(selector, node, config) for node in traits.nodes)
+
+
+def has_labels(selector: Selector, node: str, config: Config) -> bool:
+    """Return whether a node has all labels of a selector."""
+    known = config.nodes.get(node)
+    labels = known.labels() if known else {}
+    return all(labels.get(key) == value for key, value in (selector.labels or {}).items())
+
+
+def selects(override: Override, traits: Traits, config: Config) -> bool:
+    """Return whether one of an override's selectors matches."""
+    return any(fits(selector, traits, config) for selector in override.select)
+
+
+@dataclass(frozen=True, slots=True)
+class UnsuspendedClaims(Ledger):
+    """A read-only view of a ledger without suspended claims."""
+
+    world: World | None = field(default=None, compare=False)
+
+    def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
+        """Return the claims on ``subject`` that are not suspended, sorted by demand id."""
+        return tuple(claim for claim in Ledger.claims_on(self, subject) if self._is_active(claim))
+
+    def first_claim(self, subject: Subject) -> Claim | None:
+        """Return the first claim on ``subject`` that is not suspended, or ``None``."""
+        first = Ledger.first_claim(self, subject)
+        if first is None or self._is_active(first):
+            return first
+        return next(iter(self.claims_on(subject)), None)
+
+    def get(self, key: ClaimKey) -> Claim | None:
+        """Return one claim, or ``None`` if it is suspended."""
+        claim = Ledger.get(self, key)
+        return claim if claim and self._is_active(claim) else None
+
+    def is_carried_to(self, target: str, topic: str) -> bool:
+        """Return whether a claimed connection brings ``topic`` to the node ``target``."""
+        return bool(self.connections_bringing(target, topic))
+
+    def _ids(self, *entry: str) -> tuple[str, ...]:
+        keys = self.index.get(entry) or ()
+        return tuple(sorted({key.subject.id for key in keys if self.get(key)}))
+
+    def _is_active(self, claim: Claim) -> bool:
+        return self.world is None or suspended_by(claim, self.world) is None
+
+
+def without_suspended(world: World) -> World:
+    """Return the world with a view of its ledger without suspended claims."""
+    ledger = world.ledger
+    if isinstance(ledger, UnsuspendedClaims) or not any(one.deny for one in world.overrides):
+        return world
+    parts = (getattr(ledger, part.name) for part in fields(Ledger))
+    view = replace(UnsuspendedClaims(*parts), world=world)
+    return replace(world, ledger=view)
+
+
+def suspended_by(claim: Claim, world: World) -> Override | None:
+    """Return the highest override that suspends a claim, or ``None``."""
+    return denied_by(traits_of(claim), world) if world.overrides else None
+
+
+def denied_by(traits: Traits, world: World) -> Override | None:
+    """Return the highest override that denies something with these traits, or ``None``.
+
+    A selector that names services denies the releases of these services, never a claim or demand.
+    """
+    for override in reversed(world.overrides):
+        if override.deny and any(
+            bool(selector.services) is bool(traits.service) and fits(selector, traits, world.config)
+            for selector in override.select
+        ):
+            return override
+    return None
+
+
+def suspended_claims(world: World) -> Iterator[tuple[Claim, Override]]:
+    """Yield every suspended claim and the override that suspends it, sorted by subject."""
+    if not any(one.deny for one in world.overrides):
+        return
+    for claim in sorted(world.ledger, key=lambda one: (str(one.subject), one.demand)):
+        override = suspended_by(claim, world)
+        if override is not None:
+            yield claim, override
+
+
+def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
+    """Return the ledger without the kept claims on these subjects."""
+    for subject in subjects:
+        ledger = ledger.without(ledger.kept_claims(subject))
+    return ledger
+
+
+def with_kept_claims(
+    before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
+) -> tuple[Ledger, Changes]:
+    """Return a booking with the kept claims updated on the subjects that it changed."""
+    keys = [change.key for change in changes.claims]
+    touched = dict.fromkeys((*changes.subjects(), *subjects))
+    ledger, more = update_kept_claims(before, after, touched, now)
+    return ledger, replace(changes, claims=claim_changes(before, ledger, [*keys, *more]))
+
+
+def update_kept_claims(
+    before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
+) -> tuple[Ledger, list[ClaimKey]]:
+    """Return the ledger with exactly the kept claims that overrides ask for, and their keys.
+
+    Args:
+        before: the ledger before a change.
+        after: the world after it.
+        subjects: the subjects that changed.
+        now: the booking time of new kept claims.
+    """
+    keys, ledger = list[ClaimKey](), after.ledger
+    for subject in subjects:
+        existing = [*ledger.kept_claims(subject), *before.kept_claims(subject)]
+        needed = None
+        if ledger.is_only_kept(subject):
+            needed = _needed(existing, before.claims_on(subject), after, now)
+        keys += [claim.key for claim in existing]
+        ledger = ledger.without(existing)
+        if needed is not None:
+            keys.append(needed.key)
+            ledger = ledger.replace(needed.key, needed)
+    return ledger, keys
+
+
+def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
+    """Return every subject with a kept claim, sorted."""
+    return tuple(dict.fromkeys(claim.subject for claim in ledger.kept_claims()))
+
+
+def _needed(
+    existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
+) -> Claim | None:
+    """Return the kept claim that a subject without demands needs, or ``None``."""
+    for claim in existing:
+        if any(one.name == claim.keeping_override for one in keeping_overrides(claim, world)):
+            return claim
+    if not before:
+        return None
+    last = max(before, key=lambda claim: (claim.booked, claim.demand))
+    if suspended_by(last, world) is not None:
+        return None
+    for override in keeping_overrides(last, world):
+        name = OVERRIDE_PREFIX + override.name
+        return replace(
+            last,
+            demand=name,
+            request=name,
+            requesters=(override.owner,),
+            booked=now,
+            lease=None,
+            joined=False,
+            partial={},
+        )
+    return None
+
+
+def keeping_overrides(claim: Claim, world: World) -> list[Override]:
+    """Return the overrides that keep the subject of a claim, the highest first.
+
+    A kept claim names the owner as its requester, so ``requesters`` of the selector is ignored: it
+    was matched against the original claim.
+    """
+    traits = traits_of(claim)
+    if claim.keeping_override is not None:
+        traits = replace(traits, requesters=None)
+    keeping = (one for one in reversed(world.overrides) if one.keep)
+    return [one for one in keeping if selects(one, traits, world.config)]

@@ -1,0 +1,131 @@
+"""Which leases and overrides have ended, and when to check again.
+
+A person may set the clock. A clock that is set back only delays the end of a lease. A clock that
+jumps forward would end leases that were renewed in time, so after a jump every lease gets its full
+term again. The sleep of a machine looks like a jump and has the same effect.
+"""
+
+from __future__ import annotations
+
+import logging
+from datetime import datetime, timedelta, timezone
+
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import Expire
+from demandops.errors import InvalidInput
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
+from demandops.plan.overrides.lifecycle import expired_overrides
+from demandops.runtime import Runtime
+from demandops.service.ticket import Ticket
+from demandops.staterepo.write.commit_batch import CommitBatch
+
+log = logging.getLogger("demandops")
+
+_JUMP = timedelta(seconds=30)
+_SHORTEST_S = 1.0
+LONGEST_WAIT_S = 60.0
+"""The longest time between two checks of the leases, because the clock may be set meanwhile."""
+_RETRY = timedelta(seconds=LONGEST_WAIT_S)
+"""When to try again what could not be released or ended, such as files that do not render."""
+
+
+class LeaseExpiry:
+    """Decides which leases have ended, and makes the demands that release their claims."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._last = (runtime.now(), runtime.monotonic())
+        self._jumped_at: datetime | None = None
+        self._tried: dict[str, datetime] = {}
+
+    def tickets(self, ledger: Ledger) -> list[Ticket]:
+        """Return a ticket for each demand whose lease has ended, unless it was just tried."""
+        now, claims = self.ended_claims(ledger)
+        ended = dict.fromkeys(claim.demand for claim in claims)
+        # forget what was released or renewed meanwhile
+        self._tried = {d: at for d, at in self._tried.items() if at > now - _RETRY and d in ended}
+        demands = [demand for demand in ended if demand not in self._tried]
+        self._tried |= dict.fromkeys(demands, now)
+        requests = (Expire(id=demand, demand=demand) for demand in demands)
+        return [Ticket(self._runtime.fresh_id(), request, now) for request in requests]
+
+    def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
+        """Return the time and the claims whose lease has ended, the first to end first.
+
+        The ended claims of one demand are released together: if one of them is granted more time,
+        none is returned.
+        """
+        now = self._read_clocks()
+        ended = ledger.ended_claims(now)
+        granted = {claim.demand for claim in ended if not self._has_ended(claim, now)}
+        return now, [claim for claim in ended if claim.demand not in granted]
+
+    def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
+        """Return the seconds until the next check: at least one, at most ``longest``.
+
+        Never zero, because an ended lease stays in the ledger if its release failed or if it was
+        granted more time.
+        """
+        end = ledger.next_lease_end()
+        return longest if end is None else _seconds_until(end, self._read_clocks(), longest)
+
+    def _read_clocks(self) -> datetime:
+        wall, steady = self._runtime.now(), self._runtime.monotonic()
+        expected = self._last[0] + timedelta(seconds=steady - self._last[1])
+        if wall - expected > _JUMP:
+            jump = (wall - expected).total_seconds()
+            log.warning("the clock went forward by %.0f s; every lease gets its full term", jump)
+            self._jumped_at = wall
+        self._last = (wall, steady)
+        return wall
+
+    def _has_ended(self, claim: Claim, now: datetime) -> bool:
+        if claim.lease is None or self._jumped_at is None:
+            return claim.lease is not None
+        return now > self._jumped_at + timedelta(seconds=claim.lease.seconds + claim.lease.slack)
+
+
+class OverrideExpiry:
+    """Ends each expired override in a commit of its own."""
+
+    def __init__(self) -> None:
+        self._retry_at: dict[tuple[str, datetime | None], datetime] = {}
+        self._not_before = datetime.min.replace(tzinfo=timezone.utc)
+
+    def end_due(self, commits: CommitBatch, now: datetime) -> None:
+        """Commit the end of each expired override; retry failed ones later."""
+        for override in expired_overrides(commits.head.state, now):
+            if self._retry_at.get((override.name, override.end), now) > now:
+                continue
+            try:
+                commits.end_override(override, now)
+                log.info("%s ended as planned at %s", override.path, override.expires)
+            except InvalidInput as error:
+                self._retry_at[override.name, override.end] = now + _RETRY
+                for problem in error.faults:
+                    log.error("%s cannot be ended: %s; trying again later", override.path, problem)
+
+    def postpone(self, now: datetime) -> None:
+        """End no override for a while, because the commits could not be published."""
+        self._not_before = now + _RETRY
+
+    def is_due(self, world: World, now: datetime) -> bool:
+        """Return whether to end an override now."""
+        return any(time <= now for time in self._due_times(world))
+
+    def seconds_until_due(self, world: World, now: datetime, longest: float) -> float:
+        """Return the seconds until the next check: at least one, at most ``longest``."""
+        times = self._due_times(world)
+        return _seconds_until(min(times), now, longest) if times else longest
+
+    def _due_times(self, world: World) -> list[datetime]:
+        return [
+            max(self._retry_at.get((override.name, override.end), override.end), self._not_before)
+            for override in world.overrides
+            if override.end
+        ]
+
+
+def _seconds_until(time: datetime, now: datetime, longest: float) -> float:
+    return min(max((time - now).total_seconds() + 0.01, _SHORTEST_S), longest)
