@@ -17,7 +17,7 @@ from demandops.connections.mqtt import MQTT
 from demandops.connections.route import Route
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import ClaimKey, demand_id
-from demandops.demand.demand_request import Demanded, Join, Place, Shutdown
+from demandops.demand.demand_request import Demanded, Join, Shutdown
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.join import join
@@ -42,7 +42,7 @@ def demanded(random: Random) -> Demanded:
     routes = tuple(Route(topic, topic) for topic in topics)
     app = Application("edge/fusion", "object-detection-fusion", "edge", MappingProxyType(inputs))
     connection = Connection("vehicle00/edge", MQTT, "vehicle00", "edge", "edge", routes)
-    return Demanded(random.choice([app, connection]), some(random, PEOPLE), Place(""))
+    return Demanded(random.choice([app, connection]), some(random, PEOPLE), str)
 
 
 def listed(one: Demanded) -> Iterator[tuple[tuple[Subject, TopicKey], str]]:
