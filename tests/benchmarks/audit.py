@@ -74,8 +74,8 @@ def measure(repo: Path) -> None:
 
 
 def _fusion(opened: reader.Reader, tip: str) -> str:
-    files = opened.changed_files(opened.commit("main~2"), tip, "clusters")
-    return next(iter(files), "clusters")
+    files = opened.changed_files(opened.commit("main~2"), tip, ("clusters",))
+    return files[0] if files else "clusters"
 
 
 def _told(opened: reader.Reader, path: str | None, tip: str) -> str:

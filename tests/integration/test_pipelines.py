@@ -17,13 +17,12 @@ from typing import Any
 import pytest
 import yaml
 from demandops.cli.repo.pull_request_comment import MARK
-from demandops.staterepo import new_repo
 
 from tests.kit.config import skeleton
 from tests.kit.http import Answer, Call, serving
 from tests.kit.repo import git
 
-GITHUB, GITLAB = new_repo.PIPELINES
+GITHUB, GITLAB = ".github/workflows/demandops.yml", ".gitlab-ci.yml"
 BASH = shutil.which("bash") or "bash"
 
 

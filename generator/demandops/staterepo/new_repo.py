@@ -17,9 +17,6 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import commit_message
 
-PIPELINES = (".github/workflows/demandops.yml", ".gitlab-ci.yml")
-"""The pipelines that check pull requests, on GitHub and GitLab."""
-
 
 def init(
     target: Path,
@@ -33,15 +30,13 @@ def init(
     """Make a state repo and return its first commit.
 
     Args:
-        target: a folder that does not exist or is empty.
-        now: the time of the commit.
+        target: a folder that does not exist or is empty; else nothing is written.
         bare: make a bare repository, which the generator can use in place.
         gitops: the GitOps controller, ``flux`` or ``argocd``.
-        signer: signs the commit, if given.
         url: the URL that the clusters fetch from; by default the skeleton's example.
 
     Raises:
-        StateRepoError: the folder is not empty; nothing is written.
+        StateRepoError: the folder cannot be used.
     """
     target = target.resolve()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -72,12 +67,9 @@ def _write(
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
     tree = trees.write(repo, None, content)
-    text = (
-        "Create the state repo\n\n"
-        "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
-        "\n\n"
-        f"Operation: init\nRender-Version: {RENDER_VERSION}\n"
-    )
+    why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
+    trailers = [("Operation", "init"), ("Render-Version", str(RENDER_VERSION))]
+    text = commit_message.compose([["Create the state repo"], [why]], trailers)
     signature = commit_message.generator_signature(now)
     commit = signing.create_commit(repo, signer, (signature, signature), text, tree, [])
     repo.references.create(f"refs/heads/{MAIN_BRANCH}", commit)

@@ -7,9 +7,9 @@ from pathlib import Path
 import pygit2
 import pytest
 from demandops.errors import StateRepoError
-from demandops.staterepo.git.address import is_url, without_secrets
+from demandops.staterepo.git.address import connect, is_url
+from demandops.staterepo.git.remote_repository import without_secrets
 from demandops.staterepo.git.repository import RemoteAway
-from demandops.staterepo.git.repository_choice import connect
 
 URLS = [
     "https://example.org/state.git",

@@ -33,13 +33,13 @@ FileReader = Callable[[str], str | None]
 
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
-    """A release that starts, changes or stops, the facts that change, and its file."""
+    """A release that starts, changes or stops, its file, and the facts that change."""
 
     name: str
+    what: str
+    file: str
     change: Change
-    description: str
-    details: tuple[str, ...]
-    path: str = ""
+    details: tuple[str, ...] = ()
 
     @property
     def order(self) -> tuple[int, str]:
@@ -73,8 +73,6 @@ def build_changeset(
         before, after: the world before and after; the configuration is the same.
         changes: what differs in the ledger.
         keys: the releases that may differ (:func:`demandops.plan.release_keys.affected`).
-        engine: the engine of the configuration.
-        read: returns a current file.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.
@@ -118,8 +116,6 @@ def render_all(
     """Return all generated files, by path.
 
     Args:
-        world: the configuration and the claims.
-        engine: the configuration's engine.
         keys: all releases (:func:`demandops.plan.release_keys.all_keys`).
         current: the generated files in the state repo; overrides may hold some of them.
 
@@ -145,26 +141,19 @@ def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:
 
 
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
-    """Return a description of how a release changes.
-
-    Args:
-        old, new: the release before and after; one of them is not ``None``.
-        existed: whether the release had a file before.
-    """
+    """Return how a release changes; ``existed`` is whether it had a file before."""
     release = new or old
-    assert release is not None  # noqa: S101 - see above
-    kind: Change = "stop" if not new else "start"
-    if new and existed:
-        kind = "change"
-    details = _differences(old, new) if kind == "change" else ()
-    return ReleaseChange(release.name, kind, release.description, details, path_of(release))
+    assert release is not None  # noqa: S101 - it has at least one side
+    kind: Change = "stop" if not new else "change" if existed else "start"
+    details = _differences(old, new) if new and existed else ()
+    return ReleaseChange(release.name, release.description, path_of(release), kind, details)
 
 
-def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
+def _differences(old: Release | None, new: Release) -> tuple[str, ...]:
     before, after = _overrides(old), _overrides(new)
-    if new is None or not new.shaping.held:  # of a held file, only the comments change
+    if not new.shaping.held:  # of a held file, only the comments change
         before = (old.facts() if old else []) + before
-        after = (new.facts() if new else []) + after
+        after = new.facts() + after
     old_facts, new_facts = frozenset(before), frozenset(after)
     removed = [f"- {fact}" for fact in before if fact not in new_facts]
     added = [f"+ {fact}" for fact in after if fact not in old_facts]

@@ -29,11 +29,7 @@ class Signer:
     """Signs with one key: a private key file, or the public file of a key that an agent holds."""
 
     def __init__(self, key: Path) -> None:
-        """Try the key at once, so that a key that cannot sign fails before any demand is accepted.
-
-        Raises:
-            SigningFailed: the key cannot sign; says why and the remedy.
-        """
+        """Try the key, so that one that cannot sign fails before any demand is accepted."""
         self.key = key.expanduser()
         if not self.key.is_file():
             raise SigningFailed(
@@ -43,11 +39,7 @@ class Signer:
         self.sign(_PROBE)
 
     def sign(self, data: bytes) -> str:
-        """Return the armored signature of ``data``.
-
-        Raises:
-            SigningFailed: ``ssh-keygen`` did not sign.
-        """
+        """Return the armored signature of ``data``, or raise SigningFailed."""
         command = ["ssh-keygen", "-Y", "sign", "-n", "git", "-f", str(self.key)]
         environment = dict(os.environ) | {"SSH_ASKPASS_REQUIRE": "never", "LC_ALL": "C"}
         try:

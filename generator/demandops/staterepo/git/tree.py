@@ -16,11 +16,7 @@ pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectTyp
 
 
 def commit_of(repo: Repository, revision: str | Oid) -> Commit:
-    """Return the commit of a revision, in any form that Git knows.
-
-    Raises:
-        StateRepoError: there is no such commit.
-    """
+    """Return the commit of a revision that Git knows, or raise StateRepoError."""
     try:
         found = repo[revision] if isinstance(revision, Oid) else repo.revparse_single(revision)
         return found.peel(Commit)
@@ -139,10 +135,6 @@ def write(repo: Repository, base: Tree | None, files: Mapping[str, str | None]) 
     return _builder(repo, base, files).write()
 
 
-def _writes(files: Mapping[str, str | None]) -> bool:
-    return any(text is not None for text in files.values())
-
-
 def _builder(
     repo: Repository, base: Tree | None, files: Mapping[str, str | None]
 ) -> pygit2.TreeBuilder:
@@ -167,6 +159,8 @@ def _builder(
     for name, text in here.items():  # last, so that a file can replace a folder
         if text is not None:
             builder.insert(name, repo.create_blob(text.encode()), FileMode.BLOB)
-        elif builder.get(name) is not None and not _writes(below.get(name, {})):
+        elif builder.get(name) is not None and not any(
+            inner is not None for inner in below.get(name, {}).values()
+        ):
             builder.remove(name)
     return builder

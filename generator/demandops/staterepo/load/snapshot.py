@@ -24,7 +24,11 @@ from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.load import last_valid_config, ledger_files
-from demandops.staterepo.load.last_valid_config import ConfigSource, LastValidConfig
+from demandops.staterepo.load.last_valid_config import (
+    ConfigSource,
+    LastValidConfig,
+    load_last_valid_config,
+)
 from demandops.subject import Subject
 
 Progress = Callable[[int, int], None]
@@ -66,26 +70,14 @@ class Advance:
     subjects: tuple[Subject, ...]
     config_changed: bool
 
-    def followed_by(self, further: Advance) -> Advance:
-        """Return one advance for this one and ``further``, which follows it."""
-        return Advance(
-            further.snapshot,
-            tuple(dict.fromkeys((*self.subjects, *further.subjects))),
-            self.config_changed or further.config_changed,
-        )
-
 
 def load(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Load a commit whole.
-
-    Args:
-        progress: called with (files read, all files) while the ledger is read.
+    """Load a commit whole; ``progress`` is called with (files read, all files) of the ledger.
 
     Raises:
-        InvalidInput: every fault of every file.
-        StateRepoError: the commit is not a state repo.
+        InvalidInput, StateRepoError: with every fault of every file.
     """
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
@@ -128,7 +120,13 @@ def advance(
     if recorded is not None:
         known = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
     elif before.problems or trees.differ(old, new, CONFIG_ROOTS):
-        known = _last_valid_config(repo, before, to)
+        known = load_last_valid_config(
+            repo,
+            before.config_source,
+            before.last_valid_commit,
+            to,
+            lambda files: _load_and_rehearse(files, before.state),
+        )
     config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
     world_changed = config != state.config or ended != state.ledger.ended
     config_changed = world_changed or _has_manual_edit(repo, before.commit, to)
@@ -170,18 +168,7 @@ def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
     return shutdowns
 
 
-def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValidConfig:
-    return last_valid_config.load_last_valid_config(
-        repo,
-        before.config_source,
-        before.last_valid_commit,
-        to,
-        lambda files: _load_and_rehearse(files, before.state),
-    )
-
-
 def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Return whether a person changed generated files between two commits."""
     return any(
         trees.differ(commit.parents[0].tree, commit.tree, GENERATED_ROOTS)
         for commit in commit_log.person_commits(repo, to, before)
@@ -211,16 +198,17 @@ class ReadAhead:
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        """Return the advance from ``before`` to ``tip``.
-
-        Raises:
-            StateRepoError: ``tip`` has another render version.
-        """
+        """Return the advance to ``tip``; raise if that has another render version."""
         last_valid_config.refuse_other_render_version(trees.commit_of(repo, tip).tree)
         known = self._known
         if known is None or self._start != before.commit:
             known = Advance(before, (), False)
         if known.snapshot.commit != tip or known.snapshot.problems:
-            known = known.followed_by(advance(repo, known.snapshot, tip))
+            more = advance(repo, known.snapshot, tip)
+            known = Advance(
+                more.snapshot,
+                tuple(dict.fromkeys((*known.subjects, *more.subjects))),
+                known.config_changed or more.config_changed,
+            )
         self._known, self._start = known, before.commit
         return known
