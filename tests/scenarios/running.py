@@ -329,7 +329,7 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
     if bool(taken.files) != (taken.outcome != "unchanged"):
         yield f"is {taken.outcome}, and makes {'a' if taken.files else 'no'} commit"
     signs = {"start": "+", "change": "~", "stop": "-"}
-    desired = sorted(f"{signs[release.change]} {release.description}" for release in taken.releases)
+    desired = sorted(f"{signs[release.change]} {release.what}" for release in taken.releases)
     if step.desired is not None and desired != sorted(step.desired):
         yield f"the desired state changes otherwise: {desired}"
     if step.warns is not None:

@@ -270,13 +270,11 @@ class TestShutdowns:
 
     def test_the_oldest_claim_gives_first_and_only_the_hold_of_the_one_that_leaves(self) -> None:
         books = MemoryRepo()
-        for id in ("one", "two"):
-            books.send(goal([application(who=["vehicle00", id])], id=id))
+        joins = [goal([application(who=["vehicle00", id])], id=id) for id in ("one", "two")]
+        books.take_all(joins)
         assert books.send(goal([application()], id="three", shutdown=True)).outcome == "released"
-        assert [claim.requesters for claim in books.state.ledger] == [
-            ("one",),
-            ("two", "vehicle00"),
-        ]
+        held = {claim.request: claim.requesters for claim in books.state.ledger}
+        assert held == {"one": ("one",), "two": ("two", "vehicle00")}
 
     def test_what_one_requester_gives_up_stays_for_the_other(self) -> None:
         books = MemoryRepo()
