@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -163,6 +163,10 @@ class Person:
         assert old in text, f"{path} does not hold {old!r}"
         return self.change({path: text.replace(old, new)})
 
+    def override(self, **named: str | None) -> str:
+        """Merge ``name=text`` as overrides/<name>.yaml, or remove it; return the commit."""
+        return self.change({f"overrides/{name}.yaml": text for name, text in named.items()})
+
     def policy(self, **changed: Any) -> None:
         """Change every access domain."""
         data = yaml.safe_load(self.read(POLICY))
@@ -205,7 +209,10 @@ class Commit:
     trailers: tuple[tuple[str, str], ...]
 
     def one(self, key: str) -> str:
-        return next((value for known, value in self.trailers if known == key), "")
+        return next(iter(self.all(key)), "")
+
+    def all(self, key: str) -> list[str]:
+        return [value for known, value in self.trailers if known == key]
 
 
 _FORMAT = "%H%x1f%P%x1f%s%x1f%(trailers:only,unfold,separator=%x1e)%x1d"
@@ -224,6 +231,25 @@ def commits(repo: Path, revisions: str = "main") -> list[Commit]:
     return [commit for commit in found if commit.parents]
 
 
+def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
+    """Have a repository run a script; return its file."""
+    path = Path(os.fspath(repo), "hooks", name)
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return path
+
+
+@contextmanager
+def away(repo: Path) -> Iterator[None]:
+    """Have a repository's folder somewhere else for the length of a block."""
+    elsewhere = repo.rename(repo.with_name("away.git"))
+    try:
+        yield
+    finally:
+        elsewhere.rename(repo)
+
+
 def tip(repo: Path | str) -> str:
     """Return the newest commit of main."""
     return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)
@@ -232,6 +258,13 @@ def tip(repo: Path | str) -> str:
 def read(repo: Path, path: str) -> str:
     """Return a file of main, empty when it is not there."""
     return GitRepo(repo).files(path).get(path, "")
+
+
+def without_vehicle01(repo: Path) -> dict[str, str | None]:
+    """Return the inventory of nodes without one that demand 1 uses."""
+    path = "inventory/nodes.yaml"
+    before, _, rest = read(repo, path).partition("  - id: vehicle01\n")
+    return {path: before + rest[rest.index("  - id: vehicle02\n") :]}
 
 
 def operations(repo: Path) -> list[str]:

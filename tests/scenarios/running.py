@@ -19,7 +19,6 @@ from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.demand_request import Expire
 from demandops.errors import Fault, Refused
-from demandops.ledger import claim_file, recent_shutdowns
 from demandops.ledger.ledger import Ledger
 from demandops.service.timing.expiry import LeaseExpiry
 from demandops.service.timing.rate_limit import RateLimit
@@ -29,7 +28,7 @@ from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
 from tests.kit.config import skeleton
 from tests.kit.memory import NOW as START
-from tests.kit.memory import MemoryRepo
+from tests.kit.memory import MemoryRepo, is_booked, ledger_in
 
 HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"
@@ -235,27 +234,6 @@ class World(MemoryRepo):
         names = sorted(there.keys() ^ asked.keys())
         assert not names, f"these are there and not asked for, or the other way round: {names}"
         assert there == asked
-
-
-def rebuilt(claims: Iterable[Any]) -> Ledger:
-    """Return the ledger that holds ``claims``, put in one by one."""
-    ledger = Ledger()
-    for claim in claims:
-        ledger = ledger.replace(claim.key, claim)
-    return ledger
-
-
-def is_booked(path: str) -> bool:
-    """Return whether demands write the file: a claim's, or a recent shutdown's."""
-    return bool(claim_file.kind_of(path)) or path.startswith(recent_shutdowns.SHUTDOWNS_ROOT)
-
-
-def ledger_in(files: Mapping[str, str]) -> Ledger:
-    """Return the ledger as one who only has the files reads it."""
-    booked = {path: text for path, text in files.items() if is_booked(path)}
-    claims = [path for path in booked if claim_file.kind_of(path)]
-    ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
-    return replace(ledger, shutdowns=recent_shutdowns.read_all(booked))
 
 
 def _purpose(entry: Mapping[str, Any]) -> str:
