@@ -170,7 +170,7 @@ def everything(ledger: Ledger) -> tuple[object, ...]:
 
 
 @examples(35)
-@given(st.lists(whole_claims, max_size=8), chances)
+@given(st.lists(whole_claims, max_size=5), chances)
 def test_a_ledger_is_the_same_in_whatever_order_it_was_built(
     claims: list[Claim], random: Random
 ) -> None:
