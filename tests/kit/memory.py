@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from functools import lru_cache
 from typing import Any
@@ -14,8 +15,9 @@ from demandops.config.load import load
 from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.claim import Claim
 from demandops.errors import Refused
-from demandops.ledger import claim_file
+from demandops.ledger import claim_file, recent_shutdowns
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit.config import FAST, configuration, skeleton
@@ -95,6 +97,15 @@ class MemoryRepo:
             for minute, goal in enumerate(goals)
         ]
 
+    def forget_shutdowns(self) -> None:
+        """Let the recent shutdowns be forgotten."""
+        shutdowns = self.state.ledger.shutdowns
+        self.state = replace(
+            self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())
+        )
+        for digest in shutdowns.by_digest:
+            del self.files[recent_shutdowns.path_of(digest)]
+
     def faults(self, goal: object) -> list[str]:
         """Return the faults of a goal that must be refused, each as ``field: message``."""
         refusal = self.take(goal)
@@ -121,11 +132,6 @@ class MemoryRepo:
             for path, text in self.files.items()
             if path.split("/")[0] in roots and not path.endswith("/README.md")
         }
-
-    def claims_in_files(self) -> list[Claim]:
-        """Return the claims as one who has only the files reads them."""
-        paths = filter(claim_file.kind_of, self.files)
-        return [claim_file.read(self.files[path], path) for path in paths]
 
     def rendered(self) -> dict[str, str]:
         """Return the files below ``clusters/`` that demands brought."""
@@ -154,6 +160,19 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
     for claim in claims:
         ledger = ledger.replace(claim.key, claim)
     return ledger
+
+
+def is_booked(path: str) -> bool:
+    """Return whether demands write the file: a claim's, or a recent shutdown's."""
+    return bool(claim_file.kind_of(path)) or path.startswith(recent_shutdowns.SHUTDOWNS_ROOT)
+
+
+def ledger_in(files: Mapping[str, str]) -> Ledger:
+    """Return the ledger as one who has only the files reads it."""
+    booked = {path: text for path, text in files.items() if is_booked(path)}
+    claims = [path for path in booked if claim_file.kind_of(path)]
+    ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
+    return replace(ledger, shutdowns=recent_shutdowns.read_all(booked))
 
 
 def outcome(taken: Decision | Refused) -> str:

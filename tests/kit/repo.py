@@ -297,7 +297,7 @@ def books(repo: Path, revision: str = "main") -> dict[str, Any]:
 def claims(repo: Path, needle: str = "") -> list[str]:
     """The paths of claim files whose text holds ``needle``."""
     files = GitRepo(repo).files("ledger/")
-    return [path for path in files if path.endswith(".yaml") and needle in files[path]]
+    return [path for path, text in files.items() if "Claim\n" in text and needle in text]
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:

@@ -22,7 +22,7 @@ from tests.kit.goals import (
     goal,
     input_topic,
 )
-from tests.model.books import World
+from tests.model.books import World, requesters
 
 T = TypeVar("T")
 
@@ -102,6 +102,7 @@ class Maker:
         self._random = random
         self.calm = calm
         self.joined: list[Goal] = []
+        self.left: list[Goal] = []
 
     def sequence(self, length: int) -> list[Goal]:
         """Return requests of every sort, in any order."""
@@ -115,7 +116,11 @@ class Maker:
             return self.again(self._pick(self.joined))
         if self._odds(30):
             return goal(id=self._pick(REQUESTS), shutdown=True)
-        return self.leave()
+        if self.left and self._odds(4):  # the last one, or one from long ago
+            made = self.left[-1] if self._odds(2) else self._pick(self.left)
+            return self.again(made) if self._odds(3) else made
+        self.left.append(self.leave())
+        return self.left[-1]
 
     def join(self, request: str | None = None, who: Sequence[str] | None = None) -> Goal:
         """Return a request for one to four subjects, mostly in the name of the same requesters."""
@@ -159,7 +164,7 @@ class Maker:
                 made[kind] = made[kind][:1]
         if self._odds(4):
             made["id"] = self._pick(REQUESTS)
-        if self._odds(5):
+        if self._odds(4):
             self._ask_others(made)
         for app in made["apps"]:
             self._leave_application(app)
@@ -208,6 +213,8 @@ class Maker:
             self._disturb_application(app)
         for item in made["connections"]:
             self._disturb_connection(item)
+        if self._odds(16):  # a subject is asked for in the name of the same: one claim is older
+            self._name(self._pick(["apps", "connections"]), made, self._people())
         if self._odds(20):
             made["apps"] += deepcopy(made["apps"])
         if self._odds(20):
@@ -219,8 +226,8 @@ class Maker:
         body = app["object_detection_fusion_app"]
         if self._odds(16):
             app["header"]["node_id"] = self._pick(["cloud", "edge", "nowhere"])
-        if self._odds(20):
-            body["requester_ids"] = self._people() if self._odds(2) else []
+        if self._odds(40):
+            body["requester_ids"] = []
         if self._odds(40):
             app["type"] = 2
         if self._odds(40):
@@ -235,8 +242,8 @@ class Maker:
         self._disturb_ends(item)
         if self._odds(20):
             item["target_topics"][0] = "/elsewhere"
-        if self._odds(24):
-            item["requester_ids"] = self._people() if self._odds(2) else []
+        if self._odds(48):
+            item["requester_ids"] = []
         if self._odds(40):
             item["target_topics"] = item["target_topics"][1:]
         if self._odds(40):
@@ -253,12 +260,16 @@ class Maker:
             item["type"] = self._pick([0, 2, 7])
 
     def _ask_others(self, made: Goal) -> None:
-        """Ask in the name of fewer or other requesters."""
+        """Ask in the name of fewer requesters, of others, or of those of several claims."""
         people = self._people()
-        for item in [app["object_detection_fusion_app"] for app in made["apps"]]:
-            item["requester_ids"] = item["requester_ids"][:1] if self._odds(2) else people
-        for item in made["connections"]:
-            item["requester_ids"] = item["requester_ids"][:1] if self._odds(2) else people
+        for kind in ("apps", "connections"):
+            named = [one for item in made[kind] for one in requesters(item)]
+            who = [named[:1], people, list(dict.fromkeys((*named, *people)))]
+            self._name(kind, made, self._pick(who))
+
+    def _name(self, kind: str, made: Goal, who: Sequence[str]) -> None:
+        for item in made[kind]:
+            item.get("object_detection_fusion_app", item)["requester_ids"] = list(who)
 
     def _leave_application(self, app: Item) -> None:
         body = app["object_detection_fusion_app"]

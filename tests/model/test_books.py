@@ -55,4 +55,4 @@ def test_the_model_gives_the_papers_table() -> None:
             assert inputs["ego_data"] == [f"/vehicles/vehicle0{one}/ego_data" for one in present]
             clouds = [STATION_CLOUD] + [VEHICLE_CLOUD] * bool(by_vehicle)
             assert inputs["object_list"] == clouds
-    assert not books.demands()
+    assert not books.claims

@@ -19,7 +19,6 @@ from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.demand_request import Expire
 from demandops.errors import Fault, Refused
-from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.service.timing.expiry import LeaseExpiry
 from demandops.service.timing.rate_limit import RateLimit
@@ -29,7 +28,7 @@ from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
 from tests.kit.config import skeleton
 from tests.kit.memory import NOW as START
-from tests.kit.memory import MemoryRepo, rebuilt
+from tests.kit.memory import MemoryRepo, is_booked, ledger_in
 
 HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"
@@ -178,8 +177,8 @@ class World(MemoryRepo):
         self.state = replace(state, ledger=self.state.ledger)
         empty = replace(state, ledger=Ledger())
         self._initial = {**skeleton(), **config, **rendered_files(empty)}
-        claims = {p: text for p, text in self.files.items() if claim_file.kind_of(p)}
-        self.files = {**self._initial, **claims, **rendered_files(self.state)}
+        ledger = {p: text for p, text in self.files.items() if is_booked(p)}
+        self.files = {**self._initial, **ledger, **rendered_files(self.state)}
 
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
@@ -229,7 +228,7 @@ class World(MemoryRepo):
 
     def assert_sound(self) -> None:
         """The files say what the books say, and nothing else is there."""
-        assert rebuilt(self.claims_in_files()) == self.state.ledger
+        assert ledger_in(self.files) == self.state.ledger
         asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())

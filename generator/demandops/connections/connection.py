@@ -80,6 +80,10 @@ class Connection:
             and listed.type in (None, self.type)
         )
 
+    def told_apart_by(self) -> tuple[str, ...]:
+        """Return what a shutdown lists to mean this one, beside its id and topics."""
+        return (self.source, self.target, self.known_type.word)
+
     def topic_keys(self) -> Iterator[TopicKey]:
         """Yield the key of each topic: its name on the source node."""
         for route in self.topics:

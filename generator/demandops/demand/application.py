@@ -104,6 +104,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             and listed.appdef == self.appdef
         )
 
+    def told_apart_by(self) -> tuple[str, ...]:
+        """Return what a shutdown lists to mean this one, beside its id and topics."""
+        return (self.node, self.appdef)
+
     def topic_keys(self) -> Iterator[TopicKey]:
         """Yield the key of each input: role, topic, source. Without inputs, the key is empty."""
         for role, topic in self.all_inputs():

@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel, parse
@@ -24,7 +24,7 @@ from demandops.connections.route import Route, RouteOptions
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
-from demandops.errors import InvalidInput, fault
+from demandops.errors import Fault, InvalidInput, fault
 from demandops.settings import LEDGER_API_VERSION
 from demandops.subject import Subject, SubjectKind, TopicKey
 
@@ -116,19 +116,19 @@ class _Claim(FrozenModel):
     def held(self) -> Application | Connection:
         raise NotImplementedError
 
-    def partial(self) -> Iterator[tuple[TopicKey, tuple[str, ...]]]:
-        """Yield the topics that name their requesters."""
+    def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
+        """Yield the topics that name their requesters, each with its place in the file."""
         raise NotImplementedError
 
-    @model_validator(mode="after")
-    def _topics_have_known_requesters(self) -> _Claim:
-        for key, names in self.partial():
+    def faults(self) -> Iterator[Fault]:
+        """Yield a fault for each topic with a requester that the claim does not have."""
+        for place, _, names in self.partial():
             if unknown := set(names) - set(self.requesters):
-                raise ValueError(
-                    f"topic {key[-1]}: {', '.join(sorted(unknown))} is not among the requesters of "
-                    "the claim; add it there, or remove it from the topic"
+                message = (
+                    f"{', '.join(sorted(unknown))} is not among the requesters of the claim; add "
+                    "it there, or remove it here"
                 )
-        return self
+                yield fault(f"{place}.requesters", message)
 
     def claim(self) -> Claim:
         held = self.held()
@@ -141,7 +141,7 @@ class _Claim(FrozenModel):
             lease=self.lease.lease() if self.lease else None,
             joined=self.action is not None or self._is_old_join(),
         )
-        partial = dict(self.partial())
+        partial = {key: names for _, key, names in self.partial()}
         if not partial:
             return claim
         holders = {key: partial.get(key, self.requesters) for key in held.topic_keys()}
@@ -161,11 +161,12 @@ class _ApplicationFile(_Claim):
     parameters: dict[str, Any] = Field(default_factory=dict)
     version: str = ""
 
-    def partial(self) -> Iterator[tuple[TopicKey, tuple[str, ...]]]:
+    def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
         for role, topics in self.inputs.items():
-            for one in topics:
+            for number, one in enumerate(topics):
                 if one.requesters:
-                    yield (role, one.topic, one.source), one.requesters
+                    place = f"inputs.{role}[{number}]"
+                    yield place, (role, one.topic, one.source), one.requesters
 
     def held(self) -> Application:
         inputs = {
@@ -192,10 +193,10 @@ class _ConnectionFile(_Claim):
     broker: str = ""
     topics: dict[str, Annotated[_Route, BeforeValidator(_plain_route)]] = Field(min_length=1)
 
-    def partial(self) -> Iterator[tuple[TopicKey, tuple[str, ...]]]:
+    def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
         for source, route in self.topics.items():
             if route.requesters:
-                yield (source,), route.requesters
+                yield f"topics.{source}", (source,), route.requesters
 
     def held(self) -> Connection:
         topics = tuple(
@@ -301,10 +302,11 @@ def read(text: str, path: str) -> Claim:
                 ).within(path)
             ]
         )
+    file: _Claim
     if kind == "ApplicationClaim":
-        claim = parse(_ApplicationFile, data, path).claim()
+        file = parse(_ApplicationFile, data, path)
     elif kind == "ConnectionClaim":
-        claim = parse(_ConnectionFile, data, path).claim()
+        file = parse(_ConnectionFile, data, path)
     else:
         raise InvalidInput(
             [
@@ -313,6 +315,9 @@ def read(text: str, path: str) -> Claim:
                 ).within(path)
             ]
         )
+    if faults := [found.within(path) for found in file.faults()]:
+        raise InvalidInput(faults)
+    claim = file.claim()
     if path_of(claim.key) != path:
         raise InvalidInput(
             [

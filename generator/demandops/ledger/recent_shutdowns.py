@@ -50,17 +50,17 @@ class RecentShutdown:
     @classmethod
     def of(cls, request: Shutdown, at: datetime) -> RecentShutdown:
         """Return the record of a shutdown that was received at a time."""
-        listed = sorted(
-            [
+        listed = {
+            (
                 one.held.subject.kind.value,
                 one.held.subject.id,
-                sorted(set(one.requesters)),
-                one.held.nodes,
-                sorted(words for words, _ in one.held.listed_topics(one.held)),
-            ]
+                tuple(sorted(set(one.requesters))),
+                one.held.told_apart_by(),
+                tuple(sorted({words for words, _ in one.held.listed_topics(one.held)})),
+            )
             for one in request.demanded
-        )
-        exact = json.dumps([request.id, listed], ensure_ascii=True)
+        }
+        exact = json.dumps([request.id, sorted(listed)], ensure_ascii=True)
         digest = hashlib.sha256(exact.encode()).hexdigest()[:20]
         return cls(digest, request.id, tuple(sorted(request.requesters())), at)
 

@@ -45,7 +45,7 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
             ("Application", "edge/fusion-1"),
             ("Connection", "vehicle01/edge"),
             ("Request-Id", "vehicle01"),
-            ("Render-Version", "1"),
+            ("Render-Version", "2"),
         ]
         author = rig.git(bare, "log", "-1", "--format=%an <%ae> %cn", commit.id)
         assert author == "Petra Platform <petra@example.org> DemandOps generator"

@@ -109,7 +109,7 @@ def test_an_edited_inventory_is_carried_out_before_the_next_demand(
         "Follows": made,
         "Since": first.id,
         "Caused-By": f"{made} Petra Platform <petra@example.org>",
-        "Render-Version": "1",
+        "Render-Version": "2",
     }
     changed = rig.git(bare, "diff-tree", "-r", "--name-only", "--no-commit-id", follow.id)
     assert changed.splitlines()

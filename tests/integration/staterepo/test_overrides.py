@@ -203,7 +203,7 @@ def test_what_is_kept_runs_on_until_somebody_asks_again_or_the_override_goes(
     assert len(rig.claims(bare, "override:lasting")) == 1
     assert "override overrides/lasting.yaml: keep;" in file(bare, DETECTION)
     with pytest.raises(Refused):
-        rig.book(generator, rig.leave(1))
+        rig.book(generator, rig.leave(1) | {"id": "another"})
     moved = rig.goal(6)
     moved["apps"][0]["header"]["node_id"] = "cloud"
     rig.book(generator, moved)

@@ -167,8 +167,7 @@ def test_what_was_not_held_is_named_and_the_rest_released() -> None:
 
 def test_the_oldest_claim_gives_first_and_only_the_hold_of_the_one_that_leaves() -> None:
     books = MemoryRepo()
-    for id in ("one", "two"):
-        books.send(goal([application(who=["vehicle00", id])], id=id))
+    books.take_all(goal([application(who=["vehicle00", id])], id=id) for id in ("one", "two"))
     assert books.send(goal([application()], id="three", shutdown=True)).outcome == "released"
     left = sorted(claim.requesters for claim in books.state.ledger)
     assert left == [("one",), ("two", "vehicle00")]

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from random import Random
 from types import MappingProxyType
 
+import pytest
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import CONNECTION_TYPES
+from demandops.connections.mqtt import MQTT
 from demandops.connections.route import Route, merged_routes
 from demandops.demand.application import Application, InputTopic
-from demandops.demand.claim import Claim, ClaimKey
+from demandops.demand.claim import Claim, ClaimKey, demand_id
 from demandops.demand.demand_request import id_problem
 from demandops.demand.lease import LONGEST_S, Lease
+from demandops.errors import InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.subject import Subject, SubjectKind
@@ -121,8 +125,17 @@ claims = st.builds(
 )
 
 
+@st.composite
+def joined_claims(draw: st.DrawFn) -> Claim:
+    """Return a claim of the reference's action; some of its requesters hold each topic."""
+    claim = replace(draw(claims), joined=True)
+    some = st.sets(st.sampled_from(claim.requesters), min_size=1)
+    holders = {topic: tuple(sorted(draw(some))) for topic in claim.held.topic_keys()}
+    return claim.with_holders(claim.held, holders)
+
+
 @examples(100)
-@given(claims)
+@given(claims | joined_claims())
 def test_every_claim_survives_its_file(claim: Claim) -> None:
     path, text = claim_file.path_of(claim.key), claim_file.text_of(claim)
 
@@ -170,3 +183,43 @@ def test_a_ledger_is_the_same_in_whatever_order_it_was_built(
     for claim in rest:
         ledger = ledger.replace(claim.key, None)
     assert everything(ledger) == everything(Ledger())
+
+
+def written(claim: Claim, *changes: tuple[str, str]) -> Claim:
+    """Return what is read of a claim's file that a person changed."""
+    text = claim_file.text_of(claim)
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return claim_file.read(text, claim_file.path_of(claim.key))
+
+
+@pytest.mark.parametrize(("demand", "joined"), [(demand_id("r", ["c"]), True), ("trip-7", False)])
+def test_the_first_schema_has_no_action_and_the_demand_id_tells_it(
+    demand: str, joined: bool
+) -> None:
+    connection = Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"),))
+    claim = Claim(connection, demand, "r", ("c",), datetime(2026, 1, 31, tzinfo=timezone.utc))
+
+    assert written(claim) == claim
+    assert written(claim, ("ledger/v2", "ledger/v1")) == replace(claim, joined=joined)
+
+
+def test_a_topic_names_requesters_of_the_claim_only() -> None:
+    inputs = {"point_cloud": (InputTopic("/a", "v"), InputTopic("/b", "v"))}
+    claims = [
+        Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"), Route("/c", "/d"))),
+        Application("a", "object-detection-fusion", "edge", inputs),
+    ]
+    places = ("topics./a.requesters", "inputs.point_cloud[0].requesters")
+    for held, place in zip(claims, places, strict=True):
+        first, second = held.topic_keys()
+        claim = Claim(held, "d", "r", ("c", "e"), datetime(2026, 1, 31, tzinfo=timezone.utc))
+        claim = claim.with_holders(held, {first: ("e",), second: ("c", "e")})
+        with pytest.raises(InvalidInput) as error:
+            written(claim, ("    - e\n", "    - e\n    - x\n"))
+        (found,) = error.value.faults
+        assert found.field == place
+        assert found.message == (
+            "x is not among the requesters of the claim; add it there, or remove it here"
+        )

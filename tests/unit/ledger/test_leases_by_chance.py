@@ -7,21 +7,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import timedelta
+from itertools import combinations
 from random import Random
 from typing import Any
 
 from demandops.config.load import load
 from demandops.decision import Decision, State
 from demandops.demand.application import Application
-from demandops.demand.claim import Claim
+from demandops.demand.claim import Claim, demand_id
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.recent_shutdowns import RecentShutdowns
 from hypothesis import given, note
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
-from tests.kit.memory import rebuilt
-from tests.model.leases import BY_MESSAGE, Goal, Promises, Subject
+from tests.kit.memory import ledger_in
+from tests.model.leases import Goal, Promises, Subject, by_message
 from tests.scenarios import running
 
 SLACK_S = 30
@@ -36,7 +38,7 @@ EMPTY = State.of(load(FILES), Ledger())
 DEMANDS = ("d0", "d1", "D1", "d/2")
 PEOPLE = ("vehicle00", "vehicle01", "station00")
 LEASES = (None, 10, 60, 90)
-PAUSES = (0, 0, 1, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 3600)
+PAUSES = (1, 1, 2, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 900, 3600)
 
 
 class Maker:
@@ -45,6 +47,7 @@ class Maker:
     def __init__(self, random: Random) -> None:
         self._random = random
         self._puts: list[Goal] = []
+        self._shutdowns: list[Goal] = []
 
     def any(self) -> Goal:
         kind = self._random.randrange(20)
@@ -55,6 +58,8 @@ class Maker:
             return self._puts[-1]
         if kind < 16:
             return self._named("release" if kind == 14 else "renew")
+        if kind == 19 and self._shutdowns:
+            return self._random.choice(self._shutdowns[-2:])
         return self._message(shutdown=kind > 17)
 
     def _of_known(self, kind: int) -> Goal:
@@ -119,16 +124,26 @@ class Maker:
             "target_topics": topics,
         }
         request = self._random.choice(["m0", "m1"])
-        return {"id": request, "shutdown": shutdown, "connections": [item]}
+        made = {"id": request, "shutdown": shutdown, "connections": [item]}
+        if shutdown:
+            self._shutdowns.append(made)
+        return made
 
 
 Name = tuple[str, Subject]
 
 
+MESSAGES = {
+    demand_id(request, who): by_message(request, who)
+    for request in ("m0", "m1")
+    for count in (1, 2, 3)
+    for who in combinations(PEOPLE, count)
+}
+
+
 def name_of(claim: Claim) -> Name:
     """Return what the model knows a claim by."""
-    by_message = f"{BY_MESSAGE}{claim.request} {sorted(claim.requesters)}"
-    demand = claim.demand if claim.demand in DEMANDS else by_message
+    demand = MESSAGES.get(claim.demand, claim.demand)
     return demand, (claim.subject.kind.value, claim.subject.id)
 
 
@@ -147,20 +162,16 @@ def claims_of(world: running.World) -> dict[Name, tuple[dict[str, Any], frozense
         else:
             topics = {route.source: route.target for route in held.topics}
             what = {"source": held.source, "target": held.target, "topics": topics}
+            what["holds"] = {one: frozenset(claim.holders((one,))) for one in topics}
         found[name_of(claim)] = what, frozenset(claim.requesters)
     return found
 
 
 def restart(world: running.World, random: Random) -> None:
     """Go on from the files alone, read in any order."""
-    claims = world.claims_in_files()
-    random.shuffle(claims)
-    ledger = rebuilt(claims)
-    assert (ledger.claims, ledger.index, ledger.minutes) == (
-        world.state.ledger.claims,
-        world.state.ledger.index,
-        world.state.ledger.minutes,
-    )
+    files = random.sample(sorted(world.files.items()), len(world.files))
+    ledger = ledger_in(dict(files))
+    assert ledger == world.state.ledger
     world.state = replace(world.state, ledger=ledger)
     world.restart()
 
@@ -235,6 +246,6 @@ def leave_all(world: running.World, promises: Promises, now: int) -> None:
             continue  # went with another of its demand
         release = {"kind": "Demand", "operation": "release", "demand": claim.demand}
         world.take(release | {"requesters": list(claim.requesters)})
-    assert world.state.ledger == Ledger()
+    assert replace(world.state.ledger, shutdowns=RecentShutdowns()) == Ledger()
     assert world.rendered() == {}
     assert not [path for path in world.files if claim_file.kind_of(path)]

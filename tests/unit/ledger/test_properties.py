@@ -11,22 +11,32 @@ from random import Random
 
 import pytest
 from demandops.decision import Decision, rendered_files
-from demandops.demand.claim import Claim
+from demandops.demand.claim import ClaimKey, demand_id
 from demandops.ledger import claim_file
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import TIMES, chances, examples, told
 from tests.kit.goals import application, connection, goal
-from tests.kit.memory import NOW, MemoryRepo, outcome, rebuilt
+from tests.kit.memory import MemoryRepo, ledger_in, outcome
 from tests.model.books import Books, Demand, Goal, Result
 from tests.model.goals import SKELETON, Maker, ego, shutdown_of
 
+PAUSES = (1, 1, 1, 60, 400, 899, 900, 901)
+"""Seconds between two requests; a shutdown is remembered for 900."""
 
-def demand_in(claim: Claim) -> tuple[str, str, Demand]:
-    """Return what the model knows a claim by."""
-    kind = "application" if claim.is_on_application else "connection"
-    return kind, claim.subject.id, (claim.request, claim.requesters)
+Key = tuple[tuple[str, str], str]
+"""A subject and a demand id."""
+
+
+def key_of(subject: tuple[str, str], demand: Demand) -> Key:
+    """Return what the program knows a claim of the model by."""
+    return subject, demand_id(*demand)
+
+
+def key_in(key: ClaimKey) -> Key:
+    """Return the key of a claim in plain words."""
+    return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
 
 
 class Walk:
@@ -34,29 +44,39 @@ class Walk:
 
     def __init__(self, random: Random) -> None:
         self.maker = Maker(random)
+        self._random = random
         self._repo, self._books = MemoryRepo(), Books(SKELETON)
 
     def take(self, request: Goal) -> None:
-        expected = self._books.take(request)
+        pause = self._random.choice(PAUSES)
+        self._repo.now += timedelta(seconds=pause)
+        expected = self._books.take(request, pause)
         taken = self._repo.take(request)
-        assert outcome(taken) == expected.outcome, (expected, taken)
-        assert {demand_in(claim) for claim in self._repo.state.ledger} == self._books.demands()
+        assert outcome(taken) == expected.outcome, (pause, expected, taken)
+        holds = {key_of(*key): holds for key, holds in self._books.holds().items()}
+        assert self._holds() == holds, (pause, request)
         assert self._repo.view() == self._books.view()
         if isinstance(taken, Decision):
             assert_changes(taken, expected)
-            if taken.outcome != "released":
+            if not request["shutdown"]:
                 self._assert_counts_once(request)
 
     def assert_rendered_from_the_files(self) -> None:
         """Step by step gave what one gives who only has the claims' files."""
-        fresh = replace(self._repo.state, ledger=rebuilt(self._repo.claims_in_files()))
+        fresh = replace(self._repo.state, ledger=ledger_in(self._repo.files))
         assert fresh.ledger == self._repo.state.ledger
         at_once = rendered_files(fresh)
         assert self._repo.below(*{path.split("/")[0] for path in at_once}) == at_once
 
+    def _holds(self) -> dict[Key, dict[tuple[str, ...], set[str]]]:
+        return {
+            key_in(claim.key): {key: set(claim.holders(key)) for key in claim.held.topic_keys()}
+            for claim in self._repo.state.ledger
+        }
+
     def _assert_counts_once(self, request: Goal) -> None:
         same = self.maker.again(request)
-        again = self._repo.decide(same, NOW + timedelta(days=1))
+        again = self._repo.decide(same, self._repo.now + timedelta(days=1))
         assert again.outcome == "unchanged", same
         assert again.state == self._repo.state
         assert (dict(again.files), again.changes.claims, again.releases) == ({}, (), ())
@@ -64,21 +84,23 @@ class Walk:
 
 def assert_changes(taken: Decision, expected: Result) -> None:
     """The claims that change are written, no others, and what was not held is named."""
-    changed = [change.after or change.before for change in taken.changes.claims]
-    assert {demand_in(claim) for claim in changed if claim} == expected.touched
+    changed = {key_in(change.key) for change in taken.changes.claims}
+    assert changed == {key_of(*key) for key in expected.touched}
     paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
-    assert {path for path in taken.files if path.startswith("ledger/")} == paths
+    assert {path for path in taken.files if claim_file.kind_of(path)} == paths
     assert bool(taken.files) == expected.effective
     named = taken.changes.not_held
-    for subject, topic in expected.not_held:
-        assert any(_names(text, subject, topic) for text in named), (subject, topic, named)
+    for vain in expected.not_held:
+        assert any(_names(text, *vain) for text in named), (vain, named)
     for text in named:
         assert any(_names(text, *vain) for vain in expected.not_held), (text, expected.not_held)
 
 
-def _names(text: str, subject: str, topic: str | None) -> bool:
-    """Tell whether a subject is named, with this topic or with none."""
-    return f"'{subject}'" in text and (": " not in text or f" {topic}" in text)
+def _names(text: str, subject: str, topic: tuple[str, ...] | None, who: str) -> bool:
+    """Tell whether a subject is named for a requester, with this topic or with none."""
+    words = " ".join(("topic", *topic) if len(topic) == 1 else topic[:2]) if topic else ""
+    named = ": " not in text or f": {words} " in text
+    return named and f"'{subject}'" in text and text.endswith(f" for {who}")
 
 
 @examples(60)
@@ -150,6 +172,8 @@ def test_a_released_demand_leaves_no_trace(random: Random, before: int, after: i
     left = outcome(with_guest.take(shutdown_of(guest)))
 
     assert (came, left) in (("booked", "released"), ("refused", "refused"))
+    with_guest.forget_shutdowns()
+    without.forget_shutdowns()
     assert with_guest.state == without.state
     assert with_guest.files == without.files
 
@@ -162,6 +186,7 @@ def test_when_all_have_left_the_repo_is_as_it_was_laid_down(random: Random, coun
     repo.take_all(requests)
 
     assert set(repo.take_all([shutdown_of(request) for request in requests])) == {"released"}
+    repo.forget_shutdowns()
     assert repo.state == MemoryRepo().state
     assert repo.files == MemoryRepo().files
 
@@ -185,6 +210,8 @@ def test_the_order_of_independent_demands_does_not_matter(random: Random, count:
     assert "refused" not in {outcome(one.take(request)) for request in one_order}
     for request in other_order:  # nor does it matter in which order a request lists things
         assert outcome(other.take(maker.again(request))) != "refused"
+    one.forget_shutdowns()
+    other.forget_shutdowns()
     assert one.state == other.state
     assert one.files == other.files
 
