@@ -247,7 +247,7 @@ class Worker:
         override_is_due = self._override_expiry.is_due(self.snapshot.state, self._runtime.now())
         try:
             if self._timer.start_if_due():
-                self._repository.refresh_unless_urgent(lambda: self._demands.must_not_wait)
+                self._repository.refresh(lambda: self._demands.must_not_wait)
             elif not (self._repository.always_current or override_is_due):
                 return
             new = override_is_due or self._repository.tip() != self.snapshot.commit
