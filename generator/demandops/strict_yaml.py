@@ -28,6 +28,8 @@ _WORDS = frozenset(
 
 _OPENING = (yaml.MappingStartEvent, yaml.SequenceStartEvent)
 _CLOSING = (yaml.MappingEndEvent, yaml.SequenceEndEvent)
+MAX_LENGTH = 4_000_000
+"""The characters of a file that is read; an inventory of 20,000 nodes has fewer."""
 _MAX_DEPTH = 100
 _MAX_BITS = 1024
 _NEEDS_CHECK = re.compile(r"[&*]|[-?:][ \t]+[-?][ \t]|^\?", re.MULTILINE)
@@ -152,6 +154,9 @@ def load_all(text: str, file: str = "") -> Iterator[Any]:
     Raises:
         InvalidInput: if it is not strict YAML; the fault names ``file``.
     """
+    if len(text) > MAX_LENGTH:
+        message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
+        raise InvalidInput.at("", message, file=file)
     with _strict(file):
         depth = 0
         for event in yaml.parse(text, Loader=_Loader):

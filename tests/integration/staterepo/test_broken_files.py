@@ -16,7 +16,7 @@ import pytest
 import yaml
 from demandops.service import Generator
 from demandops.settings import GENERATED_ROOTS
-from demandops.staterepo.load import state_in_effect
+from demandops.staterepo.load import snapshot, state_in_effect
 
 from tests.kit import rig
 from tests.kit.config import override
@@ -265,4 +265,30 @@ def test_what_does_not_belong_in_generated_folders_is_removed_whatever_it_is_cal
             "clusters/a/README.md"
         }
         assert not any("evil" in one or "link" in one or "377" in one for one in entries())
+    rig.assert_sound(bare)
+
+
+def test_a_broken_file_is_judged_once_and_not_on_each_demand(
+    bare: Path, person: Person, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed: list[int] = []
+    load = snapshot.load_config
+    monkeypatch.setattr(
+        snapshot, "load_config", lambda files: (parsed.append(len(files)), load(files))[1]
+    )
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        nodes = "".join(f"  - {{id: n{i}, type: [], cluster: 5}}\n" for i in range(2_000))
+        person.change({NODES: text(bare, NODES) + nodes})
+        rig.book(generator, goal(2))
+        faults = [one for one in generator.snapshot.problems if one.file == NODES]
+        assert (len(faults), faults[-1].message) == (101, "has 3900 more faults")
+        judged = len(parsed)
+        assert judged
+        rig.book(generator, goal(3))
+        rig.book(generator, goal(4))
+        assert len(parsed) == judged
+        person.change({"README.md": "Ours\n"})
+        rig.book(generator, goal(5))
+        assert len(parsed) == judged
     rig.assert_sound(bare)
