@@ -31,7 +31,8 @@ _CLOSING = (yaml.MappingEndEvent, yaml.SequenceEndEvent)
 MAX_LENGTH = 4_000_000
 """The characters of a file that is read; an inventory of 20,000 nodes has fewer."""
 _MAX_DEPTH = 100
-_MAX_BITS = 1024
+_MAX_BITS = 14_000
+"""Of a whole number; Python prints no more than 4,300 digits."""
 _NEEDS_CHECK = re.compile(r"[&*]|[-?:][ \t]+[-?][ \t]|^\?", re.MULTILINE)
 """Text that may hold an alias, or many levels on one line."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
