@@ -129,7 +129,7 @@ def decide(
     ledger, changes = _book(state, request, now)
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
-    rendered = changeset.build_changeset(state, after, changes.claims, keys, state.engine, read)
+    rendered = changeset.build_changeset(state, after, changes, keys, state.engine, read)
     on_stage("booked")
     outcome: Outcome = "unchanged"
     if changes.claims:
@@ -144,6 +144,7 @@ def decide(
         warnings=(
             *_connection_warnings(request, after),
             *rendered.blocked,
+            *_repeat(changes),
             *denial.warnings(request, after),
         ),
         approval=permission.approval_reasons(
@@ -221,7 +222,7 @@ def changeset_of_edit(
     """Return the changes to rendered files that follow when a person changes claims."""
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
-    return changeset.build_changeset(old, state, (), keys, state.engine, read)
+    return changeset.build_changeset(old, state, Changes(), keys, state.engine, read)
 
 
 def rendered_files(
@@ -268,6 +269,13 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
                     f"connection '{held.id}': {route.read_topic} is bridged between "
                     f"'{held.source}' and '{held.target}' already, so no client carries it"
                 )
+
+
+def _repeat(changes: Changes) -> Iterator[str]:
+    """Yield a warning if the same shutdown was carried out before."""
+    if changes.repeats is not None:
+        at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
+        yield f"the same shutdown was carried out at {at}; this one releases nothing more"
 
 
 def refusal_text(error: InvalidInput) -> str:

@@ -13,10 +13,10 @@ from typing import Final
 API_VERSION: Final = "demandops/v1"
 """``apiVersion`` of every configuration file."""
 
-LEDGER_API_VERSION = "demandops.ledger/v1"
+LEDGER_API_VERSION = "demandops.ledger/v2"
 """``apiVersion`` of every claim file."""
 
-RENDER_VERSION = 1
+RENDER_VERSION = 2
 """Increased whenever the same ledger and configuration render to different bytes."""
 
 MAIN_BRANCH = "main"

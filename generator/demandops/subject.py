@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import TypeAlias
+
+TopicKey: TypeAlias = "tuple[str, ...]"
+"""The identity of a topic within its subject: role, topic and source, or the source topic."""
 
 
 class SubjectKind(Enum):

@@ -1,33 +1,23 @@
 """Further types of applications: folders of YAML and templates, demanded like the first.
 
-``recorder`` and ``monitor`` share a driver that runs where the sensor is. The reference's message
-has no parameters, so what merges them is tested below the wire, by ledger and plan.
+``recorder`` and ``monitor`` share a driver that runs where the sensor is.
 """
 
 from __future__ import annotations
 
 from datetime import timedelta
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import pytest
 import yaml
-from demandops.demand.application import Application, InputTopic
-from demandops.demand.demand_request import Demanded, Join, place_in
-from demandops.errors import Refused
-from demandops.ledger.apply import apply
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.world import World
-from demandops.plan.planner import plan
-from demandops.plan.release import ServiceRelease
-from demandops.plan.release_keys import all_keys
 
 from tests.kit.cli import Run
 from tests.kit.config import FAST, skeleton
 from tests.kit.goals import BODY, CLOUD, STATION_CLOUD, application, connection, goal
 from tests.kit.memory import NOW, MemoryRepo
 from tests.kit.repo import GitRepo
+from tests.scenarios.running import configuration
 
 HERE = Path(__file__).parent
 RECORDER, MONITOR = 2, 3
@@ -37,29 +27,17 @@ UNCARRIED = (
 )
 
 
-def additions() -> dict[str, str]:
-    """Return what a platform engineer adds to a state repo: the folders and two registry lists."""
-    found = {
-        f"appdefs/{path.relative_to(HERE).as_posix()}": path.read_text()
-        for name in ("recorder", "monitor")
-        for path in sorted((HERE / name).rglob("*"))
-        if path.is_file()
-    }
-    folder = "appdefs/recorder/charts/recorder"
-    charts = f"  recorder:\n    folder: {folder}\n    version: 0.1.0\n"
-    images = "".join(
-        f"  {name}:\n    repository: ghcr.io/example/{name}\n    tag: v1\n"
-        for name in ("driver", "recorder")
-    )
-    return found | {
-        "registry/charts.yaml": skeleton()["registry/charts.yaml"] + charts,
-        "registry/images.yaml": skeleton()["registry/images.yaml"] + images,
-    }
+ADDITIONS = {
+    path: text
+    for path, text in configuration(["recorder", "monitor"]).items()
+    if path not in skeleton() or path.startswith("registry/")
+}
+"""What a platform engineer adds to a state repo: the folders and two registry lists."""
 
 
 @pytest.fixture
 def books() -> MemoryRepo:
-    return MemoryRepo(additions())
+    return MemoryRepo(ADDITIONS)
 
 
 def record(id: str = "edge/record", **more: Any) -> dict[str, Any]:
@@ -71,7 +49,7 @@ def monitor(id: str = "cloud/monitor", **more: Any) -> dict[str, Any]:
 
 
 def test_it_is_demanded_with_yaml_alone(demandops: Run, state: GitRepo, tmp_path: Path) -> None:
-    state.commit(dict(additions()), "Add the recorder\n")
+    state.commit(ADDITIONS, "Add the recorder\n")
     file = tmp_path / "record.yaml"
     file.write_text(
         """
@@ -137,12 +115,6 @@ def test_a_service_for_each_topic_runs_where_its_source_is(books: MemoryRepo) ->
     assert "clusters/c-its/perception/vehicle00/drv-vehicle00-vehicle00.yaml" in books.rendered()
 
 
-def test_what_runs_at_its_source_needs_a_connection_for_what_it_makes_of_its_input(
-    books: MemoryRepo,
-) -> None:
-    assert books.send(goal([record()])).warnings == (UNCARRIED,)
-
-
 def test_a_demand_of_our_own_gets_the_connection_that_brings_what_is_made_at_the_source(
     books: MemoryRepo,
 ) -> None:
@@ -204,7 +176,7 @@ def test_a_shared_driver_stops_with_the_last_who_needs_it(books: MemoryRepo) -> 
 def test_a_driver_does_not_depend_on_which_of_its_users_came_first() -> None:
     ends = []
     for order in ((record(), monitor()), (monitor(), record())):
-        books = MemoryRepo(additions())
+        books = MemoryRepo(ADDITIONS)
         for demanded in order:
             books.send(goal([demanded], id=demanded["header"]["id"]))
         ends.append(books.rendered())
@@ -269,36 +241,22 @@ class TestParameters:
     """Each demand's value, merged as the appdef says; what cannot be merged is refused."""
 
     @staticmethod
-    def book(
-        ledger: Ledger, who: str, appdef: str = "recorder", minute: int = 0, **parameters: object
-    ) -> Ledger:
-        app = Application(
-            f"edge/{appdef}",
-            appdef,
-            "edge",
-            {"point_cloud": (InputTopic(*CLOUD),)},
-            MappingProxyType(parameters),
-        )
-        request = Join(who, (Demanded(app, (who,), place_in("applications[0]")),))
-        return apply(ledger, request, NOW + timedelta(minutes=minute))[0]
+    def demand(who: str, appdef: str = "recorder", **parameters: object) -> dict[str, Any]:
+        app = {
+            "id": f"edge/{appdef}",
+            "type": appdef,
+            "node": "edge",
+            "inputs": {"point_cloud": [{"topic": CLOUD[0], "source": CLOUD[1]}]},
+            "parameters": parameters,
+        }
+        return {"kind": "Demand", "demand": who, "requesters": [who], "applications": [app]}
 
     @staticmethod
-    def planned(books: MemoryRepo, ledger: Ledger, service: str = "recorder") -> dict[str, object]:
-        world = World(books.config, ledger)
-        for key in all_keys(world):
-            release = plan(world, key)
-            if isinstance(release, ServiceRelease) and key.service == service:  # type: ignore[union-attr]
-                return dict(release.parameters)
-        raise AssertionError(f"no {service} is planned")
-
-    def test_nobody_says_anything(self, books: MemoryRepo) -> None:
-        assert self.planned(books, self.book(Ledger(), "a")) == {
-            "labels": [],
-            "rate": 1,
-            "quality": None,
-            "title": "untitled",
-            "format": "mcap",
-        }
+    def values(books: MemoryRepo, prefix: str = "rec-") -> dict[str, Any]:
+        """Return the values of the one release with a prefix."""
+        releases = books.objects("HelmRelease").items()
+        (found,) = (one["spec"]["values"] for name, one in releases if name.startswith(prefix))
+        return dict(found)
 
     @pytest.mark.parametrize(
         ("name", "given", "merged"),
@@ -306,97 +264,48 @@ class TestParameters:
             ("labels", [["b", "a"], ["c", "b"]], ["a", "b", "c"]),
             ("labels", ["b", ["a"]], ["a", "b"]),
             ("labels", [[], []], []),
+            ("labels", [["yes", "1e3"], None], ["1e3", "yes"]),
             ("rate", [10, 20], 20),
             ("rate", [2.5, 2], 2.5),
             ("rate", [-3, -2], -2),
+            ("rate", [0.5, None], 0.5),  # who says nothing does not say the default
+            ("rate", [None, None], 1),
             ("quality", [10, 20], 10),
             ("quality", [0, 0.5], 0),
             ("title", ["first", "second"], "second"),
+            ("title", ["{{ x }}\n: 'y'", None], "{{ x }}\n: 'y'"),
             ("format", ["bag", "bag"], "bag"),
+            ("format", ["bag", None], "bag"),
         ],
     )
     def test_two_values_become_one(
         self, books: MemoryRepo, name: str, given: list[object], merged: object
     ) -> None:
-        ledger = Ledger()
-        for minute, value in enumerate(given):
-            ledger = self.book(ledger, f"who{minute}", minute=minute, **{name: value})
-        assert self.planned(books, ledger)[name] == merged
-
-    @pytest.mark.parametrize("name", ["labels", "rate", "quality", "format"])
-    def test_the_order_of_demands_does_not_matter(self, books: MemoryRepo, name: str) -> None:
-        values = {
-            "labels": [["a"], ["b"]],
-            "rate": [1, 2],
-            "quality": [1, 2],
-            "format": ["bag"] * 2,
-        }
-        ends = []
-        for order in ((0, 1), (1, 0)):
-            ledger = Ledger()
-            for index in order:
-                ledger = self.book(ledger, f"who{index}", **{name: values[name][index]})
-            ends.append(self.planned(books, ledger)[name])
-        assert ends[0] == ends[1]
-
-    def test_who_says_nothing_does_not_count_as_saying_the_default(self, books: MemoryRepo) -> None:
-        ledger = self.book(self.book(Ledger(), "a"), "b", rate=0.5, format="bag")
-        assert self.planned(books, ledger)["rate"] == 0.5
-        assert self.planned(books, ledger)["format"] == "bag"
-
-    def test_what_was_released_no_longer_counts(self, books: MemoryRepo) -> None:
-        ledger = self.book(self.book(Ledger(), "a", rate=5), "b", rate=9)
-        (claim,) = (claim for claim in ledger if claim.requesters == ("b",))
-        assert self.planned(books, ledger.replace(claim.key, None))["rate"] == 5
+        turned = books.copy()
+        for repo, step in ((books, 1), (turned, -1)):
+            for minute, value in enumerate(given[::step]):
+                parameters = {} if value is None else {name: value}
+                demand = self.demand(f"who{minute}", **parameters)
+                repo.send(demand, NOW + timedelta(minutes=minute))
+        assert self.values(books)[name] == merged
+        if name != "title":  # of which the last one counts
+            assert self.values(turned)[name] == merged
 
     def test_values_that_nobody_said_how_to_merge_must_agree(self, books: MemoryRepo) -> None:
-        ledger = self.book(
-            self.book(Ledger(), "vehicle00", format="mcap"), "vehicle01", format="bag"
+        books.send(self.demand("vehicle00", format="mcap"))
+        (found,) = books.faults(self.demand("vehicle01", format="bag"))
+        assert found == (
+            'parameters.format: demands contradict each other: "mcap" for vehicle00 and "bag" for '
+            "vehicle01; agree, or have the application definition say how to merge them"
         )
-        with pytest.raises(Refused) as refused:
-            self.planned(books, ledger)
-        (found,) = refused.value.faults
-        assert found.code == "conflict"
-        values = {'"mcap" for vehicle00', '"bag" for vehicle01'}
-        start, _, rest = found.message.partition("demands contradict each other: ")
-        shown, _, remedy = rest.partition("; ")
-        assert (start, set(shown.split(" and "))) == ("", values)
-        assert remedy == "agree, or have the application definition say how to merge them"
 
-    def test_a_text_where_a_number_is_merged_is_refused(self, books: MemoryRepo) -> None:
-        ledger = self.book(self.book(Ledger(), "a", rate=5), "b", rate="fast")
-        with pytest.raises(Refused) as refused:
-            self.planned(books, ledger)
-        assert [(found.field, found.message) for found in refused.value.faults] == [
-            (
-                "parameters.rate",
-                "'fast' is not a number, but the application definition takes the max",
-            )
-        ]
-
-    def test_parameters_are_in_the_values(self, books: MemoryRepo) -> None:
-        ledger = self.book(Ledger(), "a", rate=7, title="{{ x }}\n: 'y'", labels=["yes", "1e3"])
-        from demandops.decision import State, rendered_files
-
-        files = rendered_files(State(books.config, ledger, books.state.engine))
-        (text,) = (text for path, text in files.items() if "/rec-" in path)
-        values = yaml.safe_load(text)["spec"]["values"]
-        assert values["rate"] == 7
-        assert values["title"] == "{{ x }}\n: 'y'"
-        assert values["labels"] == ["1e3", "yes"]
-        assert "quality" not in values
-
-    @pytest.mark.parametrize(("recorder", "monitor"), [(10, 20), (20, 10)])
+    @pytest.mark.parametrize(
+        ("recorder", "monitor"), [({"rate": 10}, 20), ({"rate": 20}, 10), ({}, 20)]
+    )
     def test_a_shared_driver_merges_over_all_kinds_of_its_applications(
-        self, books: MemoryRepo, recorder: int, monitor: int
+        self, books: MemoryRepo, recorder: dict[str, int], monitor: int
     ) -> None:
-        ledger = self.book(Ledger(), "a", "recorder", rate=recorder)
-        ledger = self.book(ledger, "b", "monitor", rate=monitor)
-        assert self.planned(books, ledger, "driver")["rate"] == 20
-
-    def test_a_shared_driver_does_not_fall_back_to_the_default_of_one_kind(
-        self, books: MemoryRepo
-    ) -> None:
-        ledger = self.book(Ledger(), "a", "monitor", rate=20)
-        ledger = self.book(ledger, "b", "recorder")
-        assert self.planned(books, ledger, "driver")["rate"] == 20
+        """Nor does it fall back to the default of one kind."""
+        books.send(self.demand("a", "recorder", **recorder))
+        books.send(self.demand("b", "monitor", rate=monitor))
+        assert self.values(books, "drv-")["rate"] == 20

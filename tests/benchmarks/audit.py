@@ -7,12 +7,12 @@ for each question; ``--keep FOLDER`` leaves the state repo there (and takes it u
 from __future__ import annotations
 
 import argparse
-import shutil
-import tempfile
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pygit2
 from demandops.service import Generator
@@ -74,8 +74,8 @@ def measure(repo: Path) -> None:
 
 
 def _fusion(opened: reader.Reader, tip: str) -> str:
-    files = opened.changed_files(opened.commit("main~2"), tip, "clusters")
-    return next(iter(files), "clusters")
+    files = opened.changed_files(opened.commit("main~2"), tip, ("clusters",))
+    return files[0] if files else "clusters"
 
 
 def _told(opened: reader.Reader, path: str | None, tip: str) -> str:
@@ -95,15 +95,12 @@ def main() -> int:
     parser.add_argument("--commits", type=int, default=COMMITS)
     parser.add_argument("--keep", type=Path)
     args = parser.parse_args()
-    folder = args.keep or Path(tempfile.mkdtemp(prefix="bench-audit-"))
-    try:
+    with nullcontext(args.keep) if args.keep else TemporaryDirectory(prefix="bench-audit-") as used:
+        folder = Path(used)
         repo = folder / "state-repo.git"
         if not repo.exists():
             repo = lay_down(folder, args.releases, args.commits)
         measure(repo)
-    finally:
-        if not args.keep:
-            shutil.rmtree(folder, ignore_errors=True)
     return 0
 
 

@@ -7,7 +7,7 @@ what the generator itself writes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -20,11 +20,12 @@ from demandops.decision import State, admit, rendered_files
 from demandops.ledger import claim_file
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
-from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_message
+from rich.table import Table
 
 from tests.kit import goals
 from tests.kit.config import configuration
+from tests.kit.repo import write_tree
 
 VEHICLES_PER_EDGE = 10
 RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
@@ -85,7 +86,11 @@ def _nodes(edges: int, edges_per_cluster: int, vehicles: int) -> str:
         nodes.append({"id": edge, "type": "edge", "cluster": region})
         names = [vehicle_id(number, place) for place in range(vehicles)] + [spare_id(number)]
         nodes += [{"id": name, "type": "vehicle", "cluster": region} for name in names]
-    return strict_yaml.dump({"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": nodes})
+    return _file("Nodes", nodes=nodes)
+
+
+def _file(kind: str, **lists: object) -> str:
+    return strict_yaml.dump({"apiVersion": "demandops/v1", "kind": kind} | lists)
 
 
 def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
@@ -105,20 +110,10 @@ def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, fur
     files = configuration()
     files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster, vehicles + further)
     regions = sorted({_region(number, edges_per_cluster) for number in range(edges)})
-    files["inventory/clusters.yaml"] = strict_yaml.dump(
-        {
-            "apiVersion": "demandops/v1",
-            "kind": "Clusters",
-            "clusters": [{"name": region} for region in regions],
-        }
-    )
-    files["inventory/brokers.yaml"] = strict_yaml.dump(
-        {
-            "apiVersion": "demandops/v1",
-            "kind": "Brokers",
-            "brokers": [{"node": "cloud", "host": "broker", "port": 1883}],
-        }
-    )
+    clusters = [{"name": region} for region in regions]
+    files["inventory/clusters.yaml"] = _file("Clusters", clusters=clusters)
+    broker = {"node": "cloud", "host": "broker", "port": 1883}
+    files["inventory/brokers.yaml"] = _file("Brokers", brokers=[broker])
     config = load(files)
     state, now = State.of(config, Ledger()), datetime.now(timezone.utc)
     ledger = Ledger()
@@ -130,8 +125,18 @@ def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, fur
     files |= rendered_files(State(config, ledger, state.engine))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
-    tree = trees.write(repo, None, files)
+    tree = write_tree(repo, None, files)
     who = commit_message.generator_signature(now)
-    text = "A fleet\n\nOperation: init\nRender-Version: 1\n"
+    text = "A fleet\n\nOperation: init\nRender-Version: 2\n"
     repo.create_commit("refs/heads/main", who, who, text, tree, [])
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
+
+
+def table(title: str, rows: Sequence[Mapping[str, float]]) -> Table:
+    """Return figures as people read them; the columns are the keys of the first row."""
+    made = Table(title=title)
+    for column in rows[0]:
+        made.add_column(column.replace("_", " "), justify="right")
+    for row in rows:
+        made.add_row(*(f"{n:,.2f}" if isinstance(n, float) else f"{n:,}" for n in row.values()))
+    return made

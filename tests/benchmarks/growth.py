@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import statistics
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from demandops.service import Generator
 from rich.console import Console
-from rich.table import Table
 
 from tests.benchmarks import fleet
 
@@ -37,72 +35,39 @@ def _seconds(generator: Generator, goal: dict[str, Any]) -> float:
     return time.perf_counter() - start
 
 
-def _measured(
-    folder: Path, vehicles: int, goals: Callable[[int], list[dict[str, Any]]], rounds: int
-) -> tuple[float, list[float]]:
-    """Return the start of a generator with ``vehicles`` at one edge, and each goal's median."""
+def _row(
+    folder: Path, name: str, size: int, vehicles: int, rounds: int, ego: Callable[[int], list[str]]
+) -> Row:
+    """Measure a further vehicle, again and again, on an application that ``vehicles`` hold."""
     laid = fleet.lay_down_crowd(folder / "state-repo.git", vehicles, rounds + WARM_UP)
     start = time.perf_counter()
     generator = Generator(str(laid), data=folder / "data")
     load = time.perf_counter() - start
+    times: list[tuple[float, float]] = []
     try:
-        times = [
-            [_seconds(generator, goal) for goal in goals(number)]
-            for number in range(rounds + WARM_UP)
-        ]
+        for number in range(rounds + WARM_UP):
+            edge, vehicle = fleet.edge_id(0), fleet.vehicle_id(0, vehicles + number)
+            join = fleet.goal(edge, vehicle, ego=ego(number))
+            leave = join | {"shutdown": True}
+            times.append((_seconds(generator, join), _seconds(generator, leave)))
     finally:
         generator.close()
-    return load, [statistics.median(column) for column in zip(*times[WARM_UP:], strict=True)]
+    joins, leaves = map(statistics.median, zip(*times[WARM_UP:], strict=True))
+    return {name: size, "start_ms": load * 1e3, "join_ms": joins * 1e3, "leave_ms": leaves * 1e3}
 
 
 def vehicles_row(folder: Path, vehicles: int) -> Row:
     """Measure one more vehicle on an application that ``vehicles`` hold."""
-
-    def goals(number: int) -> list[dict[str, Any]]:
-        edge, name = fleet.edge_id(0), fleet.vehicle_id(0, vehicles + number)
-        return [fleet.goal(edge, name), fleet.goal(edge, name, shutdown=True)]
-
-    load, (join, leave) = _measured(folder, vehicles, goals, ROUNDS)
-    return {
-        "vehicles": vehicles,
-        "start_ms": load * 1e3,
-        "join_ms": join * 1e3,
-        "leave_ms": leave * 1e3,
-    }
+    return _row(folder, "vehicles", vehicles, vehicles, ROUNDS, lambda number: [])
 
 
 def topics_row(folder: Path, topics: int) -> Row:
     """Measure one goal with ``topics`` topics, and its shutdown."""
 
-    def goals(number: int) -> list[dict[str, Any]]:
-        names = [f"/t{number}/n{index}" for index in range(topics)]
-        edge, name = fleet.edge_id(0), fleet.vehicle_id(0, 10 + number)
-        return [
-            fleet.goal(edge, name, ego=names),
-            fleet.goal(edge, name, ego=names, shutdown=True),
-        ]
+    def ego(number: int) -> list[str]:
+        return [f"/t{number}/n{index}" for index in range(topics)]
 
-    load, (join, leave) = _measured(folder, 10, goals, 3)
-    return {
-        "topics": topics,
-        "start_ms": load * 1e3,
-        "join_ms": join * 1e3,
-        "leave_ms": leave * 1e3,
-    }
-
-
-def _print(out: Console, title: str, rows: list[Row]) -> None:
-    table = Table(title=title)
-    for column in rows[0]:
-        table.add_column(column.replace("_", " "), justify="right")
-    for row in rows:
-        table.add_row(
-            *(
-                f"{value:,.1f}" if name.endswith("_ms") else f"{value:,}"
-                for name, value in row.items()
-            )
-        )
-    out.print(table)
+    return _row(folder, "topics", topics, 10, 3, ego)
 
 
 def main() -> int:
@@ -115,18 +80,12 @@ def main() -> int:
     out = Console(highlight=False)
     args.output.parent.mkdir(parents=True, exist_ok=True)
     results: dict[str, list[Row]] = {}
-    for name, measure, sizes in (
-        ("vehicles", vehicles_row, args.vehicles),
-        ("topics", topics_row, args.topics),
-    ):
+    for name, measure in (("vehicles", vehicles_row), ("topics", topics_row)):
         rows = results[name] = []
-        for size in sizes:
-            folder = Path(tempfile.mkdtemp(prefix="bench-", dir=args.output.parent))
-            try:
-                rows.append(measure(folder, size))
-            finally:
-                shutil.rmtree(folder, ignore_errors=True)
-        _print(out, f"One more demand, by {name} (medians in milliseconds)", rows)
+        for size in getattr(args, name):
+            with TemporaryDirectory(prefix="bench-", dir=args.output.parent) as folder:
+                rows.append(measure(Path(folder), size))
+        out.print(fleet.table(f"One more demand, by {name} (medians)", rows))
     args.output.write_text(json.dumps(results, indent=2) + "\n")
     out.print(f"written to {args.output}")
     return 0

@@ -11,6 +11,7 @@ import pytest
 from demandops.cli.main import run
 
 from tests.kit.cli import Run
+from tests.kit.goals import put
 from tests.kit.repo import git
 
 CHART = "appdefs/object-detection-fusion/charts/object-fusion"
@@ -101,16 +102,6 @@ def test_a_generated_file_edited_by_hand_is_told(checkout: Path, check: Check) -
     )
 
 
-def test_edits_are_held_against_where_the_branch_left_main_even_when_committed(
-    checkout: Path, check: Check
-) -> None:
-    git(checkout, "update-ref", "refs/remotes/origin/main", "HEAD")
-    edit(checkout / CHART / "values.yaml", "period: 0.5", "period: 0.7")
-    git(checkout, "commit", "-qam", "a quicker watcher")
-    assert check()[0] == 1
-    assert check("--base", "HEAD")[0] == 0
-
-
 def test_a_folder_that_is_no_git_checkout_is_checked_all_the_same(
     checkout: Path, check: Check
 ) -> None:
@@ -164,23 +155,7 @@ def test_an_application_definition_that_is_in_use_cannot_be_deleted(
     checkout: Path, check: Check
 ) -> None:
     goal = checkout.parent / "goal.yaml"
-    goal.write_text(
-        json.dumps(
-            {
-                "kind": "Demand",
-                "demand": "d",
-                "requesters": ["vehicle00"],
-                "applications": [
-                    {
-                        "id": "edge/fusion",
-                        "type": "object-detection-fusion",
-                        "node": "edge",
-                        "inputs": {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]},
-                    }
-                ],
-            }
-        )
-    )
+    goal.write_text(json.dumps(put("d")))
     bare = checkout.parent / "state.git"
     git(checkout.parent, "clone", "-q", "--bare", str(checkout), str(bare))
     assert run(["request", str(goal), "--state-repo", str(bare)]) == 0

@@ -12,14 +12,13 @@ import pytest
 import yaml
 
 from tests.kit.cli import Ran, Run
+from tests.kit.config import override
 from tests.kit.goals import perception
 from tests.kit.repo import GitRepo
 
-HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
 
-
-def text(**fields: Any) -> str:
-    return yaml.safe_dump(HEAD | fields, sort_keys=False)
+def text(select: dict[str, list[str]], **fields: Any) -> str:
+    return override(select, **fields, reason="why")
 
 
 @pytest.fixture
@@ -27,20 +26,19 @@ def overridden(state: GitRepo, request_json: Callable[..., Ran]) -> GitRepo:
     """A state repo with perception for vehicle00, and overrides of each sort in force."""
     request_json(perception())
     many = {
-        "select": [{"services": ["object-detection"]}],
         "values": {"replicas": 2, "nodeSelector": None},
         "images": {"object-detection": {"tag": "x"}},
         "priority": 3,
     }
     state.commit(
         {
-            "overrides/many.yaml": text(**many),
-            "overrides/closed.yaml": text(select=[{"connections": ["*"]}], deny=True),
-            "overrides/off.yaml": text(select=[{"services": ["object-fusion"]}], deny=True),
-            "overrides/lasting.yaml": text(select=[{"applications": ["edge/*"]}], keep=True),
-            "overrides/idle.yaml": text(select=[{"nodes": ["cloud"]}], hold=True),
+            "overrides/many.yaml": text({"services": ["object-detection"]}, **many),
+            "overrides/closed.yaml": text({"connections": ["*"]}, deny=True),
+            "overrides/off.yaml": text({"services": ["object-fusion"]}, deny=True),
+            "overrides/lasting.yaml": text({"applications": ["edge/*"]}, keep=True),
+            "overrides/idle.yaml": text({"nodes": ["cloud"]}, hold=True),
             "overrides/over.yaml": text(
-                select=[{"nodes": ["cloud"]}], keep=True, expires="2020-01-01T00:00:00Z"
+                {"nodes": ["cloud"]}, keep=True, expires="2020-01-01T00:00:00Z"
             ),
         }
     )
@@ -123,11 +121,11 @@ def test_check_says_what_an_override_would_do_and_warns_of_idle_ones(
     clone = tmp_path / "clone"
     pygit2.clone_repository(str(state.path), str(clone))
     folder = clone / "overrides"
-    select = [{"services": ["object-detection"]}]
-    (folder / "many.yaml").write_text(text(select=select, replicas=2))
-    (folder / "idle.yaml").write_text(text(select=[{"nodes": ["nowhere"]}], hold=True, priority=1))
+    select = {"services": ["object-detection"]}
+    (folder / "many.yaml").write_text(text(select, replicas=2))
+    (folder / "idle.yaml").write_text(text({"nodes": ["nowhere"]}, hold=True, priority=1))
     (folder / "over.yaml").write_text(
-        text(select=select, replicas=5, expires="2020-01-01T00:00:00Z", priority=9)
+        text(select, replicas=5, expires="2020-01-01T00:00:00Z", priority=9)
     )
     found = demandops("check", clone)
     assert found.code == 0
@@ -138,7 +136,7 @@ def test_check_says_what_an_override_would_do_and_warns_of_idle_ones(
     ]
     told = "  ~ od-edge-vehicle00 (object-detection on edge for vehicle00)"
     assert told in found.out.splitlines()
-    (folder / "many.yaml").write_text(text(select=select, values={"replicas": "two"}))
+    (folder / "many.yaml").write_text(text(select, values={"replicas": "two"}))
     (folder / "idle.yaml").unlink()
     found = demandops("check", clone, "--output", "json")
     assert found.code == 1

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
 import yaml
 
 from tests.kit.cli import Ran, Run
+from tests.kit.generator import wait_until
 from tests.kit.goals import perception
-from tests.kit.repo import GitRepo, git
-
-POLICY = "policy/access-domains.yaml"
+from tests.kit.repo import GitRepo, Person, branches, git
 
 
 @pytest.fixture
-def strict(state: GitRepo) -> GitRepo:
+def strict(state: GitRepo, person: Person) -> GitRepo:
     """A state repo whose access domain demands approval."""
-    data = yaml.safe_load(state.files(POLICY)[POLICY])
-    data["domains"][0]["approval"] = "required"
-    state.commit({POLICY: yaml.safe_dump(data)})
+    person.policy(approval="required")
     return state
 
 
@@ -42,6 +39,8 @@ def test_a_demand_that_needs_approval_is_proposed_and_listed(
     demandops: Run, send: Send, strict: GitRepo
 ) -> None:
     before = strict.tip
+    nothing = demandops("proposals", "--state-repo", strict.path, "--output", "json")
+    assert (nothing.code, nothing.json()) == (0, [])
     ran = send(strict)
     assert (ran.code, ran.err) == (0, "")
     *_, words, branch = ran.out.strip().rpartition("approval ")
@@ -63,7 +62,7 @@ def test_a_demand_that_needs_approval_is_proposed_and_listed(
 
 def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:
     [row] = send(strict, "--output", "json").json()
-    branch = git(strict, "for-each-ref", "--format=%(refname:short)", "refs/heads/demand")
+    branch = "".join(branches(strict.path))
     assert row == {
         "index": 0,
         "request": "request",
@@ -76,31 +75,23 @@ def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:
     }
 
 
-def test_sent_again_it_waits_on_the_same_branch_and_once_merged_changes_nothing(
-    demandops: Run, send: Send, strict: GitRepo
-) -> None:
-    first, second = send(strict), send(strict)
-    assert first.out == second.out
-    branch = first.out.split()[-1]
-    git(strict, "branch", "--force", "main", branch)
-    assert demandops("proposals", "--state-repo", strict.path).out == "nothing awaits approval\n"
-    [row] = send(strict, "--output", "json").json()
-    assert (row["outcome"], row["commit"]) == ("unchanged", strict.tip)
+@contextmanager
+def decided(state: GitRepo, *command: str) -> Iterator[None]:
+    """A person who runs a command of git with the first branch that comes."""
+
+    def decide() -> None:
+        wait_until(lambda: branches(state.path), "a demand waits")
+        git(state, *command, *branches(state.path))
+
+    person = threading.Thread(target=decide)
+    person.start()
+    yield
+    person.join()
 
 
 def test_wait_waits_for_the_decision(send: Send, strict: GitRepo) -> None:
-    def merge() -> None:
-        for _ in range(1000):
-            found = git(strict, "for-each-ref", "--format=%(refname)", "refs/heads/demand")
-            if found:
-                git(strict, "update-ref", "refs/heads/main", found)
-                return
-            threading.Event().wait(0.02)
-
-    person = threading.Thread(target=merge)
-    person.start()
-    ran = send(strict, "--wait")
-    person.join()
+    with decided(strict, "branch", "--force", "main"):
+        ran = send(strict, "--wait")
     assert ran.code == 0
     assert ran.err.startswith(
         "standard input: request 'request' awaiting approval: demand/request-"
@@ -109,18 +100,8 @@ def test_wait_waits_for_the_decision(send: Send, strict: GitRepo) -> None:
 
 
 def test_one_that_is_turned_down_while_it_waits_is_refused(send: Send, strict: GitRepo) -> None:
-    def turn_down() -> None:
-        for _ in range(1000):
-            found = git(strict, "for-each-ref", "--format=%(refname:short)", "refs/heads/demand")
-            if found:
-                git(strict, "branch", "--delete", "--force", found)
-                return
-            threading.Event().wait(0.02)
-
-    person = threading.Thread(target=turn_down)
-    person.start()
-    ran = send(strict, "--wait")
-    person.join()
+    with decided(strict, "branch", "--delete", "--force"):
+        ran = send(strict, "--wait")
     assert ran.code == 1
     assert "was turned down: demand/request-" in ran.err
 
@@ -135,7 +116,7 @@ def test_a_dry_run_says_that_approval_is_needed(
     ]
     [row] = send(strict, "--dry-run", "--output", "json").json()
     assert (row["outcome"], row["approval"]) == ("proposed", ["access domain 'perception'"])
-    assert git(strict, "for-each-ref", "refs/heads/demand") == ""
+    assert branches(strict.path) == []
 
 
 def test_a_release_of_what_waits_is_done_by_a_later_call(
@@ -144,7 +125,7 @@ def test_a_release_of_what_waits_is_done_by_a_later_call(
     send(strict)
     ran = send(strict, goal=perception(shutdown=True))
     assert ran.out.startswith("standard input: request 0 'request' released in ")
-    assert git(strict, "for-each-ref", "refs/heads/demand") == ""
+    assert branches(strict.path) == []
 
 
 def test_verify_and_log_take_a_merged_proposal(demandops: Run, send: Send, strict: GitRepo) -> None:
@@ -155,8 +136,3 @@ def test_verify_and_log_take_a_merged_proposal(demandops: Run, send: Send, stric
     assert "merged by a person" in ran.out
     [entry] = demandops("log", "-n", "1", "--output", "json", "--state-repo", strict.path).json()
     assert entry["commit"] == strict.tip
-
-
-def test_nothing_waits_in_a_new_state_repo(demandops: Run, state: GitRepo, tmp_path: Path) -> None:
-    ran = demandops("proposals", "--state-repo", state.path, "--output", "json")
-    assert (ran.code, ran.json()) == (0, [])

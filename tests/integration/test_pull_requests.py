@@ -110,48 +110,67 @@ def test_edited_values_image_and_replicas_become_an_override_to_paste(
     )
 
 
-@pytest.mark.parametrize(
-    ("path", "replaced", "effects", "left"),
-    [
-        (
-            DETECTION,
-            [("object-detection-0.1.0", "object-detection-0.2.0")],
-            {"version": "0.2.0"},
-            [],
-        ),
-        (DETECTION, [("  interval: 10m\n", "  interval: 10m\n  suspend: true\n")],
-         {"hold": True}, []),
-        (DETECTION, [("tolerations: []", "tolerations: [{key: gpu}]"),
-                     ("interval: 10m", "interval: 1m")],
-         {"values": {"tolerations": [{"key": "gpu"}]}}, ["spec.interval"]),
-        (DETECTION, [('      digest: ""\n', ""), ("      rmwImplementation: ", "      other: ")],
-         {"values": {"image": {"digest": None},
-                     "ros": {"rmwImplementation": None, "other": "rmw_cyclonedds_cpp"}}}, []),
-        (CLIENT, [("mqtt_client:kilted", "mqtt_client:jazzy"), ("replicas: 1", "replicas: 2")],
-         {"images": {"mqtt-client": {"tag": "jazzy"}}}, ["Deployment spec.replicas"]),
-        (CLIENT, [("ghcr.io/ika-rwth-aachen/mqtt_client:kilted",
-                   f"mirror.example:5000/mqtt@sha256:{'0' * 64}")],
-         {"images": {"mqtt-client": {"digest": f"sha256:{'0' * 64}",
-                                     "repository": "mirror.example:5000/mqtt"}}}, []),
-    ],
-    ids=["version", "suspend", "values-and-more", "removed-values", "image", "digest"],
-)  # fmt: skip
+OTHER_EDITS: list[tuple[str, list[tuple[str, str]], dict[str, Any], list[str]]] = [
+    (DETECTION, [("object-detection-0.1.0", "object-detection-0.2.0")], {"version": "0.2.0"}, []),
+    (DETECTION, [("  interval: 10m\n", "  interval: 10m\n  suspend: true\n")], {"hold": True}, []),
+    (
+        DETECTION,
+        [("tolerations: []", "tolerations: [{key: gpu}]"), ("interval: 10m", "interval: 1m")],
+        {"values": {"tolerations": [{"key": "gpu"}]}},
+        ["spec.interval"],
+    ),
+    (
+        DETECTION,
+        [('      digest: ""\n', ""), ("      rmwImplementation: ", "      other: ")],
+        {
+            "values": {
+                "image": {"digest": None},
+                "ros": {"rmwImplementation": None, "other": "rmw_cyclonedds_cpp"},
+            }
+        },
+        [],
+    ),
+    (
+        CLIENT,
+        [("mqtt_client:kilted", "mqtt_client:jazzy"), ("replicas: 1", "replicas: 2")],
+        {"images": {"mqtt-client": {"tag": "jazzy"}}},
+        ["Deployment spec.replicas"],
+    ),
+    (
+        CLIENT,
+        [
+            (
+                "ghcr.io/ika-rwth-aachen/mqtt_client:kilted",
+                f"mirror.example:5000/mqtt@sha256:{'0' * 64}",
+            )
+        ],
+        {
+            "images": {
+                "mqtt-client": {
+                    "digest": f"sha256:{'0' * 64}",
+                    "repository": "mirror.example:5000/mqtt",
+                }
+            }
+        },
+        [],
+    ),
+]
+
+
 def test_other_edits_become_the_effect_that_is_made_for_them(
-    branch: Path,
-    found: Callable[..., dict[str, Any]],
-    path: str,
-    replaced: list[tuple[str, str]],
-    effects: dict[str, Any],
-    left: list[str],
+    branch: Path, found: Callable[..., dict[str, Any]]
 ) -> None:
-    edit(branch / path, *replaced)
-    (suggested,) = found()["suggestions"]
-    override = yaml.safe_load(suggested["text"])
-    head = ("apiVersion", "kind", "reason", "owner", "select")
-    assert {key: override[key] for key in override if key not in head} == effects
-    assert (suggested["instead_of"], suggested["not_covered"]) == (path, left)
-    also = ["od-edge-vehicle00"] if path == DETECTION else []
-    assert suggested["other_releases"] == also
+    for path, replaced, effects, left in OTHER_EDITS:
+        before = (branch / path).read_text()
+        edit(branch / path, *replaced)
+        (suggested,) = found()["suggestions"]
+        (branch / path).write_text(before)
+        override = yaml.safe_load(suggested["text"])
+        head = ("apiVersion", "kind", "reason", "owner", "select")
+        assert {key: override[key] for key in override if key not in head} == effects
+        assert (suggested["instead_of"], suggested["not_covered"]) == (path, left)
+        also = ["od-edge-vehicle00"] if path == DETECTION else []
+        assert suggested["other_releases"] == also
 
 
 def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, check: Run) -> None:
@@ -159,19 +178,6 @@ def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, che
     assert check()[2] == f"error: {DETECTION}: {LOST}, and change the configuration instead\n"
     (branch / DETECTION).write_text("kind: [\n")
     assert check()[0] == 1
-
-
-def test_a_suggested_override_is_one_that_can_be_merged(
-    branch: Path, found: Callable[..., dict[str, Any]]
-) -> None:
-    override = pytest.importorskip("demandops.config.override")
-    edit(branch / FUSION, ("replicas: 1", "replicas: 3"), ("domainId: 0", "domainId: 7"))
-    edit(branch / CLIENT, ("mqtt_client:kilted", "mqtt_client:jazzy"))
-    (branch / DETECTION).unlink()
-    suggested = found()["suggestions"]
-    assert len(suggested) == 3
-    for one in suggested:
-        override.OverrideFile.model_validate(yaml.safe_load(one["text"]))
 
 
 def test_what_is_deleted_added_or_the_generators_own_is_refused_with_what_to_do(

@@ -79,7 +79,7 @@ def git_says(
 
 
 def test_git_accepts_the_signature(book: Run, state: Any, key: Path, tmp_path: Path) -> None:
-    assert book("a", "--signing-key", key).code == 0
+    assert book("Straße/北京", "--signing-key", key).code == 0
     said = git_says(state, listed(key), tmp_path)
     assert said.returncode == 0
     assert said.stderr.startswith('Good "git" signature for generator@example.org with ED25519 key')
@@ -87,15 +87,9 @@ def test_git_accepts_the_signature(book: Run, state: Any, key: Path, tmp_path: P
     git(state, "fsck", "--strict")
 
 
-@pytest.mark.parametrize("kind", ["rsa", "ecdsa"])
-def test_other_kinds_of_keys(book: Run, state: Any, tmp_path: Path, kind: str) -> None:
-    key = keygen(tmp_path / "key", kind=kind)
+def test_an_rsa_key(book: Run, state: Any, tmp_path: Path) -> None:
+    key = keygen(tmp_path / "key", kind="rsa")
     assert book("a", "--signing-key", key).code == 0
-    assert git_says(state, listed(key), tmp_path).returncode == 0
-
-
-def test_ids_of_any_alphabet(book: Run, state: Any, key: Path, tmp_path: Path) -> None:
-    assert book("Straße/北京", "--signing-key", key).code == 0
     assert git_says(state, listed(key), tmp_path).returncode == 0
 
 
@@ -107,38 +101,36 @@ def test_a_key_that_an_agent_holds(book: Run, state: Any, agent: None, tmp_path:
     assert git_says(state, listed(key), tmp_path).returncode == 0
 
 
-def test_by_the_environment(
-    book: Run, state: Any, key: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_every_command_that_writes_signs(
+    demandops: Run,
+    book: Run,
+    state: Any,
+    key: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("DEMANDOPS_SIGNING_KEY", str(key))
-    assert book("a").code == 0
-    assert git_says(state, listed(key), tmp_path).returncode == 0
-
-
-def test_init_and_rollback_sign_too(
-    demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path
-) -> None:
     shutil.rmtree(state.path)
-    made = demandops("init", state.path, "--bare", "--signing-key", key)
-    assert made.code == 0
-    assert git_says(state, listed(key), tmp_path).returncode == 0
+    assert demandops("init", state.path, "--bare").code == 0
+    made = [state.tip]
     assert book("a").code == 0
-    where = ("--state-repo", state.path, "--signing-key", key)
-    assert demandops("rollback", "main~1", "-m", "x", "--drop-newer", *where).code == 0
-    assert git_says(state, listed(key), tmp_path).returncode == 0
-
-
-@pytest.mark.parametrize("command", [("decommission", "vehicle00"), ("upgrade",)])
-def test_decommission_and_upgrade_sign_too(
-    command: tuple[str, ...], demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path
-) -> None:
-    assert book("a").code == 0
-    state.commit({next(iter(state.manifests())): None})  # something for the upgrade to render
-    before = state.tip
-    ran = demandops(*command, "--state-repo", state.path, "--signing-key", key)
-    assert (ran.code, ran.err) == (0, "")
-    assert state.tip != before
-    assert git_says(state, listed(key), tmp_path).returncode == 0
+    made.append(state.tip)
+    commands = (
+        ("rollback", "main~1", "-m", "x", "--drop-newer"),
+        ("decommission", "vehicle00"),
+        ("upgrade",),
+    )
+    for command in commands:
+        if command == ("decommission", "vehicle00"):
+            assert book("a").code == 0
+        elif command == ("upgrade",):  # something to render
+            state.commit({next(iter(state.manifests())): None})
+        ran = demandops(*command, "--state-repo", state.path)
+        assert (ran.code, ran.err) == (0, "")
+        made.append(state.tip)
+    assert len(set(made)) == 5
+    for commit in made:
+        assert git_says(state, listed(key), tmp_path, commit).returncode == 0
 
 
 class TestProposals:
@@ -158,20 +150,6 @@ class TestProposals:
     def test_its_commit_is_signed(self, book: Run, state: Any, key: Path, tmp_path: Path) -> None:
         assert book("a", "--signing-key", key).code == 0
         assert git_says(state, listed(key), tmp_path, self.branch(state)).returncode == 0
-
-    def test_a_key_that_is_gone_is_told_to_the_requester(
-        self, state: Any, key: Path, tmp_path: Path, data_home: Path
-    ) -> None:
-        from demandops.service import Generator
-
-        generator = Generator(str(state.path), signing_key=key)
-        try:
-            key.rename(tmp_path / "hidden")
-            with pytest.raises(SigningFailed):
-                generator.submit(goal([], [connection("a")])).future.result(30)
-        finally:
-            assert generator.close()
-        assert self.branch(state) == ""
 
     def test_rolling_back_while_one_waits(
         self, demandops: Run, book: Run, state: Any, key: Path
@@ -234,22 +212,14 @@ class TestKeysThatCannotSign:
         key.chmod(stat.S_IRUSR)
         assert self.told(book, state, key).startswith(f"error: signing key {key} cannot sign: ")
 
-    def test_an_agent_that_does_not_hold_it(
-        self, book: Run, state: Any, agent: None, tmp_path: Path
+    def test_an_agent_that_does_not_hold_it_and_none(
+        self, book: Run, state: Any, agent: None, key: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        key = keygen(tmp_path / "key")
         key.unlink()
-        assert self.told(book, state, f"{key}.pub").startswith(
-            f"error: signing key {key}.pub is public, and no agent signs for it ("
-        )
-
-    def test_no_agent(
-        self, book: Run, state: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.delenv("SSH_AUTH_SOCK", raising=False)
-        key = keygen(tmp_path / "key")
-        key.unlink()
-        assert "no agent signs for it" in self.told(book, state, f"{key}.pub")
+        told = f"error: signing key {key}.pub is public, and no agent signs for it ("
+        assert self.told(book, state, f"{key}.pub").startswith(told)
+        monkeypatch.delenv("SSH_AUTH_SOCK")
+        assert self.told(book, state, f"{key}.pub").startswith(told)
 
 
 def test_a_key_that_is_gone_later_is_told_to_the_requester(
@@ -323,7 +293,7 @@ class TestVerify:
     ) -> None:
         state.commit({SIGNERS: listed(key)})
         since = state.tip
-        forged = "Forged\n\nOperation: join\nRender-Version: 1\n"
+        forged = "Forged\n\nOperation: join\nRender-Version: 2\n"
         state.commit({SIGNERS: listed(keygen(tmp_path / "forger"))}, forged)
         (row,) = self.rows(demandops, state, since, 1)
         assert row["touched"] == [SIGNERS]

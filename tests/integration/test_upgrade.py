@@ -33,11 +33,11 @@ PARTS = ("generator", "ros_bridge", "templates", "appdefs", "state-repo-skeleton
 ROOT_FILE = "demandops.yaml"
 URL = "https://git.example/fleet/state-repo.git"
 OLDER = (
-    "demandops.yaml: renderVersion: is 1, but this generator renders version 2; stop older "
+    "demandops.yaml: renderVersion: is 2, but this generator renders version 3; stop older "
     "generators, then run `demandops upgrade` to render everything again"
 )
 NEWER = (
-    "demandops.yaml: renderVersion: is 2, but this generator renders version 1; update the "
+    "demandops.yaml: renderVersion: is 3, but this generator renders version 2; update the "
     "generator"
 )
 
@@ -59,12 +59,12 @@ for line in commands:
 
 @pytest.fixture(scope="session")
 def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subprocess.Popen[str]]:
-    """A program of render version 2, whose HelmReleases wait longer."""
+    """A program of render version 3, whose HelmReleases wait longer."""
     folder = tmp_path_factory.mktemp("newer")
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
     for path, old, new in (
-        ("generator/demandops/settings.py", "RENDER_VERSION = 1\n", "RENDER_VERSION = 2\n"),
+        ("generator/demandops/settings.py", "RENDER_VERSION = 2\n", "RENDER_VERSION = 3\n"),
         ("templates/flux/release.yaml.j2", "timeout: 5m", "timeout: 6m"),
     ):
         text = (folder / path).read_text()
@@ -155,7 +155,7 @@ def test_the_commit_says_what_it_did(state: GitRepo, upgraded: Callable[..., Ran
     assert state.commits()[0] == (
         "Render everything again, for Argo CD\n"
         "\n"
-        "Why: `demandops upgrade` renders everything with render version 1, for Argo CD "
+        "Why: `demandops upgrade` renders everything with render version 2, for Argo CD "
         "instead of Flux.\n"
         "\n"
         "Files written or removed:\n"
@@ -164,10 +164,10 @@ def test_the_commit_says_what_it_did(state: GitRepo, upgraded: Callable[..., Ran
         "  1 in demandops.yaml\n"
         "\n"
         "Operation: upgrade\n"
-        "From-Render-Version: 1\n"
+        "From-Render-Version: 2\n"
         "From-Gitops: flux\n"
         "Gitops: argocd\n"
-        "Render-Version: 1\n"
+        "Render-Version: 2\n"
     )
 
 
@@ -177,7 +177,7 @@ def test_what_a_person_wrote_in_the_file_stays(
     text = (
         "# Ours.\napiVersion: demandops/v1\nkind: StateRepository\n"
         "gitops: 'flux'   # until spring\nsource: fleet # as in the wiki\n"
-        f"renderVersion: 1\nflux: {{url: '{URL}', interval: 30s}} # asked for by Petra"
+        f"renderVersion: 2\nflux: {{url: '{URL}', interval: 30s}} # asked for by Petra"
     )
     state.commit({ROOT_FILE: text})
     assert upgraded("--gitops", "argocd", "--url", "ssh://git@git.example/fleet.git").code == 0
@@ -278,7 +278,7 @@ def test_where_nothing_would_change_nothing_is_committed(
     before = state.tip
     ran = upgraded(*more)
     assert (ran.code, ran.err, state.tip) == (0, "", before)
-    assert ran.out == f"nothing to do: everything is rendered for flux by version 1, at {before}\n"
+    assert ran.out == f"nothing to do: everything is rendered for flux by version 2, at {before}\n"
     assert upgraded(*more, "--output", "json").json()["outcome"] == "unchanged"
 
 
@@ -311,7 +311,7 @@ def test_a_file_that_cannot_be_edited_by_the_program_is_told(
         "apiVersion": "demandops/v1",
         "kind": "StateRepository",
         "gitops": "flux",
-        "renderVersion": 1,
+        "renderVersion": 2,
         "flux": {"url": URL},
     }
     before = state.commit({ROOT_FILE: json.dumps(root)})
@@ -398,7 +398,7 @@ def test_a_newer_program_serves_only_after_an_upgrade_and_the_older_only_before(
         assert (ran.code, ran.out, ran.err) == (1, "", f"error: {OLDER}\n")
     assert newer("bookkeeping").code == 0
     assert [row["skipped"] for row in json.loads(newer("verify", "--output", "json").out)] == [
-        "rendered by version 1, this is version 2"
+        "rendered by version 2, this is version 3"
     ]
     assert state.tip == before
 
@@ -406,13 +406,13 @@ def test_a_newer_program_serves_only_after_an_upgrade_and_the_older_only_before(
     ran = newer("upgrade")
     assert (ran.code, ran.err) == (0, "")
     assert ran.out == (
-        f"wrote 3 and removed 0 files\nrender version 1 → 2\nin commit {state.tip}\n"
+        f"wrote 3 and removed 0 files\nrender version 2 → 3\nin commit {state.tip}\n"
     )
     new = state.files()
     changed = {path for path in new if new[path] != old.get(path)}
     assert {path.rsplit("/", 1)[-1][:3] for path in changed} == {"dem", "od-", "of-"}
-    assert new[ROOT_FILE] == old[ROOT_FILE].replace("renderVersion: 1", "renderVersion: 2")
-    assert "From-Render-Version: 1\nGitops: flux\nRender-Version: 2\n" in state.commits()[0]
+    assert new[ROOT_FILE] == old[ROOT_FILE].replace("renderVersion: 2", "renderVersion: 3")
+    assert "From-Render-Version: 2\nGitops: flux\nRender-Version: 3\n" in state.commits()[0]
     assert all(row["holds"] for row in json.loads(newer("verify", "--output", "json").out))
     assert "nothing to do" in newer("upgrade").out
 
@@ -457,4 +457,4 @@ def test_an_upgrade_that_is_reverted_gives_the_repo_back_to_the_older_program(
 def test_a_newer_program_lays_down_a_repo_of_its_own_version(newer: Run, tmp_path: Path) -> None:
     folder = tmp_path / "fleet"
     assert newer("init", str(folder)).code == 0
-    assert "renderVersion: 2\n" in (folder / ROOT_FILE).read_text()
+    assert "renderVersion: 3\n" in (folder / ROOT_FILE).read_text()

@@ -30,9 +30,10 @@ def runner(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
     """Return a function that runs ``demandops`` with its arguments."""
     from demandops.cli.main import run
 
-    def call(*args: str | Path, stdin: str = "") -> Ran:
+    def call(*args: str | Path, stdin: str | bytes = "") -> Ran:
         capsys.readouterr()
-        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(stdin.encode()), "utf-8"))
+        given = io.BytesIO(stdin.encode() if isinstance(stdin, str) else stdin)
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(given, "utf-8"))
         code = run([str(arg) for arg in args])
         out, err = capsys.readouterr()
         assert "Traceback" not in out + err, err

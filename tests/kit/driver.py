@@ -55,55 +55,44 @@ class _At:
             die()
 
 
-def _before(owner: type, name: str, point: Callable[[], None]) -> None:
+def _at(owner: type, name: str, point: Callable[[], None], *, after: bool) -> None:
     known = getattr(owner, name)
 
     def wrapped(*args: Any, **options: Any) -> Any:
-        point()
-        return known(*args, **options)
-
-    setattr(owner, name, wrapped)
-
-
-def _after(owner: type, name: str, point: Callable[[], None]) -> None:
-    known = getattr(owner, name)
-
-    def wrapped(*args: Any, **options: Any) -> Any:
+        if not after:
+            point()
         result = known(*args, **options)
-        point()
+        if after:
+            point()
         return result
 
     setattr(owner, name, wrapped)
+
+
+_POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
+    "journaled": (True, [(Journal, "append")]),
+    "committed": (True, [(CommitBatch, "commit")]),
+    "locked": (False, [(LocalRepository, "publish")]),
+    "publishing": (False, [(RemoteRepository, "publish"), (LocalRepository, "publish")]),
+    "published": (True, [(RemoteRepository, "publish"), (LocalRepository, "publish")]),
+    "unanswered": (True, [(Journal, "mark_done")]),
+    "proposing": (False, [(ProposalBranches, "put")]),
+    "proposed": (True, [(ProposalBranches, "put")]),
+    "retracting": (False, [(ProposalBranches, "remove")]),
+}
+"""Whether after or before which calls."""
 
 
 def arm(where: str, address: str) -> None:
     point, _, times = where.partition(":")
     lock = Path(address, "refs", "heads", "main.lock")
     at = _At(int(times or 1), lock.touch if point == "locked" else lambda: None)
-    if point == "journaled":
-        _after(Journal, "append", at)
-    elif point == "committed":
-        _after(CommitBatch, "commit", at)
-    elif point == "locked":
-        _before(LocalRepository, "publish", at)
-    elif point == "publishing":
-        _before(RemoteRepository, "publish", at)
-        _before(LocalRepository, "publish", at)
-    elif point == "published":
-        _after(RemoteRepository, "publish", at)
-        _after(LocalRepository, "publish", at)
-    elif point == "unanswered":
-        _after(Journal, "mark_done", at)
-    elif point == "proposing":
-        _before(ProposalBranches, "put", at)
-    elif point == "proposed":
-        _after(ProposalBranches, "put", at)
-    elif point == "retracting":
-        _before(ProposalBranches, "remove", at)
-    elif point == "withdrawn":
+    if point == "withdrawn":
         Lanes.withdrawn = staticmethod(at)  # type: ignore[method-assign]
     elif point:
-        raise SystemExit(f"no such point: {point}")
+        after, calls = _POINTS[point]
+        for owner, name in calls:
+            _at(owner, name, at, after=after)
 
 
 class Lanes:

@@ -81,22 +81,18 @@ class Proposed:
     """A demand handed in, and the branch that it waits on."""
 
     def __init__(self, generator: Generator, made: Any, operation: str | None = None) -> None:
-        self.told: list[tuple[str, str]] = []
-        self._seen = threading.Event()
-        self.ticket: Ticket = generator.submit(made, operation, self._listen)
-
-    def _listen(self, stage: str, text: str) -> None:
-        self.told.append((stage, text))
-        if stage == "proposed":
-            self._seen.set()
+        stages = Stages()
+        self.told = stages.told
+        self.ticket: Ticket = generator.submit(made, operation, stages)
 
     @property
     def branch(self) -> str:
-        if not self._seen.wait(PATIENCE_S):
-            raise AssertionError(f"never proposed: {self.told} {self.ticket.future}")
-        text = [text for stage, text in self.told if stage == "proposed"][-1]
-        assert text.startswith("awaiting approval: demand/")
-        return text.split()[2]
+        def proposed() -> list[str]:
+            return [text for stage, text in self.told if stage == "proposed"]
+
+        wait_until(proposed, "the demand is proposed")
+        assert proposed()[-1].startswith("awaiting approval: demand/")
+        return proposed()[-1].split()[2]
 
     def outcome(self) -> str:
         return receipt(self.ticket).outcome

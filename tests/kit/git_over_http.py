@@ -1,20 +1,16 @@
-"""A smart-HTTP Git server over `git http-backend`, with faults to order.
-
-Threads of the test's own process, so that a test can say what goes wrong and see what came.
-"""
+"""The rig's smart-HTTP Git server in the test's own process, with faults to order."""
 
 from __future__ import annotations
 
-import gzip
-import os
-import subprocess
+import io
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.kit.http import Handler, listening
+from tests.e2e.rig import githttp
+from tests.kit.http import running
 
 _LOCK = threading.Lock()
 
@@ -59,28 +55,31 @@ def serving(root: Path, prefix: str = "") -> Iterator[Server]:
     server = Server("")
 
     class Serving(_Handler):
-        context = server, root, prefix
+        ordered = server, prefix
 
-    with listening(Serving) as url:
+    with running(githttp.GitServer(root, "127.0.0.1", 0, Serving)) as url:
         server.url = f"{url}{prefix}"
         yield server
 
 
-class _Handler(Handler):
-    context: tuple[Server, Path, str]
-    protocol_version = "HTTP/1.1"
+class _Handler(githttp.Handler):
+    ordered: tuple[Server, str]
 
-    def _serve(self) -> None:
+    def log_message(self, format: str, *args: object) -> None:
+        """Log nothing."""
+
+    def serve(self) -> None:
         self.close_connection = True
-        server, root, prefix = self.context
+        server, prefix = self.ordered
         faults = server.faults
         if faults.hang is not None:
             faults.hang.wait(60)
-        body = self._body()
+        self._received = b"".join(super().body())
         if self._cut(server):
             return
-        push = self.command == "POST" and self.path.endswith("/git-receive-pack")
-        about_to = self.path.endswith("/info/refs?service=git-receive-pack")
+        path, _, query = self.path.removeprefix(prefix).partition("?")
+        push = self.command == "POST" and path.endswith("/git-receive-pack")
+        about_to = path.endswith("/info/refs") and query == "service=git-receive-pack"
         with _LOCK:
             no_push = bool((push or about_to) and faults.no_pushes and not faults.away)
             refuse = 503 if faults.away else faults.status if no_push else 0
@@ -89,9 +88,11 @@ class _Handler(Handler):
         if refuse:
             self.send_error(refuse)
             return
-        answer = self._backend(root, self.path.removeprefix(prefix), body)
+        to_client, self.wfile = self.wfile, io.BytesIO()
+        self.run_backend(path, query)
+        answer, self.wfile = self.wfile.getvalue(), to_client
         # a push of nothing but a flush ("0000") is git asking whether it may
-        if push and len(body) > 4:
+        if push and len(self._received) > 4:
             with _LOCK:
                 server.taken += 1
                 cut = faults.cut_answers > 0
@@ -101,9 +102,12 @@ class _Handler(Handler):
                 self.connection.close()
                 return
         if not self._cut(server):
-            self._relay(answer)
+            self.wfile.write(answer)
 
-    do_GET = do_POST = _serve
+    do_GET = do_POST = serve
+
+    def body(self) -> Iterator[bytes]:
+        yield self._received
 
     def _cut(self, server: Server) -> bool:
         with _LOCK:
@@ -112,50 +116,3 @@ class _Handler(Handler):
         if cut:
             self.connection.close()
         return cut
-
-    def _body(self) -> bytes:
-        body = b""
-        if "chunked" in self.headers.get("Transfer-Encoding", ""):
-            while size := int(self.rfile.readline().split(b";")[0], 16):
-                body += self.rfile.read(size)
-                self.rfile.readline()
-            self.rfile.readline()
-        else:
-            body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
-        return gzip.decompress(body) if self.headers.get("Content-Encoding") == "gzip" else body
-
-    def _backend(self, root: Path, target: str, body: bytes) -> bytes:
-        path, _, query = target.partition("?")
-        variables = {
-            "GIT_PROJECT_ROOT": str(root),
-            "GIT_HTTP_EXPORT_ALL": "1",
-            "REQUEST_METHOD": self.command,
-            "PATH_INFO": path,
-            "QUERY_STRING": query,
-            "CONTENT_TYPE": self.headers.get("Content-Type", ""),
-            "CONTENT_LENGTH": str(len(body)),
-            "GIT_PROTOCOL": self.headers.get("Git-Protocol", ""),
-            "REMOTE_ADDR": "127.0.0.1",
-        }
-        command = ["git", "-c", "http.receivepack=true", "http-backend"]
-        done = subprocess.run(
-            command, input=body, env=os.environ | variables, capture_output=True, check=True
-        )
-        return done.stdout
-
-    def _relay(self, answer: bytes) -> None:
-        head, _, body = answer.partition(b"\r\n\r\n")
-        status, headers = 200, []
-        for line in head.decode("latin-1").split("\r\n"):
-            name, _, value = line.partition(": ")
-            if name == "Status":
-                status = int(value.split()[0])
-            else:
-                headers.append((name, value))
-        self.send_response(status)
-        for name, value in headers:
-            self.send_header(name, value)
-        self.send_header("Content-Length", str(len(body)))
-        self.send_header("Connection", "close")
-        self.end_headers()
-        self.wfile.write(body)

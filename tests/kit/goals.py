@@ -45,13 +45,14 @@ def application(
         "type": type,
         "object_detection_fusion_app": {
             "requester_ids": list(who),
-            "ego_data_topics": [_topic(topic) for topic in ego],
-            "pointcloud_topics": [_topic(topic) for topic in clouds],
+            "ego_data_topics": [input_topic(topic) for topic in ego],
+            "pointcloud_topics": [input_topic(topic) for topic in clouds],
         },
     }
 
 
-def _topic(topic: Topic) -> dict[str, str]:
+def input_topic(topic: Topic) -> dict[str, str]:
+    """Return one topic of an application."""
     return {"topic_name": topic[0], "source_node_id": topic[1]}
 
 
@@ -125,6 +126,17 @@ def link(number: int, **more: Any) -> Goal:
     """Return a goal of one connection, all named by a number."""
     item = connection(f"c{number}", who=[f"r{number}"], topics=[f"/t{number}"], broker="")
     return goal([], [item | more], id=f"request{number}")
+
+
+def put(
+    demand: str, *who: str, topic: Topic = ("/ego", "vehicle00"), node: str = "edge", **more: Any
+) -> Goal:
+    """Return a demand in our own format: one application with one input."""
+    inputs = {"ego_data": [{"topic": topic[0], "source": topic[1]}]}
+    item = {"id": f"edge/{demand[:100]}", "type": "object-detection-fusion", "node": node}
+    item |= {"inputs": inputs} | ({"connect": more.pop("connect")} if "connect" in more else {})
+    made = {"kind": "Demand", "demand": demand, "requesters": list(who or ["vehicle00"])}
+    return made | {"applications": [item]} | more
 
 
 def experiment(step: int) -> Goal:

@@ -113,22 +113,6 @@ def to_store(case: str) -> dict[str, dict[str, str]]:
     return steps
 
 
-def problems(case: str, stored: Mapping[str, Files]) -> list[str]:
-    """Return how stored changes differ from what is rendered."""
-    found = []
-    wanted = to_store(case)
-    for step in sorted({*wanted, *stored}):
-        must, has = wanted.get(step, {}), stored.get(step, {})
-        for path in sorted({*must, *has}):
-            if path not in has:
-                found.append(f"{case}/{step}/{path} is missing")
-            elif path not in must:
-                found.append(f"{case}/{step}/{path} is not a change of this step")
-            elif must[path] != has[path]:
-                found.append(f"{case}/{step}/{path} has another text")
-    return found
-
-
 def _base(
     case: str, step: str, before: Files, steps_of: Callable[[str], Mapping[str, Files]]
 ) -> dict[str, str]:

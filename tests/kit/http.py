@@ -55,9 +55,8 @@ class Server:
 
 
 @contextmanager
-def listening(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
-    """Serve with a handler for the length of a block; gives the URL."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+def running(server: ThreadingHTTPServer) -> Iterator[str]:
+    """Run a server for the length of a block; gives the URL."""
     server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
     thread.start()
@@ -69,20 +68,16 @@ def listening(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
         thread.join()
 
 
-class Handler(BaseHTTPRequestHandler):
-    """A handler that logs nothing."""
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Log nothing."""
-
-
 @contextmanager
 def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
     """Record calls and answer them, one at a time, for the length of a block."""
     served = Server() if answer is None else Server(answer)
     lock = threading.Lock()
 
-    class Recorder(Handler):
+    class Recorder(BaseHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            """Log nothing."""
+
         def _serve(self) -> None:
             length = int(self.headers.get("Content-Length") or 0)
             call = Call(self.command, self.path, self.headers, self.rfile.read(length))
@@ -98,7 +93,7 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
 
         do_GET = do_POST = do_PUT = do_PATCH = do_DELETE = _serve
 
-    with listening(Recorder) as served.url:
+    with running(ThreadingHTTPServer(("127.0.0.1", 0), Recorder)) as served.url:
         yield served
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from functools import lru_cache
 from typing import Any
@@ -12,8 +13,11 @@ import yaml
 from demandops.config.config import Config
 from demandops.config.load import load
 from demandops.decision import Decision, State, decide, rendered_files
+from demandops.demand.claim import Claim
 from demandops.errors import Refused
+from demandops.ledger import claim_file, recent_shutdowns
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit.config import FAST, configuration, skeleton
@@ -93,6 +97,15 @@ class MemoryRepo:
             for minute, goal in enumerate(goals)
         ]
 
+    def forget_shutdowns(self) -> None:
+        """Let the recent shutdowns be forgotten."""
+        shutdowns = self.state.ledger.shutdowns
+        self.state = replace(
+            self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())
+        )
+        for digest in shutdowns.by_digest:
+            del self.files[recent_shutdowns.path_of(digest)]
+
     def faults(self, goal: object) -> list[str]:
         """Return the faults of a goal that must be refused, each as ``field: message``."""
         refusal = self.take(goal)
@@ -139,6 +152,27 @@ class MemoryRepo:
         named = {document["metadata"]["name"]: document for document in documents}
         assert len(named) == len(documents), "two objects have one name"
         return named
+
+
+def rebuilt(claims: Iterable[Claim]) -> Ledger:
+    """Return the ledger that holds ``claims``, put in one by one."""
+    ledger = Ledger()
+    for claim in claims:
+        ledger = ledger.replace(claim.key, claim)
+    return ledger
+
+
+def is_booked(path: str) -> bool:
+    """Return whether demands write the file: a claim's, or a recent shutdown's."""
+    return bool(claim_file.kind_of(path)) or path.startswith(recent_shutdowns.SHUTDOWNS_ROOT)
+
+
+def ledger_in(files: Mapping[str, str]) -> Ledger:
+    """Return the ledger as one who has only the files reads it."""
+    booked = {path: text for path, text in files.items() if is_booked(path)}
+    claims = [path for path in booked if claim_file.kind_of(path)]
+    ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
+    return replace(ledger, shutdowns=recent_shutdowns.read_all(booked))
 
 
 def outcome(taken: Decision | Refused) -> str:

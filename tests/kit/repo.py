@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ import pygit2
 import yaml
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.staterepo import new_repo, reader
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.load import snapshot as snapshots
 
 from tests.kit.memory import NOW
@@ -56,6 +58,16 @@ def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
     )
     assert not check or done.returncode == 0, f"git {' '.join(args)}: {done.stdout}{done.stderr}"
     return done.stdout.removesuffix("\n")
+
+
+def write_tree(
+    repo: pygit2.Repository, base: pygit2.Tree | None, files: Mapping[str, str | None]
+) -> pygit2.Oid:
+    """Write ``base`` with ``files`` changed, as the program does, and return the tree."""
+    objects = NewObjects(repo)
+    tree = trees.write(objects, base, files)
+    with objects.packed(tree):
+        return tree
 
 
 def _index(path: Path, revision: str) -> tuple[pygit2.Repository, pygit2.Index]:
@@ -163,6 +175,10 @@ class Person:
         assert old in text, f"{path} does not hold {old!r}"
         return self.change({path: text.replace(old, new)})
 
+    def override(self, **named: str | None) -> str:
+        """Merge ``name=text`` as overrides/<name>.yaml, or remove it; return the commit."""
+        return self.change({f"overrides/{name}.yaml": text for name, text in named.items()})
+
     def policy(self, **changed: Any) -> None:
         """Change every access domain."""
         data = yaml.safe_load(self.read(POLICY))
@@ -205,7 +221,10 @@ class Commit:
     trailers: tuple[tuple[str, str], ...]
 
     def one(self, key: str) -> str:
-        return next((value for known, value in self.trailers if known == key), "")
+        return next(iter(self.all(key)), "")
+
+    def all(self, key: str) -> list[str]:
+        return [value for known, value in self.trailers if known == key]
 
 
 _FORMAT = "%H%x1f%P%x1f%s%x1f%(trailers:only,unfold,separator=%x1e)%x1d"
@@ -224,6 +243,25 @@ def commits(repo: Path, revisions: str = "main") -> list[Commit]:
     return [commit for commit in found if commit.parents]
 
 
+def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
+    """Have a repository run a script; return its file."""
+    path = Path(os.fspath(repo), "hooks", name)
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return path
+
+
+@contextmanager
+def away(repo: Path) -> Iterator[None]:
+    """Have a repository's folder somewhere else for the length of a block."""
+    elsewhere = repo.rename(repo.with_name("away.git"))
+    try:
+        yield
+    finally:
+        elsewhere.rename(repo)
+
+
 def tip(repo: Path | str) -> str:
     """Return the newest commit of main."""
     return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)
@@ -232,6 +270,13 @@ def tip(repo: Path | str) -> str:
 def read(repo: Path, path: str) -> str:
     """Return a file of main, empty when it is not there."""
     return GitRepo(repo).files(path).get(path, "")
+
+
+def without_vehicle01(repo: Path) -> dict[str, str | None]:
+    """Return the inventory of nodes without one that demand 1 uses."""
+    path = "inventory/nodes.yaml"
+    before, _, rest = read(repo, path).partition("  - id: vehicle01\n")
+    return {path: before + rest[rest.index("  - id: vehicle02\n") :]}
 
 
 def operations(repo: Path) -> list[str]:
@@ -252,7 +297,7 @@ def books(repo: Path, revision: str = "main") -> dict[str, Any]:
 def claims(repo: Path, needle: str = "") -> list[str]:
     """The paths of claim files whose text holds ``needle``."""
     files = GitRepo(repo).files("ledger/")
-    return [path for path in files if path.endswith(".yaml") and needle in files[path]]
+    return [path for path, text in files.items() if "Claim\n" in text and needle in text]
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
@@ -288,3 +333,18 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
     assert sorted(ids) == sorted(set(ids))
     before = made[-verify_last - 1].id if 0 < verify_last < len(made) else None
     assert differing(repo, before) == {}
+
+
+FIRST_VERSION = Path(__file__).parents[1] / "fixtures" / "first-version.bundle"
+"""A state repo that the first version wrote: render version 1, ledger ``demandops.ledger/v1``.
+
+Three joins of the experiment (tag ``three-joins``), then two overrides, of which one ended, a join
+by another request, a demand with a lease, and a shutdown.
+"""
+
+
+def first_version(path: Path, revision: str = "main") -> GitRepo:
+    """Return a bare copy of the first version's state repo, with ``main`` at a revision."""
+    git(path.parent, "clone", "--quiet", "--bare", str(FIRST_VERSION), str(path))
+    git(path, "update-ref", "refs/heads/main", f"{revision}^{{commit}}")
+    return GitRepo(path)

@@ -38,7 +38,7 @@ _ROOT = """
 apiVersion: demandops/v1
 kind: StateRepository
 gitops: flux
-renderVersion: 1
+renderVersion: 2
 source: demandops
 flux: {url: "https://git.example/fleet/state.git", interval: 1m, secret: git}
 argocd: {url: "https://git.example/fleet/state.git", namespace: argocd}
@@ -48,7 +48,7 @@ _PROPOSALS_BY_API = """
 apiVersion: demandops/v1
 kind: StateRepository
 gitops: argocd
-renderVersion: 1
+renderVersion: 2
 argocd: {url: "https://git.example/fleet/state.git", namespace: argocd}
 proposals: {forge: gitea, url: "https://git.example/fleet/state", api: "https://git.example/api/v1"}
 """

@@ -24,13 +24,13 @@ import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.cli.main import run
+from demandops.settings import DEFAULT_ACTION_NAME
 from demandops_ros.messages import fill_message
 from demandops_ros.node import DEEP_QOS
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from unique_identifier_msgs.msg import UUID
 
-ACTION = "/event_detector_operator_plugin/operator_plugin/deployment_request"
 DEADLINE_S = 60.0
 STATUS = {
     GoalStatus.STATUS_SUCCEEDED: "succeeded",
@@ -135,9 +135,12 @@ class Servers:
 class Sent:
     """A goal that was sent, and what the server has answered so far."""
 
+    at: float
     handle: Any = None
     accepted: bool | None = None
     feedback: list[str] = field(default_factory=list)
+    stages: dict[str, float] = field(default_factory=dict)
+    """When each stage was heard of; an answer without feedback means pushed."""
     status: str = ""
     message: str = ""
     cancel: bool | None = None
@@ -146,21 +149,24 @@ class Sent:
     def answered(self) -> bool:
         return bool(self.status) or self.accepted is False
 
+    @property
+    def commit(self) -> str:
+        """Return the commit that the result names."""
+        return self.message.splitlines()[0].split()[-1]
+
 
 class Client:
     """An action client with its own executor; a test drives it."""
 
-    def __init__(self, domain: int, action: str = ACTION, deep: bool = True) -> None:
+    def __init__(self, domain: int, action: str = DEFAULT_ACTION_NAME) -> None:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = rclpy.create_node("test_client", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-        qos = (
-            {f"{service}_service_qos_profile": DEEP_QOS for service in ("goal", "result", "cancel")}
-            if deep
-            else {}
-        )
+        self.executor = SingleThreadedExecutor(context=self._context)
+        self.executor.add_node(self.node)
+        qos = {
+            f"{service}_service_qos_profile": DEEP_QOS for service in ("goal", "result", "cancel")
+        }
         self._client = ActionClient(self.node, DeploymentRequest, action, **qos)
         # an action client forgets a goal's feedback once it has the result; a subscription does not
         self._sent: dict[bytes, Sent] = {}
@@ -176,14 +182,17 @@ class Client:
         end = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < end, "the condition did not hold in time"
-            self._executor.spin_once(timeout_sec=0.05)
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def reaches_a_node(self) -> bool:
+        return bool(self._client.server_is_ready())
 
     def ready(self) -> None:
-        self.wait(self._client.server_is_ready)
+        self.wait(self.reaches_a_node)
 
     def send(self, goal: dict[str, Any]) -> Sent:
         """Send a goal; its answers arrive while the client waits for a condition."""
-        sent, id = Sent(), uuid.uuid4().bytes
+        sent, id = Sent(time.monotonic()), uuid.uuid4().bytes
         self._sent[id] = sent
         future = self._client.send_goal_async(
             fill_message(DeploymentRequest.Goal(), goal), goal_uuid=UUID(uuid=list(id))
@@ -194,7 +203,9 @@ class Client:
     def _on_feedback(self, message: Any) -> None:
         sent = self._sent.get(bytes(message.goal_id.uuid))
         if sent is not None:
-            sent.feedback.append(message.feedback.message)
+            text = message.feedback.message
+            sent.feedback.append(text)
+            sent.stages[text.split(maxsplit=1)[0]] = time.monotonic()
 
     def _on_response(self, sent: Sent, handle: Any) -> None:
         sent.handle, sent.accepted = handle, handle.accepted
@@ -206,6 +217,7 @@ class Client:
     @staticmethod
     def _on_result(sent: Sent, answer: Any) -> None:
         sent.message = answer.result.message
+        sent.stages.setdefault("pushed", time.monotonic())
         sent.status = STATUS[answer.status]
 
     def cancel(self, sent: Sent) -> bool:
@@ -221,6 +233,6 @@ class Client:
         return under_way
 
     def close(self) -> None:
-        self._executor.shutdown(timeout_sec=1)
+        self.executor.shutdown(timeout_sec=1)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)

@@ -1,4 +1,4 @@
-"""The bookkeeping once more, from the sentences of the design alone (§4, §5 and §7).
+"""The bookkeeping once more, from the sentences of docs/demand.md and decision 23 alone.
 
 Plain dicts and sets over goals as they come in YAML. It imports nothing of the program and shares
 no idea with it, so that a mistake would have to be made twice. Where the design leaves something
@@ -16,12 +16,19 @@ from typing import Any, Literal
 Goal = dict[str, Any]
 Item = dict[str, Any]
 Demand = tuple[str, tuple[str, ...]]
-"""The request id and the sorted, de-duplicated requesters: what makes two claims differ."""
+"""The request id and the sorted, de-duplicated requesters of a join: they tell claims apart."""
+
+Subject = tuple[str, str]
+"""``application`` or ``connection``, and the id."""
+
+Topic = tuple[str, ...]
+"""A connection's source topic, or an application's role, topic and source."""
 
 Claim = dict[str, Any]
-Claims = dict[str, dict[Demand, Claim]]
+Claims = dict[Subject, dict[Demand, Claim]]
 Outcome = Literal["booked", "released", "unchanged", "refused"]
 
+REPEATS_WITHIN_S = 15 * 60
 DETECTION_FUSION = 1
 MQTT = 1
 _CONNECTION_TYPES = (0, 1, 2)
@@ -40,14 +47,14 @@ class World:
 class Result:
     """What became of one request.
 
-    ``not_held`` names (subject, topic) of what a shutdown listed in vain; ``touched`` the claims
-    that are other than before, as (kind, subject, demand).
+    ``not_held`` names (id, topic, requester) of what a shutdown listed in vain, the topic ``None``
+    if it listed none; ``touched`` the claims that are other than before.
     """
 
     outcome: Outcome
     reason: str = ""
-    not_held: tuple[tuple[str, str | None], ...] = ()
-    touched: frozenset[tuple[str, str, Demand]] = frozenset()
+    not_held: tuple[tuple[str, Topic | None, str], ...] = ()
+    touched: frozenset[tuple[Subject, Demand]] = frozenset()
 
     @property
     def effective(self) -> bool:
@@ -80,50 +87,44 @@ class Books:
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.applications: Claims = {}
-        self.connections: Claims = {}
+        self.claims: Claims = {}
+        self.now = 0
+        self._shutdowns: dict[Any, int] = {}
 
-    def take(self, goal: Goal) -> Result:
-        """Book or release a request as a whole, or refuse it as a whole."""
+    def take(self, goal: Goal, after: int = 1) -> Result:
+        """Book or release a request as a whole, or refuse it as a whole.
+
+        It comes so many seconds after the last one, at least one: the oldest claim gives first.
+        """
+        self.now += after
         problem = next(self._inadmissible(goal), None)
         if problem:
             return Result("refused", problem)
-        before = deepcopy((self.applications, self.connections))
+        before = deepcopy(self.claims)
         try:
             if goal.get("shutdown", False):
-                not_held = self._shut_down(goal)
-                return Result("released", "", not_held, self._touched(before))
+                return self._shut_down(goal, before)
             self._join(goal)
         except _Refused as refusal:
-            self.applications, self.connections = before
+            self.claims = before
             return Result("refused", str(refusal))
         touched = self._touched(before)
+        if touched:
+            who = _people(goal)
+            self._shutdowns = {one: at for one, at in self._shutdowns.items() if not one[0] & who}
         return Result("booked" if touched else "unchanged", touched=touched)
 
-    def _touched(self, before: tuple[Claims, Claims]) -> frozenset[tuple[str, str, Demand]]:
-        found = set()
-        pairs = zip(("application", "connection"), before, self._both(), strict=True)
-        for kind, old, new in pairs:
-            for subject in {*old, *new}:
-                was, now = old.get(subject, {}), new.get(subject, {})
-                found |= {
-                    (kind, subject, demand)
-                    for demand in {*was, *now}
-                    if was.get(demand) != now.get(demand)
-                }
-        return frozenset(found)
-
-    def _both(self) -> tuple[Claims, Claims]:
-        return self.applications, self.connections
+    def _touched(self, before: Claims) -> frozenset[tuple[Subject, Demand]]:
+        was, now = _flat(before), _flat(self.claims)
+        return frozenset(key for key in {*was, *now} if was.get(key) != now.get(key))
 
     # What cannot be asked at all
 
     def _inadmissible(self, goal: Goal) -> Iterator[str]:
         joining = not goal.get("shutdown", False)
-        items = [*goal.get("apps", []), *goal.get("connections", [])]
-        if not items:
+        if not _items(goal):
             yield "nothing is listed"
-        for item in items:
+        for item in _items(goal):
             if not requesters(item) or "" in requesters(item):
                 yield "nobody asks"
         for app in goal.get("apps", []):
@@ -175,103 +176,84 @@ class Books:
     # Joining: additive for each claim; what contradicts a standing claim is refused
 
     def _join(self, goal: Goal) -> None:
-        for app in goal.get("apps", []):
-            self._join_application(demand_of(goal, app), app)
-        for connection in goal.get("connections", []):
-            self._join_connection(demand_of(goal, connection), connection)
-
-    def _join_application(self, demand: Demand, app: Item) -> None:
-        claims = self.applications.setdefault(app["header"]["id"], {})
-        node, type_ = app["header"]["node_id"], app["type"]
-        for other in claims.values():
-            if other["node"] != node:
-                raise _Refused("the application is on another node")
-            if other["type"] != type_:
-                raise _Refused("the application is of another type")
-        claim = claims.setdefault(
-            demand, {"node": node, "type": type_, "ego_data": set(), "point_cloud": set()}
-        )
-        for role, topics in _inputs(app).items():
-            claim[role] |= topics
-
-    def _join_connection(self, demand: Demand, connection: Item) -> None:
-        claims = self.connections.setdefault(connection["id"], {})
-        fixed = {
-            "type": connection.get("type", 0),
-            "source": connection["source_node_id"],
-            "target": connection["target_node_id"],
-        }
-        broker = connection.get("broker_node_id", "")
-        for other in claims.values():
-            for name, value in fixed.items():
-                if other[name] != value:
-                    raise _Refused(f"the connection has another {name}")
-            # "explicitly different": only where both say which
-            if broker and other["broker"] and other["broker"] != broker:
-                raise _Refused("the connection has another broker")
-            for source, target in _pairs(connection).items():
-                if other["topics"].get(source, target) != target:
+        for item in _items(goal):
+            claims = self.claims.setdefault(_subject(item), {})
+            fixed, broker, routes = _fixed(item), item.get("broker_node_id", ""), _pairs(item)
+            for other in claims.values():
+                if other["fixed"] != fixed:
+                    raise _Refused("another node, type or end")
+                # "explicitly different": only if both say which
+                if broker and other["broker"] and other["broker"] != broker:
+                    raise _Refused("another broker")
+                if any(other["routes"].get(one, two) != two for one, two in routes.items()):
                     raise _Refused("the source topic has another target")
-        claim = claims.setdefault(demand, {**fixed, "broker": "", "topics": {}})
-        claim["broker"] = claim["broker"] or broker
-        claim["topics"] |= _pairs(connection)
+            demand = demand_of(goal, item)
+            was = claims.get(demand, {"broker": "", "routes": {}, "holds": {}, "booked": self.now})
+            claim = {
+                "fixed": fixed,
+                "broker": was["broker"] or broker,
+                "routes": was["routes"] | routes,
+                "holds": deepcopy(was["holds"]),
+                "booked": was["booked"],
+            }
+            for topic in _topics(item):
+                claim["holds"].setdefault(topic, set()).update(demand[1])
+            # left open: that a join which changes its claim books it anew
+            claims[demand] = claim if claim == was else claim | {"booked": self.now}
 
-    # Leaving: what is held among what is listed
+    # Leaving: one hold of each requester that is named, on each topic that is listed
 
-    def _shut_down(self, goal: Goal) -> tuple[tuple[str, str | None], ...]:
-        """Release, and return what was listed in vain.
+    def _shut_down(self, goal: Goal, found: Claims) -> Result:
+        """Take holds; whose is asked of the books as ``found``: what is listed twice is taken once.
 
-        Which claim is meant is asked of the books as the request finds them: listing a thing
-        twice must not reach for a second claim.
+        Left open: for several requesters and no topic, each gives up one claim, maybe not the same.
         """
-        found, released = deepcopy(self._both()), False
-        in_vain: list[tuple[str, str | None]] = []
-        for app in goal.get("apps", []):
-            id_, listed = app["header"]["id"], _listed_inputs(app)
-            demand = _meant(found[0].get(id_, {}), demand_of(goal, app))
-            claim = found[0][id_][demand] if demand else None
-            if not demand or not claim or not _same_application(claim, app):
-                in_vain += [(id_, topic) for _, _, topic in listed] or [(id_, None)]
-                continue
-            vain = [(role, s, t) for role, s, t in listed if (s, t) not in claim[role]]
-            in_vain += [(id_, topic) for _, _, topic in vain]
-            released = released or len(vain) < len(listed) or not listed
-            self._subtract_inputs(id_, demand, listed)
-        for connection in goal.get("connections", []):
-            id_, pairs = connection["id"], _pairs(connection)
-            demand = _meant(found[1].get(id_, {}), demand_of(goal, connection))
-            claim = found[1][id_][demand] if demand else None
-            if not demand or not claim or not _same_connection(claim, connection):
-                in_vain += [(id_, topic) for topic in pairs] or [(id_, None)]
-                continue
-            # the source topic says which is meant, for it has one target only
-            vain_topics = [topic for topic in pairs if topic not in claim["topics"]]
-            in_vain += [(id_, topic) for topic in vain_topics]
-            released = released or len(vain_topics) < len(pairs) or not pairs
-            self._subtract_topics(id_, demand, pairs)
+        # a shutdown is the same if it lists the same, in any order and any number of times
+        said = frozenset(_said(item) for item in _items(goal))
+        this = _people(goal), goal.get("id", ""), said
+        if this in self._shutdowns and self.now - self._shutdowns[this] <= REPEATS_WITHIN_S:
+            return Result("unchanged", "a repeat")
+        in_vain, released = list[tuple[str, Topic | None, str]](), False
+        for item in _items(goal):
+            subject, demand = _subject(item), demand_of(goal, item)
+            claims = {d: c for d, c in found.get(subject, {}).items() if _is_meant(c, item)}
+            first = sorted(
+                claims, key=lambda d: (d != demand, d[0] != demand[0], claims[d]["booked"])
+            )
+            for one in demand[1]:
+                theirs = [d for d in first if one in requesters_of(claims[d])]
+                asked: list[tuple[Topic | None, Demand | None]] = [
+                    (
+                        topic,
+                        next((d for d in theirs if one in claims[d]["holds"].get(topic, ())), None),
+                    )
+                    for topic in sorted(_topics(item))
+                ] or [(None, next(iter(theirs), None))]
+                for topic, giver in asked:
+                    if giver is None:
+                        in_vain.append((subject[1], topic, one))
+                    else:
+                        self._take(subject, giver, one, topic)
+                        released = True
         if not released:
             raise _Refused("nothing listed is held")
-        return tuple(in_vain)
+        self._shutdowns[this] = self.now
+        return Result("released", "", tuple(in_vain), self._touched(found))
 
-    def _subtract_inputs(
-        self, id_: str, demand: Demand, listed: list[tuple[str, str, str]]
-    ) -> None:
-        claim = self.applications.get(id_, {}).get(demand)
-        if claim is None:
+    def _take(self, subject: Subject, demand: Demand, one: str, topic: Topic | None) -> None:
+        claims = self.claims.get(subject, {})
+        if demand not in claims:
             return  # dropped by what the same request listed before
-        for role, source, topic in listed:
-            claim[role].discard((source, topic))
-        if not listed or not (claim["ego_data"] or claim["point_cloud"]):
-            _drop(self.applications, id_, demand)
-
-    def _subtract_topics(self, id_: str, demand: Demand, topics: Mapping[str, str]) -> None:
-        claim = self.connections.get(id_, {}).get(demand)
-        if claim is None:
-            return
-        for topic in topics:
-            claim["topics"].pop(topic, None)
-        if not topics or not claim["topics"]:
-            _drop(self.connections, id_, demand)
+        holds = claims[demand]["holds"]
+        for each in list(holds) if topic is None else [topic]:
+            holds.get(each, set()).discard(one)
+            if not holds.get(each, True):
+                del holds[each]
+                claims[demand]["routes"].pop(each[0], None)
+        if not holds:
+            del claims[demand]
+        if not claims:
+            del self.claims[subject]
 
     # The view
 
@@ -282,80 +264,90 @@ class Books:
         fusion's object lists are told by the clouds that they come from.
         """
         found: dict[tuple[str, str, str], dict[str, Any]] = {}
-        for id_, claims in self.applications.items():
-            for (_, who), claim in claims.items():
-                node = claim["node"]
-                fusion = found.setdefault(("object-fusion", node, id_), _service())
-                _add(fusion, id_, who)
-                fusion["inputs"]["ego_data"] |= {topic for _, topic in claim["ego_data"]}
-                for source, topic in claim["point_cloud"]:
-                    cloud = f"{source} {topic}"
-                    fusion["inputs"]["object_list"].add(cloud)
-                    detection = found.setdefault(("object-detection", node, cloud), _service())
-                    _add(detection, id_, who)
-                    detection["inputs"]["point_cloud"].add(topic)
+        for id_, claim in self._on("application"):
+            node, who = claim["fixed"]["node"], requesters_of(claim)
+            fusion = found.setdefault(("object-fusion", node, id_), _service())
+            _add(fusion, id_, who)
+            for role, topic, source in claim["holds"]:
+                if role == "ego_data":
+                    fusion["inputs"]["ego_data"].add(topic)
+                    continue
+                cloud = f"{source} {topic}"
+                fusion["inputs"]["object_list"].add(cloud)
+                detection = found.setdefault(("object-detection", node, cloud), _service())
+                _add(detection, id_, who)
+                detection["inputs"]["point_cloud"].add(topic)
         return {key: _sorted(entry) for key, entry in found.items()}
 
     def connection_view(self) -> dict[str, dict[str, Any]]:
         """Return who requests which connection, as the contract prints it."""
+        found: dict[str, dict[str, Any]] = {}
+        for id_, claim in self._on("connection"):
+            ends = {end: claim["fixed"][end] for end in ("source", "target")}
+            entry = found.setdefault(id_, {**ends, "topics": set(), "requesters": set()})
+            entry["topics"] |= {topic for (topic,) in claim["holds"]}
+            entry["requesters"] |= requesters_of(claim)
         return {
-            id_: {
-                "source": next(iter(claims.values()))["source"],
-                "target": next(iter(claims.values()))["target"],
-                "topics": sorted({topic for claim in claims.values() for topic in claim["topics"]}),
-                "requesters": sorted({who for _, all_ in claims for who in all_}),
-            }
-            for id_, claims in self.connections.items()
-            if claims
+            id_: entry | {name: sorted(entry[name]) for name in ("topics", "requesters")}
+            for id_, entry in found.items()
         }
+
+    def _on(self, kind: str) -> Iterator[tuple[str, Claim]]:
+        return ((id_, claim) for ((of, id_), _), claim in _flat(self.claims).items() if of == kind)
 
     def view(self) -> dict[str, Any]:
         """Return both, to be compared with :func:`in_model_words`."""
         return {"services": self.services(), "connections": self.connection_view()}
 
-    def demands(self) -> set[tuple[str, str, Demand]]:
-        """Return every standing claim as (kind, subject, demand)."""
-        pairs = zip(("application", "connection"), self._both(), strict=True)
-        return {
-            (kind, subject, demand)
-            for kind, claims in pairs
-            for subject, held in claims.items()
-            for demand in held
-        }
+    def holds(self) -> dict[tuple[Subject, Demand], dict[Topic, set[str]]]:
+        """Return who holds which topic in each standing claim."""
+        return {key: claim["holds"] for key, claim in _flat(self.claims).items()}
 
 
-def _meant(claims: Mapping[Demand, Claim], demand: Demand) -> Demand | None:
-    if demand in claims:
-        return demand
-    who = set(demand[1])
-    same = [other for other in claims if set(other[1]) == who]
-    if len(same) == 1:
-        return same[0]
-    around = [other for other in claims if set(other[1]) >= who]
-    return around[0] if len(around) == 1 else None
+def _flat(claims: Claims) -> dict[tuple[Subject, Demand], Claim]:
+    return {(subject, d): claim for subject, held in claims.items() for d, claim in held.items()}
 
 
-def _same_application(claim: Claim, app: Item) -> bool:
-    # a shutdown that names no node names no other node
-    node = app["header"].get("node_id", "")
-    return node in ("", claim["node"]) and app.get("type", 0) == claim["type"]
+def requesters_of(claim: Claim) -> set[str]:
+    """Return who holds anything in a claim."""
+    return {one for who in claim["holds"].values() for one in who}
 
 
-def _same_connection(claim: Claim, connection: Item) -> bool:
+def _items(goal: Goal) -> list[Item]:
+    return [*goal.get("apps", []), *goal.get("connections", [])]
+
+
+def _people(goal: Goal) -> frozenset[str]:
+    return frozenset(one for item in _items(goal) for one in requesters(item))
+
+
+def _subject(item: Item) -> Subject:
+    return ("application", item["header"]["id"]) if "header" in item else ("connection", item["id"])
+
+
+def _fixed(item: Item) -> dict[str, Any]:
+    """Return what all claims on a subject agree on; a shutdown may leave out its nodes."""
+    if "header" in item:
+        return {"node": item["header"].get("node_id", ""), "type": item.get("type", 0)}
+    ends = {end: item.get(f"{end}_node_id", "") for end in ("source", "target")}
+    return {**ends, "type": item.get("type", 0)}
+
+
+def _is_meant(claim: Claim, item: Item) -> bool:
     # the broker is not among what a shutdown is told apart by
-    source = connection.get("source_node_id", "")
-    target = connection.get("target_node_id", "")
-    return (
-        source in ("", claim["source"])
-        and target in ("", claim["target"])
-        and connection.get("type", 0) == claim["type"]
-    )
+    return all(value in ("", claim["fixed"][name]) for name, value in _fixed(item).items())
 
 
-def _drop(claims: Claims, subject: str, demand: Demand) -> None:
-    del claims[subject][demand]
-    if not claims[subject]:
-        del claims[subject]
+def _topics(item: Item) -> set[Topic]:
+    """Return what is held; a connection's source topic says which, because it has one target."""
+    if "header" not in item:
+        return {(source,) for source in _pairs(item)}
+    return {(role, topic, of) for role, topics in _inputs(item).items() for of, topic in topics}
+
+
+def _said(item: Item) -> tuple[Any, ...]:
+    people = frozenset(requesters(item))
+    return _subject(item), people, tuple(_fixed(item).values()), frozenset(_topics(item))
 
 
 def _inputs(app: Item) -> dict[str, set[tuple[str, str]]]:
@@ -367,10 +359,6 @@ def _inputs(app: Item) -> dict[str, set[tuple[str, str]]]:
         }
         for role, field in (("ego_data", "ego_data_topics"), ("point_cloud", "pointcloud_topics"))
     }
-
-
-def _listed_inputs(app: Item) -> list[tuple[str, str, str]]:
-    return sorted((role, *topic) for role, topics in _inputs(app).items() for topic in topics)
 
 
 def _pairs(connection: Item) -> dict[str, str]:

@@ -11,7 +11,18 @@ from copy import deepcopy
 from random import Random
 from typing import Any, TypeVar
 
-from tests.model.books import Goal, Item, World
+from tests.kit.goals import (
+    CLOUD,
+    STATION_CLOUD,
+    Goal,
+    Item,
+    Topic,
+    application,
+    connection,
+    goal,
+    input_topic,
+)
+from tests.model.books import World, requesters
 
 T = TypeVar("T")
 
@@ -34,14 +45,12 @@ APPLICATIONS = {
 }
 """Each application's own node: the first two share their detections, and nearly their name."""
 
-STATION_CLOUD = (STATION, "/stations/station00/pointcloud")
-VEHICLE_CLOUD = ("vehicle00", "/vehicles/vehicle00/drivers/lidar/pointcloud")
 CLOUDS = (
     STATION_CLOUD,
-    VEHICLE_CLOUD,
-    ("vehicle00", "/vehicles/vehicle00/drivers/rear/pointcloud"),
-    ("vehicle01", "/shared/points"),
-    ("vehicle02", "/shared/points"),
+    CLOUD,
+    ("/vehicles/vehicle00/drivers/rear/pointcloud", "vehicle00"),
+    ("/shared/points", "vehicle01"),
+    ("/shared/points", "vehicle02"),
 )
 """Usual clouds, a second one of a vehicle, and one topic name that two vehicles publish."""
 
@@ -52,7 +61,7 @@ CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
         "edge",
         {
             "/vehicles/vehicle00/ego_data": "/vehicles/vehicle00/ego_data",
-            VEHICLE_CLOUD[1]: VEHICLE_CLOUD[1],
+            CLOUD[0]: CLOUD[0],
             "/vehicles/vehicle00/drivers/rear/pointcloud": "/rear",
         },
     ),
@@ -60,7 +69,7 @@ CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
         STATION,
         "edge",
         "",
-        {"/stations/station00/drivers/lidar/pointcloud": STATION_CLOUD[1], "/status": "/status"},
+        {"/stations/station00/drivers/lidar/pointcloud": STATION_CLOUD[0], "/status": "/status"},
     ),
     "station00_edge": (STATION, "cloud", "cloud", {"/status": "/stations/status"}),
     "vehicle01/edge": (
@@ -73,60 +82,9 @@ CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
 """Source, target, broker and topics of each connection."""
 
 
-def ego(vehicle: str) -> tuple[str, str]:
-    """Return a vehicle's usual ego data, as (source, topic)."""
-    return vehicle, f"/vehicles/{vehicle}/ego_data"
-
-
-def application(
-    id_: str,
-    who: Sequence[str],
-    ego_data: Sequence[tuple[str, str]] = (),
-    clouds: Sequence[tuple[str, str]] = (),
-    node: str | None = None,
-) -> Item:
-    """Return one application of a goal."""
-    return {
-        "header": {"id": id_, "node_id": APPLICATIONS[id_] if node is None else node},
-        "type": 1,
-        "object_detection_fusion_app": {
-            "requester_ids": list(who),
-            "ego_data_topics": [_topic(topic) for topic in ego_data],
-            "pointcloud_topics": [_topic(topic) for topic in clouds],
-        },
-    }
-
-
-def _topic(topic: tuple[str, str]) -> dict[str, str]:
-    return {"source_node_id": topic[0], "topic_name": topic[1]}
-
-
-def connection(id_: str, who: Sequence[str], topics: Sequence[str] | None = None) -> Item:
-    """Return one connection of a goal, with some of its topics or all."""
-    source, target, broker, known = CONNECTIONS[id_]
-    names = list(known if topics is None else topics)
-    return {
-        "id": id_,
-        "type": 1,
-        "broker_node_id": broker,
-        "requester_ids": list(who),
-        "source_node_id": source,
-        "target_node_id": target,
-        "source_topics": names,
-        "target_topics": [known[name] for name in names],
-    }
-
-
-def goal(
-    id_: str, apps: Sequence[Item] = (), connections: Sequence[Item] = (), *, shutdown: bool = False
-) -> Goal:
-    """Return a whole goal."""
-    return {
-        "id": id_,
-        "shutdown": shutdown,
-        "apps": list(apps),
-        "connections": list(connections),
-    }
+def ego(vehicle: str) -> Topic:
+    """Return a vehicle's usual ego data."""
+    return f"/vehicles/{vehicle}/ego_data", vehicle
 
 
 def shutdown_of(joined: Goal) -> Goal:
@@ -144,6 +102,7 @@ class Maker:
         self._random = random
         self.calm = calm
         self.joined: list[Goal] = []
+        self.left: list[Goal] = []
 
     def sequence(self, length: int) -> list[Goal]:
         """Return requests of every sort, in any order."""
@@ -156,8 +115,12 @@ class Maker:
         if self._odds(6):
             return self.again(self._pick(self.joined))
         if self._odds(30):
-            return goal(self._pick(REQUESTS), shutdown=True)
-        return self.leave()
+            return goal(id=self._pick(REQUESTS), shutdown=True)
+        if self.left and self._odds(4):  # the last one, or one from long ago
+            made = self.left[-1] if self._odds(2) else self._pick(self.left)
+            return self.again(made) if self._odds(3) else made
+        self.left.append(self.leave())
+        return self.left[-1]
 
     def join(self, request: str | None = None, who: Sequence[str] | None = None) -> Goal:
         """Return a request for one to four subjects, mostly in the name of the same requesters."""
@@ -167,7 +130,8 @@ class Maker:
         connections = [
             self._connection(people) for _ in range(random.randrange(0 if apps else 1, 3))
         ]
-        made = goal(self._pick(REQUESTS) if request is None else request, apps, connections)
+        id_ = self._pick(REQUESTS) if request is None else request
+        made = goal(apps, connections, id=id_)
         if not self.calm:
             self._disturb(made)
         self.joined.append(made)
@@ -200,7 +164,7 @@ class Maker:
                 made[kind] = made[kind][:1]
         if self._odds(4):
             made["id"] = self._pick(REQUESTS)
-        if self._odds(5):
+        if self._odds(4):
             self._ask_others(made)
         for app in made["apps"]:
             self._leave_application(app)
@@ -219,13 +183,21 @@ class Maker:
         vehicles = [name for name in who if name in VEHICLES]
         topics = [ego(name) for name in vehicles if not self._odds(5)]
         clouds = [cloud for cloud in CLOUDS if self._odds(3)]
-        return application(id_, who, topics, clouds if topics or clouds else [STATION_CLOUD])
+        clouds = clouds if topics or clouds else [STATION_CLOUD]
+        return application(id_, node=APPLICATIONS[id_], who=who, ego=topics, clouds=clouds)
 
     def _connection(self, who: Sequence[str]) -> Item:
         id_ = self._pick(sorted(CONNECTIONS))
-        names = list(CONNECTIONS[id_][3])
-        some = [name for name in names if self._odds(2)] or names[:1]
-        return connection(id_, who, some)
+        source, target, broker, targets = CONNECTIONS[id_]
+        names = [name for name in targets if self._odds(2)] or list(targets)[:1]
+        return connection(
+            id_,
+            who=who,
+            ends=(source, target),
+            topics=names,
+            targets=[targets[name] for name in names],
+            broker=broker,
+        )
 
     def _people(self) -> list[str]:
         first = self._pick(PARTIES)
@@ -241,6 +213,8 @@ class Maker:
             self._disturb_application(app)
         for item in made["connections"]:
             self._disturb_connection(item)
+        if self._odds(16):  # a subject is asked for in the name of the same: one claim is older
+            self._name(self._pick(["apps", "connections"]), made, self._people())
         if self._odds(20):
             made["apps"] += deepcopy(made["apps"])
         if self._odds(20):
@@ -252,8 +226,8 @@ class Maker:
         body = app["object_detection_fusion_app"]
         if self._odds(16):
             app["header"]["node_id"] = self._pick(["cloud", "edge", "nowhere"])
-        if self._odds(20):
-            body["requester_ids"] = self._people() if self._odds(2) else []
+        if self._odds(40):
+            body["requester_ids"] = []
         if self._odds(40):
             app["type"] = 2
         if self._odds(40):
@@ -268,8 +242,8 @@ class Maker:
         self._disturb_ends(item)
         if self._odds(20):
             item["target_topics"][0] = "/elsewhere"
-        if self._odds(24):
-            item["requester_ids"] = self._people() if self._odds(2) else []
+        if self._odds(48):
+            item["requester_ids"] = []
         if self._odds(40):
             item["target_topics"] = item["target_topics"][1:]
         if self._odds(40):
@@ -286,12 +260,16 @@ class Maker:
             item["type"] = self._pick([0, 2, 7])
 
     def _ask_others(self, made: Goal) -> None:
-        """Ask in the name of fewer or other requesters."""
+        """Ask in the name of fewer requesters, of others, or of those of several claims."""
         people = self._people()
-        for item in [app["object_detection_fusion_app"] for app in made["apps"]]:
-            item["requester_ids"] = item["requester_ids"][:1] if self._odds(2) else people
-        for item in made["connections"]:
-            item["requester_ids"] = item["requester_ids"][:1] if self._odds(2) else people
+        for kind in ("apps", "connections"):
+            named = [one for item in made[kind] for one in requesters(item)]
+            who = [named[:1], people, list(dict.fromkeys((*named, *people)))]
+            self._name(kind, made, self._pick(who))
+
+    def _name(self, kind: str, made: Goal, who: Sequence[str]) -> None:
+        for item in made[kind]:
+            item.get("object_detection_fusion_app", item)["requester_ids"] = list(who)
 
     def _leave_application(self, app: Item) -> None:
         body = app["object_detection_fusion_app"]
@@ -301,7 +279,10 @@ class Maker:
             elif self._odds(4):
                 body[field] = []
         if self._odds(8):
-            body["pointcloud_topics"] = [*body["pointcloud_topics"], _topic(self._pick(CLOUDS))]
+            body["pointcloud_topics"] = [
+                *body["pointcloud_topics"],
+                input_topic(self._pick(CLOUDS)),
+            ]
         if self._odds(10):
             app["header"]["node_id"] = self._pick(["", "cloud", "edge", "nowhere"])
         if self._odds(20):

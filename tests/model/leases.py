@@ -20,25 +20,42 @@ BY_MESSAGE = "by message: "
 """Stands before the request id and requesters of a demand that the reference's goal makes."""
 
 
+REPEATS_WITHIN_S = 15 * 60
+
+
+def by_message(request: str, who: Iterable[str]) -> str:
+    """Return the demand that a goal of the reference makes."""
+    return f"{BY_MESSAGE}{request} {sorted(who)}"
+
+
 @dataclass
 class Held:
     """What one demand holds on one subject, and until when that was promised.
 
     ``promised`` is the last renewal and the lease on top of it, nothing for one without an end;
-    ``slack`` is how much later it may go.
+    ``slack`` is how much later it may go. Of the reference's: who holds each topic, the ``request``
+    that asked, and when it was ``booked``.
     """
 
     what: dict[str, Any]
     requesters: frozenset[str]
-    seconds: int | None
-    promised: int | None
+    seconds: int | None = None
+    promised: int | None = None
+    request: str = ""
+    holders: dict[str, frozenset[str]] = field(default_factory=dict)
+    booked: int = 0
 
     def same(self, other: Held | None) -> bool:
         """Tell whether both are the same but for the time."""
         if other is None:
             return False
-        mine = (self.what, self.requesters, self.seconds)
-        return mine == (other.what, other.requesters, other.seconds)
+        mine = (self.what, self.requesters, self.seconds, self.holders)
+        return mine == (other.what, other.requesters, other.seconds, other.holders)
+
+    def holds(self) -> dict[str, dict[str, frozenset[str]]]:
+        """Return ``holds``: who holds each topic of a connection, all unless some gave it up."""
+        topics = self.what.get("topics")
+        return {"holds": dict.fromkeys(topics, self.requesters) | self.holders} if topics else {}
 
 
 @dataclass
@@ -48,6 +65,9 @@ class Promises:
     slack: int
     default: int | None = None
     held: dict[str, dict[Subject, Held]] = field(default_factory=dict)
+    shutdowns: dict[tuple[str, frozenset[str], Subject, frozenset[str]], int] = field(
+        default_factory=dict
+    )
 
     def take(self, goal: Goal, now: int) -> Outcome:
         """Book, replace, release or renew as a whole, or refuse as a whole.
@@ -120,51 +140,82 @@ class Promises:
     def _message(self, goal: Goal, now: int) -> Outcome:
         item = goal["connections"][0]
         who = frozenset(item["requester_ids"])
-        demand = f"{BY_MESSAGE}{goal['id']} {sorted(who)}"
         subject = ("connections", item["id"])
         routes = dict(zip(item["source_topics"], item["target_topics"], strict=True))
-        what = {
-            "source": item["source_node_id"], "target": item["target_node_id"], "topics": routes,
-        }  # fmt: skip
         if goal.get("shutdown"):
-            return self._shut_down(demand, who, subject, what)
-        if self._contradicts("", subject, what):
+            return self._shut_down(goal["id"], who, subject, frozenset(routes), now)
+        ends = {"source": item["source_node_id"], "target": item["target_node_id"]}
+        if self._contradicts("", subject, {**ends, "topics": routes}):
             return "refused"
-        mine = self.held.setdefault(demand, {})
-        was = mine.get(subject)
-        if was:
-            what["topics"] = was.what["topics"] | routes
-        mine[subject] = Held(what, who, None, None)
-        return "unchanged" if mine[subject].same(was) else "booked"
+        demand = by_message(goal["id"], who)
+        was = self.held.get(demand, {}).get(subject, Held(ends | {"topics": {}}, frozenset()))
+        holders = {one: was.holders.get(one, frozenset()) | who for one in routes}
+        held = Held(
+            ends | {"topics": was.what["topics"] | routes},
+            was.requesters | who,
+            request=goal["id"],
+            holders=was.holders | holders,
+            booked=now,
+        )
+        if held.same(was):
+            return "unchanged"
+        self.held.setdefault(demand, {})[subject] = held
+        self.shutdowns = {one: at for one, at in self.shutdowns.items() if not one[1] & who}
+        return "booked"
 
     def _shut_down(
-        self, demand: str, who: frozenset[str], subject: Subject, what: dict[str, Any]
+        self, request: str, who: frozenset[str], subject: Subject, topics: frozenset[str], now: int
     ) -> Outcome:
-        around = {
-            name: held[subject]
+        this = (request, who, subject, topics)
+        if this in self.shutdowns and now - self.shutdowns[this] <= REPEATS_WITHIN_S:
+            return "unchanged"
+        own = by_message(request, who)
+        around = [
+            (name != own, held[subject].request != request, held[subject].booked, name)
             for name, held in self.held.items()
-            if subject in held
-            and all(held[subject].what[end] == what[end] for end in ("source", "target"))
-        }
-        meant = [demand] if demand in around else []
-        meant = meant or [name for name, held in around.items() if held.requesters == who]
-        meant = meant or [name for name, held in around.items() if held.requesters > who]
-        if len(meant) != 1:
+            if name.startswith(BY_MESSAGE) and subject in held
+        ]
+        names = [name for *_, name in sorted(around)]
+        # one person's holds are no other's, so it may be taken while the next is looked for
+        taken = [self._take(names, one, subject, topics) for one in who]
+        if not any(taken):
             return "refused"
-        held = around[meant[0]]
-        rest = {one: two for one, two in held.what["topics"].items() if one not in what["topics"]}
-        if rest and rest == held.what["topics"]:
-            return "refused" if what["topics"] else self._drop(meant[0], subject)
-        if not rest or not what["topics"]:
-            return self._drop(meant[0], subject)
-        held.what = held.what | {"topics": rest}
+        self.shutdowns[this] = now
         return "released"
 
-    def _drop(self, demand: str, subject: Subject) -> Outcome:
+    def _take(self, names: list[str], one: str, subject: Subject, topics: frozenset[str]) -> bool:
+        theirs = [
+            (name, self.held[name][subject])
+            for name in names
+            if one in self.held.get(name, {}).get(subject, Held({}, frozenset())).requesters
+        ]
+        givers = [
+            next(
+                (
+                    (name, held, topic)
+                    for name, held in theirs
+                    if one in held.holders.get(topic, ())
+                ),
+                None,
+            )
+            for topic in topics
+        ]
+        if theirs and not topics:
+            name, held = theirs[0]
+            givers = [(name, held, topic) for topic in held.holders]
+        for name, held, topic in filter(None, givers):
+            held.holders[topic] -= {one}
+            if not held.holders[topic]:
+                del held.holders[topic], held.what["topics"][topic]
+            held.requesters = frozenset().union(*held.holders.values())
+            if not held.holders:
+                self._drop(name, subject)
+        return any(givers)
+
+    def _drop(self, demand: str, subject: Subject) -> None:
         del self.held[demand][subject]
         if not self.held[demand]:
             del self.held[demand]
-        return "released"
 
     # time
 
@@ -192,9 +243,12 @@ class Promises:
     # the view
 
     def claims(self) -> dict[tuple[str, Subject], tuple[dict[str, Any], frozenset[str]]]:
-        """Return what stands by demand and subject: what it is, and in whose name."""
+        """Return what stands by demand and subject: what it is, and in whose name.
+
+        Of the topics of a connection it says who holds each.
+        """
         return {
-            (demand, subject): (deepcopy(held.what), held.requesters)
+            (demand, subject): (deepcopy(held.what) | held.holds(), held.requesters)
             for demand, subjects in self.held.items()
             for subject, held in subjects.items()
         }

@@ -48,13 +48,7 @@ def run(command: list[str], folder: Path) -> str:
         "PATH": os.environ["PATH"],
     }
     result = subprocess.run(
-        command,
-        cwd=folder,
-        env=environ,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=900,
+        command, cwd=folder, env=environ, capture_output=True, text=True, check=False, timeout=900
     )
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
@@ -63,17 +57,9 @@ def run(command: list[str], folder: Path) -> str:
 def test_the_packages_build_with_colcon_and_import_from_its_install_space(tmp_path: Path) -> None:
     shutil.copytree(INTERFACES, tmp_path / "src")
     assert COLCON is not None
-    run(
-        [
-            COLCON,
-            "build",
-            "--cmake-args",
-            f"-DCMAKE_PREFIX_PATH={sys.prefix}",
-            f"-DPython3_EXECUTABLE={sys.executable}",
-            "-DBUILD_TESTING=OFF",
-        ],
-        tmp_path,
-    )
+    prefix = f"-DCMAKE_PREFIX_PATH={sys.prefix}"
+    python = f"-DPython3_EXECUTABLE={sys.executable}"
+    run([COLCON, "build", "--cmake-args", prefix, python, "-DBUILD_TESTING=OFF"], tmp_path)
     script = f". install/setup.sh && {shlex.join([sys.executable, '-c', IMPORT])}"
     places = run(["sh", "-c", script], tmp_path).splitlines()
     site = Path("lib", f"python{sys.version_info[0]}.{sys.version_info[1]}", "site-packages")

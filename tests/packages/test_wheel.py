@@ -28,17 +28,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copytree(ROOT / name, sources / name, ignore=skipped)
         else:
             shutil.copy(ROOT / name, sources / name)
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "-q",
-        "--no-deps",
-        "-w",
-        str(folder),
-        str(sources),
-    ]
+    options = ["-q", "--no-deps", "-w", str(folder)]
+    command = [sys.executable, "-m", "pip", "wheel", *options, str(sources)]
     subprocess.run(command, check=True)
     return next(folder.glob("demandops-*.whl"))
 
@@ -68,25 +59,23 @@ def test_a_demand_is_rendered_from_the_installed_wheel(wheel: Path, tmp_path: Pa
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
     request = ROOT / "examples" / "experiment" / "1-vehicle00-joins.yaml"
 
-    def demandops(*args: str) -> str:
-        command = [str(tmp_path / "env" / "bin" / "python"), "-m", "demandops.cli.main", *args]
-        environment = {"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
+    def python(*args: str) -> str:
         done = subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+            [str(tmp_path / "env" / "bin" / "python"), *args],
+            cwd=tmp_path,
+            env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    where = tmp_path / "env" / "bin" / "python"
-    found = subprocess.run(
-        [str(where), "-c", "import demandops; print(demandops.__file__)"],
-        cwd=tmp_path,
-        env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert found.stdout.startswith(str(tmp_path))
+    def demandops(*args: str) -> str:
+        return python("-m", "demandops.cli.main", *args)
+
+    place = python("-c", "import demandops; print(demandops.__file__)")
+    assert place.startswith(str(tmp_path))
     demandops("init", "state.git", "--bare")
     rows = json.loads(
         demandops("request", str(request), "--state-repo", "state.git", "--output", "json")

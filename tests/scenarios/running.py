@@ -19,7 +19,6 @@ from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.demand_request import Expire
 from demandops.errors import Fault, Refused
-from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.service.timing.expiry import LeaseExpiry
 from demandops.service.timing.rate_limit import RateLimit
@@ -29,7 +28,7 @@ from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
 from tests.kit.config import skeleton
 from tests.kit.memory import NOW as START
-from tests.kit.memory import MemoryRepo
+from tests.kit.memory import MemoryRepo, is_booked, ledger_in
 
 HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"
@@ -178,8 +177,8 @@ class World(MemoryRepo):
         self.state = replace(state, ledger=self.state.ledger)
         empty = replace(state, ledger=Ledger())
         self._initial = {**skeleton(), **config, **rendered_files(empty)}
-        claims = {p: text for p, text in self.files.items() if claim_file.kind_of(p)}
-        self.files = {**self._initial, **claims, **rendered_files(self.state)}
+        ledger = {p: text for p, text in self.files.items() if is_booked(p)}
+        self.files = {**self._initial, **ledger, **rendered_files(self.state)}
 
     def restart(self) -> None:
         """Forget all that is not in the state repo."""
@@ -229,25 +228,12 @@ class World(MemoryRepo):
 
     def assert_sound(self) -> None:
         """The files say what the books say, and nothing else is there."""
-        claims = [
-            claim_file.read(text, path)
-            for path, text in self.files.items()
-            if claim_file.kind_of(path)
-        ]
-        assert rebuilt(claims) == self.state.ledger
+        assert ledger_in(self.files) == self.state.ledger
         asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())
         assert not names, f"these are there and not asked for, or the other way round: {names}"
         assert there == asked
-
-
-def rebuilt(claims: Iterable[Any]) -> Ledger:
-    """Return the ledger that holds ``claims``, put in one by one."""
-    ledger = Ledger()
-    for claim in claims:
-        ledger = ledger.replace(claim.key, claim)
-    return ledger
 
 
 def _purpose(entry: Mapping[str, Any]) -> str:
@@ -321,7 +307,7 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
     if bool(taken.files) != (taken.outcome != "unchanged"):
         yield f"is {taken.outcome}, and makes {'a' if taken.files else 'no'} commit"
     signs = {"start": "+", "change": "~", "stop": "-"}
-    desired = sorted(f"{signs[release.change]} {release.description}" for release in taken.releases)
+    desired = sorted(f"{signs[release.change]} {release.what}" for release in taken.releases)
     if step.desired is not None and desired != sorted(step.desired):
         yield f"the desired state changes otherwise: {desired}"
     if step.warns is not None:

@@ -10,14 +10,14 @@ from functools import wraps
 from typing import Any
 
 import click
+from rich.table import Table
 
+from demandops.cli.output import console
 from demandops.config.override import ImagePin, Override, format_time
 from demandops.demand.claim import Claim
-from demandops.errors import DemandOpsError, Fault, InvalidInput, fault
+from demandops.errors import DemandOpsError, InvalidInput, fault
 from demandops.ledger import claim_file
 from demandops.plan.release import Release
-from demandops.plan.views.bookkeeping import EntryChange
-from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.subject import Subject
@@ -26,17 +26,13 @@ Json = dict[str, Any]
 Command = Callable[..., Any]
 
 
-def output_formats(
-    *formats: str, description: str = "The output format."
-) -> Callable[[Command], Command]:
+def output_formats(*formats: str) -> Callable[[Command], Command]:
     """Return the option ``--output``; with json, a command that fails prints its faults too."""
+    description = "The output format."
+    if "markdown" in formats:
+        description = "The output format; markdown is for a comment on a pull request."
     option = click.option(
-        "--output",
-        "output",
-        type=click.Choice(formats),
-        default="text",
-        show_default=True,
-        help=description,
+        "--output", type=click.Choice(formats), default="text", show_default=True, help=description
     )
 
     def add(command: Command) -> Command:
@@ -57,6 +53,16 @@ def output_formats(
 output_option = output_formats("text", "json")
 
 
+def show(output: str, data: object, text: Iterable[str | Table]) -> None:
+    """Print ``data`` as JSON, or ``text``: lines, which are not wrapped, and tables."""
+    if output == "json":
+        print_json(data)
+        return
+    out = console()
+    for each in text:
+        out.print(each, soft_wrap=isinstance(each, str))
+
+
 def print_json(data: object) -> None:
     """Print ``data`` as JSON."""
     click.echo(json.dumps(data, indent=2, ensure_ascii=False))
@@ -65,12 +71,7 @@ def print_json(data: object) -> None:
 def faults_of(error: DemandOpsError) -> list[Json]:
     """Return the faults of any error of the program."""
     faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
-    return [fault_data(each) for each in faults]
-
-
-def fault_data(each: Fault) -> Json:
-    """Return a fault; ``file`` and ``field`` may be empty."""
-    return asdict(each)
+    return [asdict(each) for each in faults]
 
 
 def time_data(moment: datetime | None) -> str | None:
@@ -116,22 +117,6 @@ def place_data(release: Release) -> Json:
 def release_data(release: Release) -> Json:
     """Return a release."""
     return {"name": release.name, **place_data(release), "file": path_of(release)}
-
-
-def release_change_data(release: ReleaseChange) -> Json:
-    """Return a release that starts, changes or stops."""
-    return {
-        "name": release.name,
-        "what": release.description,
-        "file": release.path,
-        "change": release.change,
-        "details": list(release.details),
-    }
-
-
-def entry_change_data(entry: EntryChange) -> Json:
-    """Return an entry of the bookkeeping that is added, changed or removed."""
-    return asdict(entry)
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:

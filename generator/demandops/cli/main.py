@@ -50,11 +50,7 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import a command.
-
-    Raises:
-        click.ClickException: a package that the command needs is not installed.
-    """
+    """Import a command; raise a ClickException if a package that it needs is not installed."""
     room = COMMANDS[name][0]
     ros = room == "demandops_ros"
     module = f"demandops_ros.{name}_command" if ros else f"demandops.cli.{room}.{name}"

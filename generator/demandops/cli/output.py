@@ -34,14 +34,7 @@ def console(stderr: bool = False) -> Console:
     return Console(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
-SIGNS = {
-    "start": "+",
-    "change": "~",
-    "stop": "-",
-    "added": "+",
-    "changed": "~",
-    "removed": "-",
-}
+SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
 """The mark of a release or an entry, by its change."""
 
 
@@ -49,12 +42,11 @@ class _Errors:
     """Prints plain lines on stderr, never wrapped."""
 
     def print(self, text: str) -> None:
-        click.echo("".join(char if char in "\n\t" else _visible(char) for char in text), err=True)
-
-
-def _visible(char: str) -> str:
-    """Return a character, escaped if it would control the terminal."""
-    return char if char.isprintable() else char.encode("unicode_escape").decode()
+        escaped = (  # what would control the terminal
+            char if char.isprintable() or char in "\n\t" else char.encode("unicode_escape").decode()
+            for char in text
+        )
+        click.echo("".join(escaped), err=True)
 
 
 errors = _Errors()
@@ -73,7 +65,6 @@ def printable(text: str) -> str:
 
 state_repo_option = click.option(
     "--state-repo",
-    "state_repo",
     required=True,
     envvar="DEMANDOPS_STATE_REPO",
     metavar="URL_OR_DIR",
@@ -83,7 +74,6 @@ state_repo_option = click.option(
 
 signing_option = click.option(
     "--signing-key",
-    "signing_key",
     envvar="DEMANDOPS_SIGNING_KEY",
     type=click.Path(path_type=Path),
     metavar="FILE",
@@ -93,7 +83,6 @@ signing_option = click.option(
 
 at_option = click.option(
     "--at",
-    "at",
     metavar="REV|TIME",
     help="A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h; default: "
     "the newest commit.",

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from demandops.connections.route import Route, merged_routes
-from demandops.subject import Subject, SubjectKind
+from demandops.subject import Subject, SubjectKind, TopicKey
 
 if TYPE_CHECKING:
     from demandops.connections.connection_type import ConnectionType
@@ -80,18 +80,26 @@ class Connection:
             and listed.type in (None, self.type)
         )
 
-    def without(self, listed: Connection) -> tuple[Connection | None, list[str]]:
-        """Return the connection without the listed topics, and the listed topics that it lacks.
+    def told_apart_by(self) -> tuple[str, ...]:
+        """Return what a shutdown lists to mean this one, beside its id and topics."""
+        return (self.source, self.target, self.known_type.word)
 
-        Without a topic it is ``None``. If no topic is listed, all are removed.
-        """
-        if not listed.topics:
-            return None, []
-        gone = {route.source for route in listed.topics}
-        missing = sorted(gone - {route.source for route in self.topics})
-        left = tuple(route for route in self.topics if route.source not in gone)
-        remaining = replace(self, topics=left) if left else None
-        return remaining, [f"topic {topic}" for topic in missing]
+    def topic_keys(self) -> Iterator[TopicKey]:
+        """Yield the key of each topic: its name on the source node."""
+        for route in self.topics:
+            yield (route.source,)
+
+    def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
+        """Yield each topic that ``listed`` names, in words, and the keys that it means here."""
+        assert isinstance(listed, Connection)  # noqa: S101 - see is_meant_by
+        known = {*self.topic_keys()}
+        for key in listed.topic_keys():
+            yield f"topic {key[0]}", [key] if key in known else []
+
+    def without_topics(self, gone: Container[TopicKey]) -> Connection | None:
+        """Return the connection without these topics; ``None`` if it has no others."""
+        left = tuple(route for route in self.topics if (route.source,) not in gone)
+        return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
         """Return the connection without a node: ``None`` for an end; a broker is chosen again."""

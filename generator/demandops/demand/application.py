@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from itertools import islice, takewhile
 from types import MappingProxyType
 
-from demandops.subject import Subject, SubjectKind
+from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -104,27 +104,35 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             and listed.appdef == self.appdef
         )
 
-    def without(self, listed: Application) -> tuple[Application | None, list[str]]:
-        """Return the application without the listed inputs, and the listed inputs that it lacks.
+    def told_apart_by(self) -> tuple[str, ...]:
+        """Return what a shutdown lists to mean this one, beside its id and topics."""
+        return (self.node, self.appdef)
 
-        Without an input it is ``None``. If no input is listed, all are removed.
-        """
-        if not any(listed.inputs.values()):
-            return None, []
-        left, missing = {}, []
-        for role in sorted({*self.inputs, *listed.inputs}):
-            by_name: dict[str, list[InputTopic]] = {}
-            for topic in self.inputs.get(role, ()):
-                by_name.setdefault(topic.topic, []).append(topic)
-            gone: set[InputTopic] = set()
-            for topic in listed.inputs.get(role, ()):
-                named = by_name.get(topic.topic, ())
-                found = {one for one in named if topic.source in ("", one.source)}
-                gone |= found
-                if not found:
-                    missing.append(f"{role} {topic.topic} of {topic.source}")
-            left[role] = tuple(one for one in self.inputs.get(role, ()) if one not in gone)
-        return (self.with_inputs(left) if any(left.values()) else None), missing
+    def topic_keys(self) -> Iterator[TopicKey]:
+        """Yield the key of each input: role, topic, source. Without inputs, the key is empty."""
+        for role, topic in self.all_inputs():
+            yield role, topic.topic, topic.source
+        if not any(self.inputs.values()):
+            yield ()
+
+    def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
+        """Yield each input that ``listed`` names, in words, and the keys that it means here."""
+        assert isinstance(listed, Application)  # noqa: S101 - see is_meant_by
+        by_name: dict[TopicKey, list[TopicKey]] = {}
+        for key in self.topic_keys():
+            by_name.setdefault(key[:2], []).append(key)
+        for role, topic in listed.all_inputs():
+            named = by_name.get((role, topic.topic), [])
+            keys = [key for key in named if topic.source in ("", key[2])]
+            yield f"{role} {topic.topic} of {topic.source}", keys
+
+    def without_topics(self, gone: Container[TopicKey]) -> Application | None:
+        """Return the application without these inputs; ``None`` if it has no others."""
+        left = {
+            role: tuple(one for one in topics if (role, one.topic, one.source) not in gone)
+            for role, topics in self.inputs.items()
+        }
+        return self.with_inputs(left) if any(left.values()) else None
 
     def without_node(self, node: str) -> Application | None:
         """Return the application without a node's inputs; ``None`` if it has no others."""

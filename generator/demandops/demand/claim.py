@@ -1,17 +1,17 @@
-"""Claims: one demand's hold on one subject. The ledger stores claims only."""
+"""Claims: one demand's hold on one subject."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 
 from demandops.connections.connection import Connection
 from demandops.demand.application import Application
 from demandops.demand.lease import Lease
-from demandops.subject import Subject, SubjectKind
+from demandops.subject import Subject, SubjectKind, TopicKey
 
 OVERRIDE_PREFIX = "override:"
 """The prefix of the demand ids of claims that overrides make; no other demand may use it."""
@@ -27,7 +27,11 @@ class ClaimKey:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """One demand's hold on an application or a connection."""
+    """One demand's hold on an application or a connection.
+
+    ``joined`` is true if a goal of the reference's action booked it: only goals of that action shut
+    it down. ``partial`` are the topics that not all ``requesters`` hold any longer, and who does.
+    """
 
     held: Application | Connection
     demand: str
@@ -35,6 +39,8 @@ class Claim:
     requesters: tuple[str, ...]
     booked: datetime
     lease: Lease | None = None
+    joined: bool = False
+    partial: Mapping[TopicKey, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def application(self) -> Application:
@@ -74,10 +80,62 @@ class Claim:
         yield ("demand", self.demand)
         for requester in self.requesters:
             yield ("requester", requester)
+            yield ("holder", requester, self.subject.kind.value, self.subject.id)
         if self.keeping_override is not None:
             yield ("kept",)
             yield ("kept", self.subject.kind.value, self.subject.id)
         yield from self.held.index_entries()
+
+    def holders(self, topic: TopicKey) -> tuple[str, ...]:
+        """Return the requesters that hold a topic of the claim."""
+        return self.partial.get(topic, self.requesters)
+
+    def with_holders(
+        self, held: Application | Connection, holders: Mapping[TopicKey, tuple[str, ...]]
+    ) -> Claim:
+        """Return the claim on ``held``; its requesters are those that hold a topic.
+
+        Args:
+            held: what is left of the application or the connection.
+            holders: the sorted requesters of each of its topics.
+        """
+        requesters = tuple(sorted({who for names in holders.values() for who in names}))
+        partial = {topic: names for topic, names in holders.items() if names != requesters}
+        return replace(self, held=held, requesters=requesters, partial=partial)
+
+    def extending(self, current: Claim) -> Claim:
+        """Return the claim with the holds of the ``current`` claim of its demand added."""
+        held = current.held.extended(self.held).booked()  # type: ignore[arg-type]  # of one kind
+        holders = dict.fromkeys(held.topic_keys(), self.requesters)
+        listed = {*self.held.topic_keys()}
+        kept = {topic: current.holders(topic) for topic in holders if topic not in listed}
+        return self.with_holders(held, holders | kept)
+
+    def without_holds(
+        self, requester: str, topics: Container[TopicKey] | None = None
+    ) -> Claim | None:
+        """Return the claim without a requester's holds on ``topics``, or on all of them.
+
+        A topic that nobody holds any longer is gone; so is a claim without requesters (``None``).
+        """
+        holders, gone = dict[TopicKey, tuple[str, ...]](), set[TopicKey]()
+        for topic in self.held.topic_keys():
+            names = self.holders(topic)
+            if topics is None or topic in topics:
+                names = tuple(who for who in names if who != requester)
+            if names:
+                holders[topic] = names
+            else:
+                gone.add(topic)
+        held = self.held.without_topics(gone) if gone else self.held
+        return None if held is None else self.with_holders(held, holders)
+
+    def without_node(self, node: str) -> Claim | None:
+        """Return the claim without what needs a node; ``None`` if nothing is left."""
+        held = self.held.without_node(node)
+        if held is None:
+            return None
+        return self.with_holders(held, {t: self.holders(t) for t in held.topic_keys()})
 
     def after_booking(self, current: Claim | None) -> Claim:
         """Return it with the booking time of the ``current`` claim if at most the lease differs."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Iterator
 from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -23,12 +24,16 @@ from demandops.connections.route import Route, RouteOptions
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
-from demandops.errors import InvalidInput, fault
+from demandops.errors import Fault, InvalidInput, fault
 from demandops.settings import LEDGER_API_VERSION
-from demandops.subject import Subject, SubjectKind
+from demandops.subject import Subject, SubjectKind, TopicKey
 
 LEDGER_ROOT = "ledger"
 
+RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements", f"{LEDGER_ROOT}/waiting")
+"""What a later version writes without a new schema: the nodes of services, waiting demands."""
+
+_JOINED = re.compile(r"[0-9a-f]{20}")  # what demandops.demand.claim.demand_id makes
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
 
 
@@ -51,11 +56,12 @@ def folder_of(subject: Subject) -> str:
 
 
 def _timestamp(text: str) -> str:
-    _time(text)
+    parse_timestamp(text)
     return text
 
 
-def _time(text: str) -> datetime:
+def parse_timestamp(text: str) -> datetime:
+    """Return a time of a ledger file, in UTC; raise :class:`ValueError` if it is none."""
     try:
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
     except ValueError:
@@ -68,14 +74,19 @@ def _time(text: str) -> datetime:
 Timestamp = Annotated[str, AfterValidator(_timestamp)]
 
 
+_Requesters = Annotated[tuple[str, ...], AfterValidator(lambda names: tuple(sorted(set(names))))]
+
+
 class _Topic(FrozenModel):
     topic: str
     source: str
     type: str = ""
+    requesters: _Requesters = Field(default=(), strict=False)
 
 
 class _Route(RouteOptions):
     target: str
+    requesters: _Requesters = Field(default=(), strict=False)
 
 
 def _plain_route(value: object) -> object:
@@ -89,30 +100,56 @@ class _Lease(FrozenModel):
     until: Timestamp | None = None  # None: the lease starts with the approval
 
     def lease(self) -> Lease:
-        until = _time(self.until) if self.until else UNSTARTED
+        until = parse_timestamp(self.until) if self.until else UNSTARTED
         return Lease(self.seconds, self.slack, until)
 
 
 class _Claim(FrozenModel):
-    apiVersion: Literal["demandops.ledger/v1"]
+    apiVersion: Literal["demandops.ledger/v1", "demandops.ledger/v2"]
+    action: Literal["DeploymentRequest"] | None = None
     demand: str = Field(min_length=1)
     request: str
-    requesters: tuple[str, ...] = Field(min_length=1, strict=False)
+    requesters: _Requesters = Field(min_length=1, strict=False)
     booked: Timestamp
     lease: _Lease | None = None
 
     def held(self) -> Application | Connection:
         raise NotImplementedError
 
+    def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
+        """Yield the topics that name their requesters, each with its place in the file."""
+        raise NotImplementedError
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield a fault for each topic with a requester that the claim does not have."""
+        for place, _, names in self.partial():
+            if unknown := set(names) - set(self.requesters):
+                message = (
+                    f"{', '.join(sorted(unknown))} is not among the requesters of the claim; add "
+                    "it there, or remove it here"
+                )
+                yield fault(f"{place}.requesters", message)
+
     def claim(self) -> Claim:
-        return Claim(
-            held=self.held(),
+        held = self.held()
+        claim = Claim(
+            held=held,
             demand=self.demand,
             request=self.request,
-            requesters=tuple(sorted(set(self.requesters))),
-            booked=_time(self.booked),
+            requesters=self.requesters,
+            booked=parse_timestamp(self.booked),
             lease=self.lease.lease() if self.lease else None,
+            joined=self.action is not None or self._is_old_join(),
         )
+        partial = {key: names for _, key, names in self.partial()}
+        if not partial:
+            return claim
+        holders = {key: partial.get(key, self.requesters) for key in held.topic_keys()}
+        return claim.with_holders(held, holders)
+
+    def _is_old_join(self) -> bool:
+        """Return whether a join booked it before there was the field ``action``."""
+        return self.apiVersion == "demandops.ledger/v1" and bool(_JOINED.fullmatch(self.demand))
 
 
 class _ApplicationFile(_Claim):
@@ -123,6 +160,13 @@ class _ApplicationFile(_Claim):
     inputs: dict[str, list[_Topic]] = Field(default_factory=dict)
     parameters: dict[str, Any] = Field(default_factory=dict)
     version: str = ""
+
+    def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
+        for role, topics in self.inputs.items():
+            for number, one in enumerate(topics):
+                if one.requesters:
+                    place = f"inputs.{role}[{number}]"
+                    yield place, (role, one.topic, one.source), one.requesters
 
     def held(self) -> Application:
         inputs = {
@@ -149,6 +193,11 @@ class _ConnectionFile(_Claim):
     broker: str = ""
     topics: dict[str, Annotated[_Route, BeforeValidator(_plain_route)]] = Field(min_length=1)
 
+    def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
+        for source, route in self.topics.items():
+            if route.requesters:
+                yield f"topics.{source}", (source,), route.requesters
+
     def held(self) -> Connection:
         topics = tuple(
             topic.route(source, topic.target) for source, topic in sorted(self.topics.items())
@@ -165,7 +214,7 @@ def text_of(claim: Claim) -> str:
     if claim.lease is not None:
         lease = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
         if claim.lease.has_started:
-            lease["until"] = _written(claim.lease.until)
+            lease["until"] = format_timestamp(claim.lease.until)
     return strict_yaml.dump(
         {
             "apiVersion": LEDGER_API_VERSION,
@@ -174,21 +223,27 @@ def text_of(claim: Claim) -> str:
             "demand": claim.demand,
             "request": claim.request,
             "requesters": list(claim.requesters),
-            "booked": _written(claim.booked),
-            **(
-                _application_data(held) if isinstance(held, Application) else _connection_data(held)
-            ),
+            "booked": format_timestamp(claim.booked),
+            **({"action": "DeploymentRequest"} if claim.joined else {}),
+            **_data(claim),
             **({"lease": lease} if lease else {}),
         }
     )
 
 
-def _application_data(app: Application) -> dict[str, Any]:
+def _data(claim: Claim) -> dict[str, Any]:
+    if claim.is_on_application:
+        return _application_data(claim, claim.application)
+    return _connection_data(claim, claim.connection)
+
+
+def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
     data: dict[str, Any] = {
         "definition": app.appdef,
         "node": app.node,
         "inputs": {
-            role: [_topic(topic) for topic in topics] for role, topics in app.inputs.items()
+            role: [_topic(claim, role, topic) for topic in topics]
+            for role, topics in app.inputs.items()
         },
     }
     if app.parameters:
@@ -196,7 +251,7 @@ def _application_data(app: Application) -> dict[str, Any]:
     return data | {"version": app.version} if app.version else data
 
 
-def _connection_data(connection: Connection) -> dict[str, Any]:
+def _connection_data(claim: Claim, connection: Connection) -> dict[str, Any]:
     data: dict[str, Any] = {
         "type": connection.known_type.word,
         "source": connection.source,
@@ -204,21 +259,28 @@ def _connection_data(connection: Connection) -> dict[str, Any]:
     }
     if connection.broker:
         data["broker"] = connection.broker
-    return data | {"topics": {route.source: _route(route) for route in connection.topics}}
+    return data | {"topics": {route.source: _route(claim, route) for route in connection.topics}}
 
 
-def _written(moment: datetime) -> str:
+def format_timestamp(moment: datetime) -> str:
+    """Return a time as ledger files have it: in UTC, with microseconds."""
     return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
-def _topic(topic: InputTopic) -> dict[str, str]:
+def _topic(claim: Claim, role: str, topic: InputTopic) -> dict[str, Any]:
     entry = {"topic": topic.topic, "source": topic.source}
-    return entry | {"type": topic.type} if topic.type else entry
+    entry |= {"type": topic.type} if topic.type else {}
+    return entry | _partial(claim, (role, topic.topic, topic.source))
 
 
-def _route(route: Route) -> str | dict[str, Any]:
-    options = route.options()
+def _route(claim: Claim, route: Route) -> str | dict[str, Any]:
+    options = route.options() | _partial(claim, (route.source,))
     return {"target": route.target, **options} if options else route.target
+
+
+def _partial(claim: Claim, topic: TopicKey) -> dict[str, list[str]]:
+    names = claim.partial.get(topic)
+    return {"requesters": list(names)} if names else {}
 
 
 def read(text: str, path: str) -> Claim:
@@ -230,7 +292,7 @@ def read(text: str, path: str) -> Claim:
     data = strict_yaml.load(text, path)
     kind = data.get("kind") if isinstance(data, dict) else None
     version = _VERSION.match(str(data.get("apiVersion", ""))) if isinstance(data, dict) else None
-    if version and int(version[1]) > 1:
+    if version and int(version[1]) > 2:
         raise InvalidInput(
             [
                 fault(
@@ -240,10 +302,11 @@ def read(text: str, path: str) -> Claim:
                 ).within(path)
             ]
         )
+    file: _Claim
     if kind == "ApplicationClaim":
-        claim = parse(_ApplicationFile, data, path).claim()
+        file = parse(_ApplicationFile, data, path)
     elif kind == "ConnectionClaim":
-        claim = parse(_ConnectionFile, data, path).claim()
+        file = parse(_ConnectionFile, data, path)
     else:
         raise InvalidInput(
             [
@@ -252,6 +315,9 @@ def read(text: str, path: str) -> Claim:
                 ).within(path)
             ]
         )
+    if faults := [found.within(path) for found in file.faults()]:
+        raise InvalidInput(faults)
+    claim = file.claim()
     if path_of(claim.key) != path:
         raise InvalidInput(
             [

@@ -21,7 +21,7 @@ MARKERS_ROOT = f"{LEDGER_ROOT}/overrides"
 
 
 class _Marker(FrozenModel):
-    apiVersion: Literal["demandops.ledger/v1"]
+    apiVersion: Literal["demandops.ledger/v1", "demandops.ledger/v2"]
     kind: Literal["EndedOverride"]
     override: str
     expires: str

@@ -18,6 +18,7 @@ from demandops.connections.connection_type import ConnectionType
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import UNSTARTED
+from demandops.ledger.recent_shutdowns import RecentShutdown, RecentShutdowns
 from demandops.subject import Subject, SubjectKind
 
 
@@ -60,10 +61,16 @@ class ClaimChange:
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """The claims that a request changed; ``not_held``: listed by a shutdown, but not held."""
+    """The claims that a request changed.
+
+    ``not_held``: listed by a shutdown, but not held. ``shutdowns``: the digests of the shutdowns
+    that the ledger now records or forgets. ``repeats``: the same shutdown, if it came before.
+    """
 
     claims: tuple[ClaimChange, ...] = ()
     not_held: tuple[str, ...] = ()
+    shutdowns: tuple[str, ...] = ()
+    repeats: RecentShutdown | None = None
 
     def subjects(self) -> tuple[Subject, ...]:
         """Return the subjects whose claims changed, each once."""
@@ -83,12 +90,14 @@ class Ledger:
     ``index`` maps each entry of :func:`index_entries` to the claims that have it.
     ``minutes`` are those in which a lease ends. They give the next end without a full scan.
     ``ended`` maps the name of each override that ended to the expiry that it had then.
+    ``shutdowns`` are those of the last 15 minutes.
     """
 
     claims: HashTrieMap[Subject, SubjectClaims] = field(default_factory=HashTrieMap)
     index: Index = field(default_factory=HashTrieMap)
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
     ended: Mapping[str, str] = field(default_factory=dict)
+    shutdowns: RecentShutdowns = field(default_factory=RecentShutdowns)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
@@ -150,6 +159,10 @@ class Ledger:
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
         """Return the claims of a requester, sorted by subject and demand."""
         return self._claims("requester", requester)
+
+    def claims_held_by(self, requester: str, subject: Subject) -> tuple[Claim, ...]:
+        """Return the claims of a requester on one subject, sorted by demand."""
+        return self._claims("holder", requester, subject.kind.value, subject.id)
 
     def count_of_requester(self, requester: str) -> int:
         """Return how many claims a requester has."""
@@ -234,7 +247,7 @@ class Ledger:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
             if entry[0] == _ENDS:
                 minutes = minutes.insert(entry[1])
-        return Ledger(claims, index, minutes, self.ended)
+        return Ledger(claims, index, minutes, self.ended, self.shutdowns)
 
     def without(self, claims: Iterable[Claim]) -> Ledger:
         """Return the ledger without these claims."""

@@ -18,7 +18,7 @@ from demandops.service.demand_lifecycle import Demands
 from demandops.service.remote_status import RemoteStatus
 from demandops.service.ticket import Listener, Ticket
 from demandops.service.worker import Worker
-from demandops.staterepo.git import repository_choice
+from demandops.staterepo.git.address import connect
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.load import state_in_effect
 from demandops.staterepo.load.snapshot import Progress, Snapshot
@@ -70,7 +70,7 @@ class Generator:
         signer = Signer(signing_key) if signing_key else None
         self._slot = Slot(data or settings.data_home(state_repo))
         try:
-            repository = repository_choice.connect(
+            repository = connect(
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
             repository.signer, repository.runtime = signer, runtime

@@ -12,7 +12,7 @@ from demandops.errors import Refused, fault
 from demandops.ledger.operations.restoration import Restoration
 from demandops.settings import API_VERSION
 from demandops.staterepo.git.repository import StateRepository
-from demandops.staterepo.load.rollback_target import restoration
+from demandops.staterepo.load.ledger_files import restoration
 from demandops.staterepo.load.snapshot import Snapshot
 
 _KIND = "Rollback"

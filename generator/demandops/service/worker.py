@@ -188,15 +188,17 @@ class Worker:
             self._require_time()
             try:
                 wait = self._attempt(batch, backoff)
-            except Unavailable as error:
+            except Exception as error:
+                reason = disk_error(error, self._repository.address) or error
+                if isinstance(reason, PushDenied):
+                    self.remote.record_push_denied(str(reason))
+                if not isinstance(reason, Unavailable):
+                    raise reason from None
                 for ticket in batch:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
-                self._record_unreachable(error)
+                self._record_unreachable(reason)
                 self._tip_is_fresh = self._repository.always_current
                 wait = backoff.unreachable()
-            except PushDenied as error:
-                self.remote.record_push_denied(str(error))
-                raise
             if wait is None:
                 continue
             # wait before the fetch, not after it: the push must follow the fetch closely
@@ -302,7 +304,7 @@ class Worker:
         override_is_due = self._override_expiry.is_due(self.snapshot.state, self._runtime.now())
         try:
             if self._timer.start_if_due():
-                self._repository.refresh_unless_urgent(lambda: self._demands.must_not_wait)
+                self._repository.refresh(lambda: self._demands.must_not_wait)
             elif not (self._repository.always_current or override_is_due):
                 return
             new = override_is_due or self._repository.tip() != self.snapshot.commit

@@ -14,11 +14,9 @@ from demandops.settings import MAIN_BRANCH, RENDER_VERSION
 from demandops.staterepo import skeleton
 from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import commit_message
-
-PIPELINES = (".github/workflows/demandops.yml", ".gitlab-ci.yml")
-"""The pipelines that check pull requests, on GitHub and GitLab."""
 
 
 def init(
@@ -33,15 +31,13 @@ def init(
     """Make a state repo and return its first commit.
 
     Args:
-        target: a folder that does not exist or is empty.
-        now: the time of the commit.
+        target: a folder that does not exist or is empty; else nothing is written.
         bare: make a bare repository, which the generator can use in place.
         gitops: the GitOps controller, ``flux`` or ``argocd``.
-        signer: signs the commit, if given.
         url: the URL that the clusters fetch from; by default the skeleton's example.
 
     Raises:
-        StateRepoError: the folder is not empty; nothing is written.
+        StateRepoError: the folder cannot be used.
     """
     target = target.resolve()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -71,16 +67,15 @@ def _write(
 ) -> str:
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
-    tree = trees.write(repo, None, content)
-    text = (
-        "Create the state repo\n\n"
-        "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
-        "\n\n"
-        f"Operation: init\nRender-Version: {RENDER_VERSION}\n"
-    )
+    objects = NewObjects(repo)
+    tree = trees.write(objects, None, content)
+    why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
+    trailers = [("Operation", "init"), ("Render-Version", str(RENDER_VERSION))]
+    text = commit_message.compose([["Create the state repo"], [why]], trailers)
     signature = commit_message.generator_signature(now)
-    commit = signing.create_commit(repo, signer, (signature, signature), text, tree, [])
-    repo.references.create(f"refs/heads/{MAIN_BRANCH}", commit)
+    commit = signing.create_commit(objects, signer, (signature, signature), text, tree, [])
+    with objects.packed(commit):
+        repo.references.create(f"refs/heads/{MAIN_BRANCH}", commit)
     if not bare:
         repo.checkout_head(  # type: ignore[no-untyped-call]
             strategy=pygit2.enums.CheckoutStrategy.FORCE

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
 from pathlib import Path
 
@@ -17,24 +17,19 @@ from demandops.render.changes.changeset import FileReader
 from demandops.runtime import REAL
 from demandops.staterepo.audit import commit_signatures, verification
 from demandops.staterepo.audit.verification import Verdict
-from demandops.staterepo.git import repository_choice
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.address import is_url
-from demandops.staterepo.git.repository import StateRepository
-from demandops.staterepo.history import authorship, commit_log, path_history, revisions
+from demandops.staterepo.git.address import connect, is_url
+from demandops.staterepo.history import authorship, commit_log, revisions
 from demandops.staterepo.history.authorship import Person
-from demandops.staterepo.history.commit_log import LogEntry
-from demandops.staterepo.history.path_history import PathHistory
+from demandops.staterepo.history.commit_log import LogEntry, PathHistory
 from demandops.staterepo.load import (
     last_valid_config,
     ledger_files,
     problem_report,
-    rollback_target,
     state_in_effect,
 )
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
-from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
 from demandops.staterepo.write.slot import Slot
 
 
@@ -42,19 +37,15 @@ class Reader:
     """An open state repo, at its newest commit."""
 
     def __init__(self, address: str) -> None:
-        """Open the state repo; a URL is fetched into a clone that is kept.
-
-        Raises:
-            StateRepoError: it cannot be read.
-        """
+        """Open the state repo; a URL is fetched into a clone that is kept."""
         self._slot: Slot | None = None
         folder = Path()
         if is_url(address):
             self._slot = Slot(settings.data_home(address) / "reader")
             folder = self._slot.folder
         try:
-            self._repository = repository_choice.connect(address, folder)
-            self._objects, self._tip = self._repository.objects, self._repository.refresh()
+            self.repository = connect(address, folder)
+            self._objects, self._tip = self.repository.objects, self.repository.refresh()
         except BaseException:
             self.close()
             raise
@@ -64,79 +55,52 @@ class Reader:
         if self._slot is not None:
             self._slot.close()
 
-    @property
-    def repository(self) -> StateRepository:
-        """The state repo itself, for a command that writes to it."""
-        return self._repository
-
     def refuse_other_render_version(self) -> None:
-        """Raise if the repo has another render version.
-
-        Raises:
-            StateRepoError: names the version and the remedy.
-        """
+        """Raise a StateRepoError with the remedy if the repo has another render version."""
         last_valid_config.refuse_other_render_version(self._tree())
 
     def commit(self, revision: str | None = None) -> str:
-        """Return the commit id of a revision or a time; by default the newest commit.
-
-        Raises:
-            StateRepoError: it is neither, or a time before the first commit.
-        """
+        """Return the commit of a revision or a time, by default the newest, or raise."""
         if not revision:
             return str(self._tip)
-        now = REAL.now()
-        return str(revisions.resolve(self._objects, self._tip, revision, now).id)
-
-    def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or a descendant."""
-        return self._repository.includes(commit, other)
-
-    def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` is equal in two commits."""
-        return self._repository.unchanged(commit, other, path)
+        return str(revisions.resolve(self._objects, self._tip, revision, REAL.now()).id)
 
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
         """Load the ledger and the configuration that are in effect at a commit.
 
-        If the generator quarantined a file, its last valid version is in effect.
-
         Raises:
-            InvalidInput, StateRepoError: the commit is not a valid state repo.
+            InvalidInput, StateRepoError: the commit is not valid, and no generator quarantined its
+                files.
         """
         commit = self.commit(revision)
         if state_in_effect.record_at(self._objects, commit).first("In-Force"):
             return state_in_effect.state_at(self._objects, commit, progress)
         return snapshots.load(self._objects, commit, progress)
 
-    def _tree(self, revision: str | None = None) -> Tree:
-        return trees.commit_of(self._objects, self.commit(revision)).tree
-
-    def problems(self) -> tuple[problem_report.Problem, ...]:
-        """Return the problems that the generator reports at the newest commit."""
-        return problem_report.read(self.file_reader()(problem_report.PATH))
-
-    def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
-        """Return the problems reported at a commit, else the problems found by loading it."""
-        report = self.file_reader(str(snapshot.commit))(problem_report.PATH)
-        return problem_report.read(report) or snapshot.problems
-
     def last_valid_snapshot(
         self, revision: str, progress: Progress = lambda done, total: None
     ) -> Snapshot:
         """Load a commit, with last valid versions of files that are not valid.
 
-        Unlike :meth:`snapshot` it does so even if the generator has not quarantined them yet.
-
-        Raises:
-            InvalidInput, StateRepoError: there never was a valid configuration.
+        Unlike :meth:`snapshot` it does so even if no generator has quarantined them yet.
         """
         try:
             return self.snapshot(revision, progress)
         except InvalidInput:
             return state_in_effect.state_at(self._objects, revision, progress)
+
+    def problems(self, revision: str | None = None) -> tuple[problem_report.Problem, ...]:
+        """Return the problems that the generator reports at a commit."""
+        return problem_report.read(self.file_reader(revision)(problem_report.PATH))
+
+    def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
+        """Return the problems reported at a commit, else the problems found by loading it."""
+        return self.problems(str(snapshot.commit)) or snapshot.problems
+
+    def _tree(self, revision: str | None = None) -> Tree:
+        return trees.commit_of(self._objects, self.commit(revision)).tree
 
     def file_reader(self, revision: str | None = None) -> FileReader:
         """Return a function that returns the text of a file at a commit."""
@@ -144,43 +108,27 @@ class Reader:
         return lambda path: trees.read_text(tree, path)
 
     def config(self) -> Config:
-        """Return the configuration at the newest commit.
-
-        Raises:
-            InvalidInput, StateRepoError: it is not valid.
-        """
+        """Return the configuration at the newest commit; raise if it is not valid."""
         return last_valid_config.config_at(self._tree())
 
-    def proposals(self) -> list[PendingProposal]:
-        """Return the demands that await approval, by branch.
+    def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
+        """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``.
 
-        Raises:
-            RemoteAway: the remote cannot be reached.
+        If a file or folder is given, only the commits that changed it.
         """
-        return list(pending_proposals(self._repository))
-
-    def log(self, spec: str | None = None) -> Iterator[LogEntry]:
-        """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``."""
         since, until = self._sides(spec or "")
-        yield from commit_log.walk(self._objects, until, since)
-
-    def commits_changing(self, path: str, spec: str | None = None) -> Iterator[LogEntry]:
-        """Yield the commits of :meth:`log` that changed a file or folder."""
-        since, until = self._sides(spec or "")
-        for change in path_history.changes_to(self._objects, until, path, since):
-            yield change.entry
+        if path is not None:
+            changes = commit_log.changes_to(self._objects, until, path, since)
+            return (change.entry for change in changes)
+        return (entry for _, entry in commit_log.commits(self._objects, until, since))
 
     def revisions(self, spec: str | None) -> list[str]:
-        """Return the commits that ``REV`` or ``A..B`` names, oldest first.
-
-        Raises:
-            StateRepoError: a side is neither a revision nor a time.
-        """
+        """Return the commits that ``REV`` or ``A..B`` names, oldest first, or raise."""
         since, until = self._sides(spec or "")
         if since is None:
             return [until]
-        walked = commit_log.walk(self._objects, until, since)
-        return [entry.commit for entry in walked][::-1]
+        walked = commit_log.commits(self._objects, until, since)
+        return [entry.commit for _, entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
         """Return the commits A and B of ``A..B``, or None and REV of ``REV``."""
@@ -198,12 +146,9 @@ class Reader:
         whole: bool = False,
         progress: Progress = lambda done, total: None,
     ) -> list[Verdict]:
-        """Return a verdict on each commit: its files, compared byte by byte, and its signature.
+        """Return a verdict on each commit, oldest first: its files, byte by byte, and signature.
 
-        Args:
-            commits: oldest first.
-            whole: load every commit whole, rather than what differs from the one before.
-            progress: called with (commits done, all commits).
+        With ``whole``, each commit is loaded whole, rather than what differs from the one before.
         """
         verdicts = list[Verdict]()
         for verdict in verification.verify(self._objects, commits, whole=whole):
@@ -213,21 +158,20 @@ class Reader:
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
         """Return the history of a file or folder up to a commit."""
-        return path_history.history_of(self._objects, revision, path, most)
+        return commit_log.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
         """Return the path of a release, or of the last stopped release with this name."""
-        current = path_history.release_path(self._objects, revision, name)
-        return current or path_history.stopped_release_path(self._objects, revision, name)
+        return commit_log.release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
         """Return the names of all releases that were ever stopped."""
-        return path_history.stopped_release_names(self._objects, revision)
+        return commit_log.stopped_release_names(self._objects, revision)
 
-    def changed_files(self, before: str, after: str, root: str) -> dict[str, bool]:
-        """Return the files of a folder that differ between two commits: path → exists after."""
-        changed = trees.differences(self._tree(before), self._tree(after), (root,))
-        return {path: blob is not None for path, blob in changed}
+    def changed_files(self, before: str, after: str, roots: Sequence[str]) -> list[str]:
+        """Return the files below these folders that differ between two commits, sorted."""
+        changed = trees.differences(self._tree(before), self._tree(after), roots)
+        return sorted(path for path, _ in changed)
 
     def changes_node(self, commit: str, node: str) -> bool:
         """Return whether a commit changed a release on a node, or a claim that names the node."""
@@ -243,11 +187,7 @@ class Reader:
 
     def restoration(self, to: str, **more: object) -> Restoration:
         """Return the request to roll back to a commit."""
-        return rollback_target.restoration(self._objects, to, **more)
-
-    def config_files_changed_since(self, commit: str) -> list[str]:
-        """Return the configuration files that changed since a commit."""
-        return rollback_target.config_files_changed_since(self._objects, commit, self._tip)
+        return ledger_files.restoration(self._objects, to, **more)
 
     def operator(self) -> Person:
         """Return the person who runs this program."""
@@ -257,8 +197,5 @@ class Reader:
 @contextmanager
 def opened(address: str) -> Iterator[Reader]:
     """Open a state repo for reading, and close it at the end."""
-    reader = Reader(address)
-    try:
+    with closing(Reader(address)) as reader:
         yield reader
-    finally:
-        reader.close()

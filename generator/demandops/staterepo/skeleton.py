@@ -15,11 +15,7 @@ from demandops.settings import RENDER_VERSION, data_folder
 
 
 def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
-    """Return path → text of a new state repo: skeleton, appdefs and their rendered files.
-
-    Raises:
-        InvalidInput: clusters cannot fetch from ``url``.
-    """
+    """Return path → text of a new state repo; raise if clusters cannot fetch from ``url``."""
     contents = _read(data_folder("skeleton"), "")
     contents |= _read(data_folder("appdefs"), "appdefs/")
     roots = {"flux": contents.pop(ROOT_FILE), "argocd": contents.pop("demandops.argocd.yaml")}

@@ -19,12 +19,15 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State
 from demandops.demand.claim import ClaimKey
 from demandops.errors import InvalidInput, StateRepoError, fault
+from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger.claim_file import LEDGER_ROOT
+from demandops.ledger.ledger import Ledger
 from demandops.plan.overrides.lifecycle import update_ledger
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import planned_releases
 from demandops.render.gitops.controller_switch import SwitchSteps, switch_steps
 from demandops.runtime import REAL
-from demandops.settings import RENDER_VERSION
+from demandops.settings import LEDGER_API_VERSION, RENDER_VERSION
 from demandops.staterepo import reader
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
@@ -151,11 +154,27 @@ def _plan(
     state = replace(state, ledger=applied.ledger)
     if old.repo_settings.gitops != config.repo_settings.gitops:
         _refuse_held(state)
-    changed = dict(batch.render_all(state, applied.files).files)
+    files_of_ledger = _in_this_schema(trees.texts(tree, (LEDGER_ROOT,)), state.ledger)
+    changed = dict(batch.render_all(state, {**files_of_ledger, **applied.files}).files)
     if files[ROOT_FILE] != before:
         changed[ROOT_FILE] = files[ROOT_FILE]
     upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))
     return _Plan(upgrade, batch, state, applied.keys)
+
+
+def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
+    """Return the ledger files that this program writes differently, path → text."""
+    written = {}
+    for path, text in files.items():
+        new = text
+        if claim_file.kind_of(path) is not None:
+            claim = ledger.get(claim_file.read(text, path).key)
+            new = claim_file.text_of(claim) if claim else text
+        elif ended_override_file.read({path: text}):
+            new = strict_yaml.set_key(text, "apiVersion", LEDGER_API_VERSION)
+        if new != text:
+            written[path] = new
+    return written
 
 
 def _refuse_held(state: State) -> None:

@@ -2,41 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
 from tests.e2e.common.expected import NODES, WITHOUT_DEMANDS
 from tests.e2e.common.ros import Client
-from tests.e2e.common.running import running
+from tests.e2e.common.running import CLUSTER, running, worlds
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
 from .world import World
 
-CLUSTER = "c-its"
+MakeWorld = Callable[[], World]
 
 
 @pytest.fixture(scope="session")
 def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
     """A cluster with a node for each node of the skeleton's inventory."""
-    with running(
-        Rig(CLUSTER, gitops="argocd", nodes=NODES, report=say), request.session
-    ) as cluster:
+    cluster = Rig(CLUSTER, gitops="argocd", nodes=NODES, report=say)
+    with running(cluster, request.session):
         say(f"\nrig started: {cluster.timings}")
         yield cluster
 
 
 @pytest.fixture(scope="module")
-def world(
+def make_world(
     rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[World]:
+) -> Iterator[MakeWorld]:
+    """Create a state repo that no cluster follows yet; the end of the module removes it."""
+    folder = tmp_path_factory.mktemp
+    with worlds(lambda: World(rig, folder("world"), ros_domain, client)) as make:
+        yield make
+
+
+@pytest.fixture(scope="module")
+def world(make_world: MakeWorld, rig: Rig) -> World:
     """A state repo that the cluster follows, with a running generator and no demand."""
-    made = World(rig, tmp_path_factory.mktemp("world"), ros_domain, client)
-    try:
-        made.bootstrap(CLUSTER)
-        made.generator.start()
-        made.domain.wait_lines(WITHOUT_DEMANDS)
-        yield made
-    finally:
-        made.remove()
+    made = make_world()
+    made.bootstrap(CLUSTER, rig)
+    made.generator.start()
+    made.domain.wait_lines(WITHOUT_DEMANDS)
+    return made

@@ -11,6 +11,7 @@ import yaml
 from tests.e2e.common import expected
 from tests.e2e.common.expected import NODES, WITHOUT_DEMANDS
 from tests.e2e.common.ros import Client
+from tests.e2e.common.running import CLUSTER, running
 from tests.e2e.common.staterepo import demandops
 from tests.e2e.flux import view as flux_view
 from tests.e2e.flux.world import World as FluxWorld
@@ -18,7 +19,6 @@ from tests.e2e.rig.argocd import NAMESPACE as CONTROL
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .conftest import CLUSTER
 from .view import Domain
 
 FLUX_KINDS = ("HelmRelease", "Kustomization", "HelmChart", "GitRepository")
@@ -28,13 +28,9 @@ SUSPENDED = {"spec": {"suspend": True}}
 @pytest.fixture(scope="module")
 def both(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
     """A cluster with both controllers."""
-    failed = request.session.testsfailed
     rig = Rig("both", gitops="flux", beside="argocd", nodes=NODES, report=say)
-    rig.start()
-    try:
+    with running(rig, request.session):
         yield rig
-    finally:
-        rig.stop(failed=request.session.testsfailed > failed)
 
 
 def test_every_pod_stays_there_and_back(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 from demandops.cluster import controller_webhook
@@ -12,47 +12,41 @@ from demandops_ros import DemandClient
 from tests.e2e.common.access import access_file, documented_roles, limited
 from tests.e2e.common.answers import TIMEOUT_S, fusion, push_chart, restart_generator
 from tests.e2e.common.namespace import name_of
-from tests.e2e.common.ros import Client
+from tests.e2e.common.running import CLUSTER
 from tests.e2e.rig.argocd import SERVER, WEBHOOK_SECRET
 from tests.e2e.rig.cluster import Rig
 
-from .conftest import CLUSTER
+from .conftest import MakeWorld
 from .world import World
 
 OF_CHART = "\n---\napiVersion: v1\nkind: ConfigMap\nmetadata: {name: {{ .Release.Name }}-new}\n"
 
 
 @pytest.fixture(scope="module")
-def world(
-    rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[World]:
+def world(make_world: MakeWorld, rig: Rig) -> World:
     """A state repo whose generator calls the webhook and may only read the cluster."""
     if rig.existing:
         pytest.skip("the tests do not know the webhook secret of an existing Argo CD")
-    made = World(rig, tmp_path_factory.mktemp("world"), ros_domain, client)
-    try:
-        made.bootstrap(CLUSTER)
-        secret = made.folder / "secret"
-        secret.touch(mode=0o600)
-        secret.write_text(f"{WEBHOOK_SECRET}\n")
-        rights = {
-            namespace: [
-                {**rule, "verbs": [verb for verb in rule["verbs"] if verb != "patch"]}
-                for rule in rules
-            ]
-            for namespace, rules in documented_roles("argo cd").items()
-        }
-        access_file(
-            made.folder,
-            CLUSTER,
-            kubeconfig=limited(rig.kube, rig.kubeconfig, made.folder, rights),
-            webhook=f"{rig.url(SERVER)}/api/webhook",
-            secret_file=secret,
-        )
-        restart_generator(made, TIMEOUT_S)
-        yield made
-    finally:
-        made.remove()
+    made = make_world()
+    made.bootstrap(CLUSTER, rig)
+    secret = made.folder / "secret"
+    secret.touch(mode=0o600)
+    secret.write_text(f"{WEBHOOK_SECRET}\n")
+    rights = {
+        namespace: [
+            {**rule, "verbs": [verb for verb in rule["verbs"] if verb != "patch"]} for rule in rules
+        ]
+        for namespace, rules in documented_roles("argo cd").items()
+    }
+    access_file(
+        made.folder,
+        CLUSTER,
+        kubeconfig=limited(rig.kube, rig.kubeconfig, made.folder, rights),
+        webhook=f"{rig.url(SERVER)}/api/webhook",
+        secret_file=secret,
+    )
+    restart_generator(made, TIMEOUT_S)
+    return made
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from tests.e2e.common.namespace import Namespace, name_of
+from tests.e2e.common.namespace import Namespace
 from tests.e2e.rig.argocd import NAMESPACE
 from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Manifest
@@ -19,13 +19,10 @@ _REFRESH = "argocd.argoproj.io/refresh"
 class Domain(Namespace):
     """The domain's namespace on one cluster; the Application over its folder is called `name`."""
 
+    GITOPS = "argocd"
     RELEASE = "Application"
 
     # --- reading ----------------------------------------------------------------------------
-
-    def releases(self) -> dict[str, Any]:
-        """Return the spec of every release's Application, by its name."""
-        return {name_of(item): item["spec"] for item in self.find("Application")}
 
     def fetched(self) -> str:
         """Return the commit that the folder was last compared with."""
@@ -52,6 +49,9 @@ class Domain(Namespace):
             ]
         return "; ".join(messages)
 
+    def folder_trouble(self) -> str:
+        return self.trouble(self.name, NAMESPACE)
+
     # --- waiting ----------------------------------------------------------------------------
 
     def wake(self) -> None:
@@ -71,18 +71,21 @@ class Domain(Namespace):
         self.kube.wait(f"Application {namespace}/{name} to be refreshed", refreshed)
 
     def wait_fetched(self, commit: str) -> float:
-        """Wait until the folder was compared with a commit; return when that was seen."""
         self._wait_for(f"{commit[:10]} to be fetched", commit, fetched=True)
         return time.monotonic()
 
     def wait_applied(self, commit: str) -> float:
-        """Wait until the folder is applied from a commit; return when that was seen."""
         self._wait_for(f"{commit[:10]} to be applied", commit, fetched=False)
         return time.monotonic()
 
-    def wait_releases(self) -> None:
-        """Wait until the Application of every release is Synced."""
+    def wait_attempted(self, commit: str) -> None:
+        self.wait_fetched(commit)
 
+    def wait_checked(self, commit: str) -> None:
+        for release in self.releases():
+            self.refresh(release)
+
+    def wait_releases(self) -> None:
         def synced() -> bool:
             states = [item.get("status", {}).get("sync", {}) for item in self.find("Application")]
             return all(state.get("status") == "Synced" for state in states)

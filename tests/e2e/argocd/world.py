@@ -9,6 +9,7 @@ import yaml
 
 from tests.e2e.common.staterepo import StateRepo
 from tests.e2e.rig.argocd import NAMESPACE
+from tests.e2e.rig.cluster import Rig
 
 from .view import Domain
 
@@ -16,19 +17,18 @@ from .view import Domain
 class World(StateRepo[Domain]):
     """A state repo that Argo CD follows."""
 
-    def bootstrap(self, cluster: str) -> None:
-        """Apply `bootstrap/<cluster>.yaml` to the cluster and wait until its Argo CD follows."""
+    def bootstrap(self, cluster: str, rig: Rig) -> Domain:
         manifests = list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
         (project,) = [item for item in manifests if item["kind"] == "AppProject"]
         (folder,) = [item for item in manifests if item["kind"] == "Application"]
         namespace = folder["spec"]["destination"]["namespace"]
         assert project["spec"]["sourceNamespaces"] == [namespace]
-        self.domains[cluster] = Domain(self.rig.kube, namespace, folder["metadata"]["name"])
-        self.rig.kube.apply(*manifests)
-        self.domain.wait_applied(self.tip())
+        domain = self.domains[cluster] = Domain(rig.kube, namespace, folder["metadata"]["name"])
+        rig.kube.apply(*manifests)
+        domain.wait_applied(self.tip())
+        return domain
 
     def remove(self) -> None:
-        """Remove the state repo from the cluster. The namespace stays."""
         self.generator.stop()
         for domain in self.domains.values():
             domain.kube.delete("Application", domain.name, NAMESPACE)

@@ -6,11 +6,10 @@ import base64
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 
-from tests.e2e.rig.kube import Kube, Manifest
+from tests.e2e.rig.kube import Kube, Manifest, build_manifest
 
 _RBAC = "rbac.authorization.k8s.io"
 _ACCOUNT = "generator"
@@ -41,14 +40,22 @@ def limited(
     home, *_ = rights
     subject = {"kind": "ServiceAccount", "name": _ACCOUNT, "namespace": home}
     role = {"apiGroup": _RBAC, "kind": "Role", "name": _ACCOUNT}
-    kube.apply(
-        _object("v1", "ServiceAccount", home),
-        _object("v1", "Secret", home, type="kubernetes.io/service-account-token"),
+    secret = build_manifest(
+        "v1", "Secret", _ACCOUNT, home, type="kubernetes.io/service-account-token"
     )
+    secret["metadata"]["annotations"] = {"kubernetes.io/service-account.name": _ACCOUNT}
+    kube.apply(build_manifest("v1", "ServiceAccount", _ACCOUNT, home), secret)
     for namespace, rules in rights.items():
         kube.apply(
-            _object(f"{_RBAC}/v1", "Role", namespace, rules=list(rules)),
-            _object(f"{_RBAC}/v1", "RoleBinding", namespace, roleRef=role, subjects=[subject]),
+            build_manifest(f"{_RBAC}/v1", "Role", _ACCOUNT, namespace, rules=list(rules)),
+            build_manifest(
+                f"{_RBAC}/v1",
+                "RoleBinding",
+                _ACCOUNT,
+                namespace,
+                roleRef=role,
+                subjects=[subject],
+            ),
         )
 
     def token() -> str:
@@ -63,10 +70,3 @@ def limited(
     file = folder / "generator.kubeconfig"
     file.write_text(yaml.safe_dump(config))
     return file
-
-
-def _object(version: str, kind: str, namespace: str, **fields: Any) -> dict[str, Any]:
-    metadata: dict[str, Any] = {"name": _ACCOUNT, "namespace": namespace}
-    if kind == "Secret":
-        metadata["annotations"] = {"kubernetes.io/service-account.name": _ACCOUNT}
-    return {"apiVersion": version, "kind": kind, "metadata": metadata, **fields}

@@ -15,7 +15,9 @@ from typing import Any
 import pytest
 from demandops_ros import DemandClient, DemandError
 
+from tests.e2e.common.access import access_file, documented_roles, limited
 from tests.e2e.common.namespace import Namespace, fusion_inputs, name_of
+from tests.e2e.common.running import CLUSTER
 from tests.e2e.common.staterepo import StateRepo, demandops
 from tests.e2e.rig.cluster import Rig
 
@@ -50,6 +52,16 @@ FUSION = fusion("vehicle00")
 
 
 World = StateRepo[Any]
+
+
+def limited_world(world: World, rig: Rig, gitops: str) -> World:
+    """Have a new state repo followed, with a generator that has the rights of docs/status.md."""
+    world.bootstrap(CLUSTER, rig)
+    rights = documented_roles(gitops)
+    kubeconfig = limited(rig.kube, rig.kubeconfig, world.folder, rights)
+    access_file(world.folder, CLUSTER, kubeconfig=kubeconfig)
+    restart_generator(world, TIMEOUT_S)
+    return world
 
 
 def restart_generator(world: World, timeout_s: float) -> None:

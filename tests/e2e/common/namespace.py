@@ -39,6 +39,7 @@ class Namespace:
     `name` is the controller's object that applies the domain's folder.
     """
 
+    GITOPS: ClassVar[str]
     RELEASE: ClassVar[str]
     OWN: ClassVar[tuple[str, ...]] = ()  # further kinds that the controller owns
     STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that an unrelated commit does not change
@@ -71,6 +72,10 @@ class Namespace:
         found += [self._pod_line(pod) for pod in self.find("Pod")]
         repeated = {line for line in found if found.count(line) > 1}
         return frozenset(found) | {f"twice: {line}" for line in repeated}
+
+    def releases(self) -> dict[str, Any]:
+        """Return the spec of every release, by its name."""
+        return {name_of(item): item["spec"] for item in self.find(self.RELEASE)}
 
     def inventory(self) -> frozenset[str]:
         """Return kind and name of everything in the namespace, whoever created it."""
@@ -117,9 +122,28 @@ class Namespace:
         """Wait until the controller has applied a commit; return when that was seen."""
         raise NotImplementedError
 
+    def wait_attempted(self, commit: str) -> None:
+        """Wait until the controller has tried to apply a commit, with or without success."""
+        raise NotImplementedError
+
     def wait_releases(self) -> None:
         """Wait until the controller has done everything for the releases except await pods."""
         raise NotImplementedError
+
+    def wait_checked(self, commit: str) -> None:
+        """Wait until the controller has compared every release with a commit."""
+        raise NotImplementedError
+
+    def folder_trouble(self) -> str:
+        """Return why the domain's folder cannot be applied; empty if it can."""
+        raise NotImplementedError
+
+    def take_away(self, kind: str, name: str) -> None:
+        """Delete an object that the controller restores."""
+        self.kube.delete(kind, name, self.namespace)
+
+    def restore(self, *releases: str) -> None:
+        """Make the controller restore releases, or the folder, if it does not so by itself."""
 
     # --- waiting ----------------------------------------------------------------------------
 

@@ -1,15 +1,20 @@
-"""A rig for the length of a block."""
+"""A rig, and state repos, for the length of a block."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import pytest
 
+from tests.e2e.common.staterepo import StateRepo
 from tests.e2e.rig.cluster import Rig
 
+CLUSTER = "c-its"
 NAMESPACE = "perception"  # the skeleton's access domain
+
+World = TypeVar("World", bound=StateRepo[Any])
 
 
 @contextmanager
@@ -23,3 +28,17 @@ def running(rig: Rig, session: pytest.Session) -> Iterator[Rig]:
         if rig.existing:
             rig.kube.delete("Namespace", NAMESPACE)
         rig.stop(failed=session.testsfailed > failed)
+
+
+@contextmanager
+def worlds(make: Callable[[], World]) -> Iterator[Callable[[], World]]:
+    """Create state repos that no cluster follows yet; the end of the block removes them."""
+    made: list[World] = []
+
+    def another() -> World:
+        made.append(make())
+        return made[-1]
+
+    yield another
+    for world in made:
+        world.remove()

@@ -19,10 +19,12 @@ from tests.e2e.rig import launch
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.errors import RigError
+from tests.kit.repo import git
+from tests.kit.ros import Sent
 
 from .expected import demand
 from .namespace import Namespace
-from .ros import Client, Sent
+from .ros import Client
 from .timing import Times
 
 Domain = TypeVar("Domain", bound=Namespace)
@@ -95,10 +97,18 @@ class StateRepo(Generic[Domain]):
         bare = folder / "state.git"
         url = rig.git_url(self.name)
         demandops(folder, "init", str(bare), "--bare", "--gitops", rig.gitops, "--url", url)
-        _git(bare, "push", "--quiet", self.push_url, "main")
+        git(bare, "push", "--quiet", self.push_url, "main")
         self.person = Clone(self.push_url, folder / "person")
         self.generator = Generator(self.push_url, folder, ros_domain, client)
         self.domains: dict[str, Domain] = {}
+
+    def bootstrap(self, cluster: str, rig: Rig) -> Domain:
+        """Apply `bootstrap/<cluster>.yaml` to a cluster and wait until it follows."""
+        raise NotImplementedError
+
+    def remove(self) -> None:
+        """Remove the state repo from its clusters. The namespace stays."""
+        raise NotImplementedError
 
     @property
     def domain(self) -> Domain:
@@ -114,7 +124,7 @@ class StateRepo(Generic[Domain]):
     def tip(self) -> str:
         """Return the tip of the remote."""
         self._pull()
-        return self.person.git("rev-parse", "HEAD").strip()
+        return self.person.git("rev-parse", "HEAD")
 
     def changed_by(self, commit: str) -> list[str]:
         """Return the paths that a commit changed."""
@@ -182,7 +192,3 @@ def environment(folder: Path) -> dict[str, str]:
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(folder / "ros-log"),
     }
-
-
-def _git(repository: Path, *arguments: str) -> None:
-    subprocess.run(["git", *arguments], cwd=repository, check=True, capture_output=True)

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
 from tests.e2e.common.expected import NODES, WITHOUT_DEMANDS
 from tests.e2e.common.ros import Client
-from tests.e2e.common.running import NAMESPACE, running
+from tests.e2e.common.running import CLUSTER, running, worlds
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
 from .world import World
-
-__all__ = ["NAMESPACE"]  # for test_charts
-CLUSTER = "c-its"
 
 MakeWorld = Callable[[], World]
 
@@ -24,7 +20,8 @@ MakeWorld = Callable[[], World]
 @pytest.fixture(scope="session")
 def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
     """A cluster with a node for each node of the skeleton's inventory."""
-    with running(Rig(CLUSTER, nodes=NODES, report=say), request.session) as cluster:
+    cluster = Rig(CLUSTER, gitops="flux", nodes=NODES, report=say)
+    with running(cluster, request.session):
         say(f"\nrig started: {cluster.timings}")
         yield cluster
 
@@ -34,16 +31,9 @@ def make_world(
     rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[MakeWorld]:
     """Create a state repo that no cluster follows yet; the end of the module removes it."""
-    made: list[World] = []
-
-    def make() -> World:
-        folder: Path = tmp_path_factory.mktemp("world")
-        made.append(World(rig, folder, ros_domain, client))
-        return made[-1]
-
-    yield make
-    for world in made:
-        world.remove()
+    folder = tmp_path_factory.mktemp
+    with worlds(lambda: World(rig, folder("world"), ros_domain, client)) as make:
+        yield make
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,15 @@ import pytest
 import yaml
 
 from tests.e2e.common.golden import golden
+from tests.e2e.common.running import NAMESPACE
+from tests.e2e.common.steps import (
+    test_the_server_does_look,
+    test_the_server_takes_every_golden_manifest,
+)
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Manifest
 
-from .conftest import NAMESPACE
-
+__all__ = ["test_the_server_does_look", "test_the_server_takes_every_golden_manifest"]
 ROOT = Path(__file__).resolve().parents[3]
 CHARTS = ROOT / "appdefs" / "object-detection-fusion" / "charts"
 
@@ -87,22 +90,6 @@ def test_every_golden_release_gives_what_the_server_takes(
         rig.kube.apply(*made, dry_run=True)
         seen += 1
     assert seen > len(VALUES)
-
-
-def test_the_server_takes_every_golden_manifest(rig: Rig, namespace: str) -> None:
-    manifests = list(golden("flux"))
-    kinds = {manifest["kind"] for manifest in manifests}
-    assert {"HelmRelease", "HelmChart", "Kustomization", "Deployment", "Role"} <= kinds
-    rig.kube.apply(*manifests, dry_run=True)
-
-
-@pytest.mark.parametrize("kind", ["Deployment", "GitRepository", "HelmRelease", "Kustomization"])
-def test_the_server_does_look(rig: Rig, namespace: str, kind: str) -> None:
-    """The dry run means something: a field that does not exist is not taken."""
-    broken = copy.deepcopy(next(item for item in golden("flux") if item["kind"] == kind))
-    broken["spec"]["interwal"] = "1m"
-    with pytest.raises(Exception, match="field not declared in schema"):
-        rig.kube.apply(broken, dry_run=True)
 
 
 def templated(rig: Rig, chart: str, values: Path, release: str) -> list[Manifest]:

@@ -9,11 +9,11 @@ import yaml
 
 from tests.e2e.common import expected
 from tests.e2e.common.expected import NODES, STEPS, VEHICLES, WITHOUT_DEMANDS
-from tests.e2e.common.running import NAMESPACE, running
+from tests.e2e.common.running import CLUSTER, NAMESPACE, running
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .conftest import CLUSTER, MakeWorld
+from .conftest import MakeWorld
 from .relay import Relay
 from .view import SOURCE, Domain
 from .world import World

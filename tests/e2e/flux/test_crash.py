@@ -66,12 +66,17 @@ def source(world: World, goal: dict[str, Any]) -> None:
     killed(world, "source-controller")
 
 
+def send_until_committed(world: World, goal: dict[str, Any]) -> None:
+    sent = world.client.send(goal)
+    world.client.wait(lambda: "committed" in sent.stages)
+
+
 def generator_without_git(world: World, goal: dict[str, Any]) -> None:
     """The demand is committed and cannot be pushed; the next run publishes it."""
     before = world.tip()
     world.rig.stop_component("git")
     try:
-        world.client.send(goal).wait_stage("committed")
+        send_until_committed(world, goal)
         world.generator.kill()
     finally:
         world.rig.start_component("git")
@@ -91,7 +96,7 @@ def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
     """
     world.rig.pause("git")
     try:
-        world.client.send(goal).wait_stage("committed")
+        send_until_committed(world, goal)
         time.sleep(0.2)
         world.generator.kill()
     finally:

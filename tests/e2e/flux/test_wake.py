@@ -5,11 +5,12 @@ from __future__ import annotations
 from tests.e2e.common import expected
 from tests.e2e.common.access import access_file, limited
 from tests.e2e.common.expected import WITHOUT_DEMANDS
+from tests.e2e.common.running import CLUSTER
 from tests.e2e.common.timing import Table
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .conftest import CLUSTER, MakeWorld
+from .conftest import MakeWorld
 
 WAKER = {
     "apiGroups": ["source.toolkit.fluxcd.io"],

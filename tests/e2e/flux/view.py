@@ -19,6 +19,7 @@ SOURCE = "demandops"  # the GitRepository's name
 class Domain(Namespace):
     """The domain's namespace on one cluster; its Kustomization is called `name`."""
 
+    GITOPS = "flux"
     RELEASE = "HelmRelease"
     STEADY = ("HelmRelease",)
     OWN = ("GitRepository", "HelmChart", "Kustomization")
@@ -50,33 +51,52 @@ class Domain(Namespace):
         ]
         return " ".join(messages)
 
+    def folder_trouble(self) -> str:
+        return self.trouble("Kustomization", self.name)
+
     # --- waiting ----------------------------------------------------------------------------
 
     def wake(self) -> None:
-        """Make the source fetch now; its new artifact triggers the Kustomization."""
+        # its new artifact triggers the Kustomization
         self.kube.reconcile("GitRepository", SOURCE, self.namespace)
 
     def wait_fetched(self, commit: str, timeout: float = 60.0) -> float:
-        """Wait until the source has fetched a commit; return when that was seen."""
         self._wait_for(f"{commit[:10]} to be fetched", lambda: self.fetched() == commit, timeout)
         return time.monotonic()
 
     def wait_applied(self, commit: str, timeout: float = 60.0) -> float:
-        """Wait until the Kustomization has applied a commit; return when that was seen."""
         self._wait_for(f"{commit[:10]} to be applied", lambda: self.applied() == commit, timeout)
         return time.monotonic()
 
     def wait_attempted(self, commit: str, timeout: float = 60.0) -> None:
-        """Wait until the Kustomization has tried a commit, with or without success."""
-
         def attempted() -> bool:
             status = self._status("Kustomization", self.name)
             return _commit(status.get("lastAttemptedRevision")) == commit
 
         self._wait_for(f"{commit[:10]} to be tried", attempted, timeout)
 
+    def wait_checked(self, commit: str) -> None:
+        for chart in self.find("HelmChart"):  # each HelmChart checks every commit
+            name = name_of(chart)
+            self.kube.wait(
+                f"{name} to check the commit",
+                lambda n=name: (
+                    commit
+                    in self.get("HelmChart", n)["status"].get("observedSourceArtifactRevision", "")
+                ),
+            )
+
+    def take_away(self, kind: str, name: str) -> None:
+        super().take_away(kind, name)
+        self.kube.wait_gone(kind, name, self.namespace)
+
+    def restore(self, *releases: str) -> None:
+        for release in releases:
+            self.kube.reconcile("HelmRelease", release, self.namespace)
+        if not releases:
+            self.kube.reconcile("Kustomization", self.name, self.namespace)
+
     def wait_releases(self) -> None:
-        """Wait until each HelmRelease is ready; it does not wait for pods."""
         for release in self.find("HelmRelease"):
             self.kube.wait_ready("HelmRelease", name_of(release), self.namespace)
 

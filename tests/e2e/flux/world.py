@@ -26,10 +26,7 @@ class World(StateRepo[Domain]):
         self._wide: list[tuple[Kube, Manifest]] = []
 
     def bootstrap(self, cluster: str, rig: Rig, **source: Any) -> Domain:
-        """Apply `bootstrap/<cluster>.yaml` to a cluster and wait until its Flux follows.
-
-        `source` changes fields of the GitRepository, as a person may do with an overlay.
-        """
+        """Do so; `source` changes fields of the GitRepository, as a person may with an overlay."""
         manifests = list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
         (git,) = [item for item in manifests if item["kind"] == "GitRepository"]
         git["spec"].update(source)
@@ -49,7 +46,6 @@ class World(StateRepo[Domain]):
         return domain
 
     def remove(self) -> None:
-        """Remove the state repo from its clusters. The namespace and its other objects stay."""
         self.generator.stop()
         for domain in self.domains.values():
             kube, namespace = domain.kube, domain.namespace

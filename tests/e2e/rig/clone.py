@@ -1,16 +1,11 @@
-"""A work tree of a served repository, for tests that act as a person or the generator.
-
-It runs `git` without the user's configuration, hooks and name.
-"""
+"""A work tree of a served repository, for tests that act as a person or the generator."""
 
 from __future__ import annotations
 
-import os
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
-from .errors import RigError
+from tests.kit.repo import git
 
 
 class Clone:
@@ -34,27 +29,8 @@ class Clone:
         self.git("add", "--all")
         self.git("commit", "--quiet", f"--message={message}")
         self.git("push", "--quiet", "origin", "HEAD:main")
-        return self.git("rev-parse", "HEAD").strip()
+        return self.git("rev-parse", "HEAD")
 
     def git(self, *arguments: str) -> str:
-        """Run git in the work tree and return what it prints."""
-        person = {"NAME": "e2e", "EMAIL": "e2e@demandops.invalid"}
-        environment = {
-            "PATH": os.environ.get("PATH", os.defpath),
-            "HOME": str(self.folder),
-            "GIT_CONFIG_NOSYSTEM": "1",
-            "GIT_CONFIG_GLOBAL": os.devnull,
-            "GIT_TERMINAL_PROMPT": "0",
-            **{f"GIT_{role}_{k}": v for role in ("AUTHOR", "COMMITTER") for k, v in person.items()},
-        }
-        done = subprocess.run(
-            ["git", *arguments],
-            cwd=self.folder,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode != 0:
-            raise RigError(f"{self.folder}: git {' '.join(arguments)}: {done.stderr.strip()}")
-        return done.stdout
+        """Run git in the work tree and return what it prints; a failure is an AssertionError."""
+        return git(self.folder, *arguments)

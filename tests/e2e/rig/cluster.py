@@ -33,7 +33,7 @@ KEEP_VARIABLE = "E2E_KEEP"
 
 Gitops = Literal["flux", "argocd"]
 
-_PARTS: dict[Gitops, ModuleType] = {"flux": flux, "argocd": argocd}
+PARTS: dict[Gitops, ModuleType] = {"flux": flux, "argocd": argocd}
 
 
 class Rig:
@@ -220,7 +220,7 @@ class Rig:
         work = self._work = Workdir(self.name, self._folder)
         self.kube = Kube(existing.kubeconfig, work.path / "discovery.json")
         for controller in self._controllers:
-            kinds, remedy = _PARTS[controller].KINDS, _PARTS[controller].REMEDY
+            kinds, remedy = PARTS[controller].KINDS, PARTS[controller].REMEDY
             for kind in kinds:
                 try:
                     self.kube.find(kind)
@@ -244,7 +244,7 @@ class Rig:
         self.kubeconfig = pki.write_kubeconfig(path, self.name, plane.server, certificates)
         self.kube = Kube(self.kubeconfig, work.path / "discovery.json", self.check)
         self.kube.install_crds(tools.crd_files(self._binaries))
-        parts = [_PARTS[controller] for controller in self._controllers]
+        parts = [PARTS[controller] for controller in self._controllers]
         for part in parts:
             self.kube.apply(*part.settings())
         clock.lap("CRDs and settings")

@@ -49,8 +49,8 @@ class GitServer(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = 128
 
-    def __init__(self, root: Path, address: str, port: int) -> None:
-        super().__init__((address, port), _Handler)
+    def __init__(self, root: Path, address: str, port: int, handler: type[Handler]) -> None:
+        super().__init__((address, port), handler)
         self.root = root.resolve()
         user, password = os.environ.get(USER_VARIABLE), os.environ.get(PASSWORD_VARIABLE)
         self.expected = ""
@@ -81,17 +81,14 @@ def _environment(root: Path) -> dict[str, str]:
     }
 
 
-class _Handler(BaseHTTPRequestHandler):
+class Handler(BaseHTTPRequestHandler):
+    """Answers what git asks for, by `git http-backend`."""
+
     protocol_version = "HTTP/1.1"  # with 1.0 a client that sends "Expect: 100-continue" would wait
     server: GitServer
 
-    def do_GET(self) -> None:
-        self._serve()
-
-    def do_POST(self) -> None:
-        self._serve()
-
-    def _serve(self) -> None:
+    def serve(self) -> None:
+        """Answer one request."""
         self.close_connection = True  # answers have no length: closing the connection ends them
         path, _, query = self.path.partition("?")
         path = unquote(path)
@@ -103,7 +100,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.BAD_REQUEST, "the path contains '..'; remove it")
         else:
             self._create_for_push(path, query)
-            self._run_backend(path, query)
+            self.run_backend(path, query)
+
+    do_GET = do_POST = serve
 
     def _allowed(self) -> bool:
         given = self.headers.get("Authorization", "")
@@ -129,7 +128,8 @@ class _Handler(BaseHTTPRequestHandler):
         if name != path and pushing and name.endswith(".git") and not repository.exists():
             init_bare(repository, self.server.git)
 
-    def _run_backend(self, path: str, query: str) -> None:
+    def run_backend(self, path: str, query: str) -> None:
+        """Have git answer."""
         backend = subprocess.Popen(
             [self.server.git, "http-backend"],
             env=self.server.environment() | self._request_variables(path, query),
@@ -168,7 +168,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Forward the request's body; read it to its end even if the backend has closed."""
         listening = True
         try:
-            for chunk in self._body():
+            for chunk in self.body():
                 if listening:
                     try:
                         stdin.write(chunk)
@@ -180,7 +180,8 @@ class _Handler(BaseHTTPRequestHandler):
             with contextlib.suppress(BrokenPipeError):
                 stdin.close()
 
-    def _body(self) -> Iterator[bytes]:
+    def body(self) -> Iterator[bytes]:
+        """Yield the request's body."""
         if "chunked" in self.headers.get("Transfer-Encoding", "").lower():  # packs above 1 MB
             while size := int(self.rfile.readline().split(b";")[0], 16):
                 yield from self._read(size)
@@ -233,7 +234,7 @@ def _main() -> None:
     parser.add_argument("--address", default="127.0.0.1", help="for a cluster in containers")
     options = parser.parse_args()
     options.root.mkdir(parents=True, exist_ok=True)
-    server = GitServer(options.root, options.address, options.port)
+    server = GitServer(options.root, options.address, options.port, Handler)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     server.serve_forever(poll_interval=0.2)
 

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ class Pod:
         """Lay out the volumes and run what comes before the client."""
         config, self.deployment = yaml.safe_load_all(manifest)
         self._spec = self.deployment["spec"]["template"]["spec"]
-        self._folder = folder
+        self.folder = folder
         for volume in self._spec["volumes"]:
             place = folder / volume["name"]
             place.mkdir(parents=True)
@@ -120,7 +121,7 @@ class Pod:
     def path(self, container: dict[str, Any], text: str) -> str:
         """Return ``text`` with the container's mount points made this pod's folders."""
         for mount in container["volumeMounts"]:
-            text = text.replace(f"{mount['mountPath']}", str(self._folder / mount["name"]))
+            text = text.replace(f"{mount['mountPath']}", str(self.folder / mount["name"]))
         return text
 
     def _run(self, container: dict[str, Any], command: list[str]) -> str:
@@ -134,6 +135,7 @@ class Pod:
         assert done.returncode == 0, done.stderr
         return done.stdout
 
+    @cached_property
     def parameters(self) -> dict[str, Any]:
         """Return the client's parameters as the real rcl reads them from its arguments."""
         (container,) = self._spec["containers"]

@@ -36,7 +36,7 @@ DEMAND: dict[str, Any] = {
 Ends = dict[str, Pod]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def manifests(broker: Broker) -> dict[str, str]:
     """Return the manifests of both ends by side."""
     repo = MemoryRepo({"inventory/brokers.yaml": broker.inventory()})
@@ -49,14 +49,17 @@ def manifests(broker: Broker) -> dict[str, str]:
     }
 
 
-@pytest.fixture
-def pods(manifests: dict[str, str], broker: Broker, tmp_path: Path) -> Ends:
+@pytest.fixture(scope="module")
+def pods(
+    manifests: dict[str, str], broker: Broker, tmp_path_factory: pytest.TempPathFactory
+) -> Ends:
     """Return both pods, their init containers done."""
     secrets = {
         "broker-ca": {"ca.crt": broker.authority.read_text()},
         "broker-login": {"username": USER + "\n", "password": PASSWORD},
     }
-    return {side: Pod(text, secrets, tmp_path / side) for side, text in manifests.items()}
+    folder = tmp_path_factory.mktemp("pods")
+    return {side: Pod(text, secrets, folder / side) for side, text in manifests.items()}
 
 
 @pytest.fixture
@@ -65,7 +68,7 @@ def connect(pods: Ends) -> Iterator[Callable[..., Client]]:
     opened: list[Client] = []
 
     def client(side: str, **changed: Any) -> Client:
-        opened.append(Client(pods[side].parameters() | changed))
+        opened.append(Client(pods[side].parameters | changed))
         return opened[-1]
 
     yield client
@@ -136,10 +139,8 @@ def test_neither_name_nor_password_is_in_what_git_holds(manifests: dict[str, str
         assert "fleet 007" not in text
 
 
-def test_what_the_init_container_writes_is_for_the_pods_user_alone(
-    pods: Ends, tmp_path: Path
-) -> None:
+def test_what_the_init_container_writes_is_for_the_pods_user_alone(pods: Ends) -> None:
     assert pods
-    for side in pods:
-        mode = (tmp_path / side / "credentials" / "params.yaml").stat().st_mode
+    for pod in pods.values():
+        mode = (pod.folder / "credentials" / "params.yaml").stat().st_mode
         assert stat.S_IMODE(mode) == 0o600

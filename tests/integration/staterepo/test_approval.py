@@ -16,27 +16,12 @@ import pytest
 import yaml
 from demandops.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
 from demandops.service import Ticket
-from demandops.service.approvals import approvals
 
-from tests.kit import rig
+from tests.kit import goals, rig
 from tests.kit.generator import Proposed
-from tests.kit.git_over_http import serving
+from tests.kit.git_over_http import Server
 from tests.kit.repo import Person, branches
 from tests.kit.rig import Gate, git, goal, leave
-
-
-@pytest.fixture(autouse=True)
-def _eager(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have branches looked at often."""
-    monkeypatch.setattr(approvals, "CHECK_EMBEDDED_S", 0.05)
-    monkeypatch.setattr(approvals, "CHECK_REMOTE_S", 0.1)
-
-
-@pytest.fixture
-def petra(bare: Path, tmp_path: Path) -> Person:
-    made = Person(bare, tmp_path / "petra")
-    made.policy(approval="required")
-    return made
 
 
 def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_it(
@@ -67,19 +52,20 @@ Way = Callable[[Person, str], None]
 
 
 @pytest.mark.parametrize(
-    "way",
+    ("way", "moved"),
     [
-        pytest.param(lambda p, b: p.merge(b, "--ff"), id="fast-forward"),
-        pytest.param(lambda p, b: p.merge(b, "--no-ff", "-m", "Merge it"), id="merge-commit"),
-        pytest.param(lambda p, b: p.squash(b, "Squashed, and its trailers lost"), id="squash"),
+        pytest.param(lambda p, b: p.merge(b, "--ff"), False, id="fast-forward"),
+        pytest.param(lambda p, b: p.merge(b, "--no-ff", "-m", "Merge it"), True, id="merge-commit"),
+        pytest.param(lambda p, b: p.squash(b, "Its trailers are lost"), True, id="squash"),
         pytest.param(
             lambda p, b: p.squash(b, f"Squashed\n\n{git(p.bare, 'log', '-1', '--format=%B', b)}"),
+            False,
             id="squash-with-trailers",
         ),
-        pytest.param(Person.rebase, id="rebase"),
+        pytest.param(Person.rebase, False, id="rebase"),
+        pytest.param(Person.rebase, True, id="rebase-main-moved-on"),
     ],
 )
-@pytest.mark.parametrize("moved", [False, True], ids=["same-main", "main-moved-on"])
 def test_however_it_is_merged_the_demand_is_booked_and_the_files_fit(
     bare: Path, petra: Person, way: Way, moved: bool
 ) -> None:
@@ -159,14 +145,14 @@ def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
         assert not waiting.future.done()
 
 
-def test_a_proposal_outlives_the_generator(address: str, bare: Path, petra: Person) -> None:
-    with rig.running(address) as generator:
+def test_a_proposal_outlives_the_generator(url: str, bare: Path, petra: Person) -> None:
+    with rig.running(url) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         branch = proposed.branch
         stands = git(bare, "rev-parse", branch)
     with pytest.raises(ShuttingDown):
         rig.receipt(proposed.ticket)
-    with rig.running(address) as generator:
+    with rig.running(url) as generator:
         again = Proposed(generator, goal(2), "op-2")  # behind it: the first was looked at
         other = again.branch
         assert sorted(branches(bare)) == sorted([branch, other])
@@ -176,14 +162,14 @@ def test_a_proposal_outlives_the_generator(address: str, bare: Path, petra: Pers
 
 
 def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
-    address: str, bare: Path, petra: Person
+    url: str, bare: Path, petra: Person
 ) -> None:
-    with rig.running(address) as generator:
+    with rig.running(url) as generator:
         taken, refused = (Proposed(generator, goal(n), f"op-{n}") for n in (1, 2))
         yes, no = taken.branch, refused.branch
     petra.merge(yes)
     petra.delete(no)
-    with rig.running(address) as generator:
+    with rig.running(url) as generator:
         rig.wait_until(lambda: branches(bare) == [], "the merged branch is taken away")
         rig.wait_until(lambda: generator.operations == (), "both are answered")
     assert rig.books(bare) == rig.books_after([goal(1)])
@@ -294,29 +280,9 @@ def test_a_release_right_behind_the_demand_leaves_no_branch(bare: Path, petra: P
             rig.receipt(held)
 
 
-def put(demand: str, vehicle: int, lease: int | None = None, who: str = "user") -> Any:
-    made = {
-        "apiVersion": "demandops/v1",
-        "kind": "Demand",
-        "demand": demand,
-        "requesters": [who],
-        "applications": [
-            {
-                "id": f"edge/{demand}",
-                "type": "object-detection-fusion",
-                "node": "edge",
-                "inputs": {
-                    "ego_data": [
-                        {
-                            "topic": f"/vehicles/vehicle{vehicle:02}/ego_data",
-                            "source": f"vehicle{vehicle:02}",
-                        }
-                    ]
-                },
-            }
-        ],
-    }
-    return made | ({"lease": lease} if lease else {})
+def put(demand: str, vehicle: int, who: str = "user", **more: Any) -> Any:
+    name = f"vehicle{vehicle:02}"
+    return goals.put(demand, who, topic=(f"/vehicles/{name}/ego_data", name), **more)
 
 
 def test_a_put_of_the_same_demand_replaces_the_proposal(bare: Path, petra: Person) -> None:
@@ -336,23 +302,9 @@ def test_a_put_of_the_same_demand_replaces_the_proposal(bare: Path, petra: Perso
     assert "vehicle01" not in git(bare, "show", f"main:{claim}")
 
 
-def test_giving_up_and_renewing_need_no_approval(bare: Path, petra: Person) -> None:
-    petra.policy(approval="none")
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1), put("d", 1, 600))
-        petra.policy(approval="required")
-        renew = {"demand": "d", "operation": "renew", "requesters": ["user"]}
-        head = {"apiVersion": "demandops/v1", "kind": "Demand"}
-        assert rig.book(generator, head | renew)[0].outcome in ("booked", "unchanged")
-        assert rig.book(generator, put("d", 1, 900))[0].outcome == "booked", "a longer lease"
-        assert rig.book(generator, goal(1))[0].outcome == "unchanged"
-        assert rig.book(generator, leave(1))[0].outcome == "released"
-        assert branches(bare) == []
-
-
 def test_a_lease_counts_from_the_merge(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
-        proposed = Proposed(generator, put("d", 1, 600), "op-1")
+        proposed = Proposed(generator, put("d", 1, lease=600), "op-1")
         branch = proposed.branch
         names = git(bare, "ls-tree", "-r", "--name-only", branch, "ledger/applications/")
         path = next(line for line in names.splitlines() if line.endswith(".yaml"))
@@ -420,16 +372,15 @@ def hooked(bare: Path) -> Iterator[Path]:
     """Where a server's hook writes the push options that reach it."""
     git(bare, "config", "receive.advertisePushOptions", "true")
     log = bare / "options"
-    hook = bare / "hooks" / "pre-receive"
-    hook.parent.mkdir(exist_ok=True)
-    hook.write_text(
-        '#!/bin/sh\nread old new ref\necho "$ref" >> options\ni=0\n'
+    rig.hook(
+        bare,
+        "pre-receive",
+        'read old new ref\necho "$ref" >> options\ni=0\n'
         'while [ "$i" -lt "${GIT_PUSH_OPTION_COUNT:-0}" ]; do\n'
         '  eval "echo \\"  \\$GIT_PUSH_OPTION_$i\\"" >> options\n  i=$((i+1))\ndone\n'
         'case "$ref" in refs/heads/demand/*) echo "View merge request for $ref:"\n'
-        'echo "  https://git.example.org/its/state/-/merge_requests/7";; esac\n'
+        'echo "  https://git.example.org/its/state/-/merge_requests/7";; esac',
     )
-    hook.chmod(0o755)
     yield log
 
 
@@ -472,10 +423,7 @@ def test_a_server_that_takes_no_push_options_gets_the_branch_without(
 def test_a_server_that_refuses_the_branch_is_told_to_the_requester(
     url: str, bare: Path, petra: Person
 ) -> None:
-    hook = bare / "hooks" / "pre-receive"
-    hook.parent.mkdir(exist_ok=True)
-    hook.write_text("#!/bin/sh\necho 'no branches here' >&2\nexit 1\n")
-    hook.chmod(0o755)
+    rig.hook(bare, "pre-receive", "echo 'no branches here' >&2; exit 1")
     refused = pytest.raises(StateRepoError, match=r"rejects the push: .*no branches here")
     with rig.running(url) as generator, refused:
         rig.receipt(generator.submit(goal(1)))
@@ -506,12 +454,12 @@ def test_killed_while_proposing_there_is_one_branch_after_the_restart(
 
 
 def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the_restart(
-    drivers: rig.Drivers, address: str, bare: Path, petra: Person
+    drivers: rig.Drivers, url: str, bare: Path, petra: Person
 ) -> None:
     lanes = [[rig.demand("leave", leave(1))]]
     opening = rig.demand("join", goal(1))
-    drivers.start(address, lanes, opening=opening, die_at="retracting").listen()
-    with rig.running(address) as generator:
+    drivers.start(url, lanes, opening=opening, die_at="retracting").listen()
+    with rig.running(url) as generator:
         rig.wait_until(lambda: not branches(bare), "the branch is deleted")
         rig.wait_until(lambda: generator.operations == (), "both are answered")
     assert rig.claims(bare) == []
@@ -530,9 +478,9 @@ def test_two_generators_that_take_one_demand_agree_once_it_is_merged(
 
 
 def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
-    bare: Path, petra: Person
+    http: str, server: Server, bare: Path, petra: Person
 ) -> None:
-    with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
+    with rig.running(http) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
         server.faults.away = True
@@ -544,8 +492,10 @@ def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
         assert branches(bare) == []
 
 
-def test_a_push_whose_answer_got_lost_makes_no_second_branch(bare: Path, petra: Person) -> None:
-    with serving(bare.parent) as server, rig.running(f"{server.url}/state.git") as generator:
+def test_a_push_whose_answer_got_lost_makes_no_second_branch(
+    http: str, server: Server, bare: Path, petra: Person
+) -> None:
+    with rig.running(http) as generator:
         server.faults.cut_answers = 1
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
@@ -606,26 +556,24 @@ def test_a_proposal_passes_the_check_of_pull_requests(
     from demandops.cli.main import run
 
     with rig.running(bare) as generator:
-        branch = Proposed(generator, put("d", 1, 600)).branch
+        branch = Proposed(generator, put("d", 1, lease=600)).branch
     petra.fetch()
     git(petra.folder, "checkout", "--quiet", f"origin/{branch}")
     assert run(["check", str(petra.folder)]) == 0, capsys.readouterr()
 
 
 def test_one_cancelled_right_before_a_crash_is_taken_away_at_the_restart(
-    bare: Path, petra: Person
+    http: str, server: Server, bare: Path, petra: Person
 ) -> None:
     """The withdrawal is on the disk before anything else; its branch is not to be merged."""
-    with serving(bare.parent) as server:
-        address = f"{server.url}/state.git"
-        with rig.running(address) as generator:
-            proposed = Proposed(generator, goal(1), "op-1")
-            assert [proposed.branch] == branches(bare)
-            server.faults.away = True
-            assert generator.withdraw("op-1") is True
-            generator.close(timeout=0)
-        server.faults.away = False
-        assert len(branches(bare)) == 1
-        with rig.running(address):
-            rig.wait_until(lambda: branches(bare) == [], "the branch is deleted")
+    with rig.running(http) as generator:
+        proposed = Proposed(generator, goal(1), "op-1")
+        assert [proposed.branch] == branches(bare)
+        server.faults.away = True
+        assert generator.withdraw("op-1") is True
+        generator.close(timeout=0)
+    server.faults.away = False
+    assert len(branches(bare)) == 1
+    with rig.running(http):
+        rig.wait_until(lambda: branches(bare) == [], "the branch is deleted")
     assert rig.claims(bare) == []

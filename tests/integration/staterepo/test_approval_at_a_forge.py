@@ -14,13 +14,13 @@ from urllib.parse import parse_qs, urlparse
 
 import pytest
 from demandops.errors import TurnedDown, Withdrawn
-from demandops.service.approvals import approvals, forge_worker
+from demandops.service.approvals import forge_worker
 
 from tests.kit import rig
 from tests.kit.generator import Proposed
 from tests.kit.http import Answer, Call, serving
 from tests.kit.repo import Person, branches
-from tests.kit.rig import git, goal
+from tests.kit.rig import goal
 
 TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
 
@@ -67,25 +67,21 @@ def hub() -> Iterator[Hub]:
 
 
 @pytest.fixture
-def petra(hub: Hub, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Person:
-    monkeypatch.setattr(approvals, "CHECK_EMBEDDED_S", 0.05)
-    monkeypatch.setattr(approvals, "CHECK_REMOTE_S", 0.1)
+def petra(hub: Hub, petra: Person, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Person:
     monkeypatch.setattr(forge_worker, "POLL_S", 0.05)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     (tmp_path / "token").write_text(TOKEN)
     monkeypatch.setenv("DEMANDOPS_FORGE_TOKEN_FILE", str(tmp_path / "token"))
-    made = Person(bare, tmp_path / "petra")
-    made.policy(approval="required")
-    root = git(bare, "show", "main:demandops.yaml")
+    root = petra.read("demandops.yaml")
     where = f"forge: github, url: 'https://github.com/its/state', api: '{hub.url}'"
-    made.change({"demandops.yaml": f"{root}\nproposals: {{{where}}}\n"})
-    return made
+    petra.change({"demandops.yaml": f"{root}\nproposals: {{{where}}}\n"})
+    return petra
 
 
 def test_a_pull_request_is_opened_and_its_link_told(
-    hub: Hub, address: str, bare: Path, petra: Person
+    hub: Hub, url: str, bare: Path, petra: Person
 ) -> None:
-    with rig.running(address) as generator:
+    with rig.running(url) as generator:
         proposed = Proposed(generator, goal(1))
         branch = proposed.branch
         [pull] = hub.pulls

@@ -15,10 +15,7 @@ def pushes(bare: Path) -> Path:
     """A file with a line for each push that the remote took."""
     log = bare / "pushes"
     log.touch()
-    hook = bare / "hooks" / "post-receive"
-    hook.parent.mkdir(exist_ok=True)
-    hook.write_text(f"#!/bin/sh\ncat >> {log}\n")
-    hook.chmod(0o755)
+    rig.hook(bare, "post-receive", f"cat >> {log}")
     return log
 
 
@@ -79,11 +76,9 @@ def test_a_refused_demand_in_a_batch_stops_none_of_the_others(
     rig.assert_sound(bare)
 
 
-def test_a_batch_is_judged_in_order_a_release_behind_its_join_finds_it(
-    address: str, bare: Path
-) -> None:
+def test_a_batch_is_judged_in_order_a_release_behind_its_join_finds_it(bare: Path) -> None:
     gate = Gate()
-    with rig.running(address) as generator:
+    with rig.running(bare) as generator:
         generator.submit(goal(0), listener=gate)
         assert gate.reached.wait(rig.PATIENCE_S)
         tickets = [generator.submit(made) for made in (goal(1), goal(1), leave(1), goal(1))]

@@ -17,20 +17,14 @@ from demandops.service import Generator
 from demandops.staterepo.load import state_in_effect
 
 from tests.kit import rig
+from tests.kit.config import override
 from tests.kit.repo import read as text
 from tests.kit.rig import Person, goal, leave
 
 NODES, IMAGES = "inventory/nodes.yaml", "registry/images.yaml"
 DETECTION = "clusters/c-its/perception/edge/od-edge-station00.yaml"
-TWO = """\
-apiVersion: demandops/v1
-kind: Override
-reason: Two for each point cloud
-owner: petra
-select: [{services: [object-detection], nodes: [edge]}]
-replicas: 2
-"""
-BROKEN = TWO.replace("replicas: 2", "replicas: many").replace("object-detection", "object-fusion")
+TWO = override({"services": ["object-detection"], "nodes": ["edge"]}, replicas=2)
+BROKEN = override({"services": ["object-fusion"], "nodes": ["edge"]}, replicas="many")
 
 
 def replicas(bare: Path) -> Any:
@@ -132,9 +126,7 @@ def test_a_node_in_use_that_is_taken_away_stays_while_something_is_broken(
         person.change({"overrides/broken.yaml": BROKEN})
         person.change({"overrides/two.yaml": TWO})
         rig.book(generator, goal(2))
-        nodes = text(bare, NODES) + "\n"
-        start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
-        person.change({NODES: nodes[:start] + nodes[end:]})
+        person.change(rig.without_vehicle01(bare))
         rig.book(generator, goal(3))
         assert replicas(bare) == 2
     with rig.running(bare) as generator:
@@ -168,7 +160,11 @@ def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
     start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
     claim = random.choice([path for path in rig.claims(bare) if "applications" in path])
     changes: list[dict[str, str | None]] = [
-        {"overrides/two.yaml": TWO.replace("2", str(random.randint(2, 9)))},
+        {
+            "overrides/two.yaml": TWO.replace(
+                "replicas: 2", "replicas: " + str(random.randint(2, 9))
+            )
+        },
         {"overrides/broken.yaml": BROKEN},
         {"overrides/broken.yaml": BROKEN.replace("many", "3")},
         {IMAGES: tagged(bare, f"v{random.randint(1, 9)}")},

@@ -13,8 +13,6 @@ from tests.kit import rig
 from tests.kit.cli import Run
 from tests.kit.rig import Person, goal, leave
 
-NODES = "inventory/nodes.yaml"
-
 
 def of(generator: Generator, subject: str) -> list[str]:
     """Who holds a subject, one text for each claim."""
@@ -47,13 +45,11 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
             ("Application", "edge/fusion-1"),
             ("Connection", "vehicle01/edge"),
             ("Request-Id", "vehicle01"),
-            ("Render-Version", "1"),
+            ("Render-Version", "2"),
         ]
         author = rig.git(bare, "log", "-1", "--format=%an <%ae> %cn", commit.id)
         assert author == "Petra Platform <petra@example.org> DemandOps generator"
-        nodes = rig.git(bare, "show", f"main:{NODES}") + "\n"
-        start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
-        made = person.change({NODES: nodes[:start] + nodes[end:]}, "vehicle01 is sold")
+        made = person.change(rig.without_vehicle01(bare), "vehicle01 is sold")
         person.fetch()
         assert demandops("check", tmp_path / "person")[0] == 0
         rig.wait_until(
@@ -196,11 +192,10 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
 
     generator = Generator(url)
     rig.book(generator, goal(1))
-    away = bare.rename(bare.with_name("away.git"))
     leaving = Decommission("vehicle01", kinds=frozenset({"node"}))
-    generator.submit(leaving.goal(), "op-leave")
-    assert generator.close(timeout=0.3) is False
-    away.rename(bare)
+    with rig.away(bare):
+        generator.submit(leaving.goal(), "op-leave")
+        assert generator.close(timeout=0.3) is False
     assert rig.restart(url) is True
     assert rig.operations(bare)[-1] == "op-leave"
     assert rig.commits(bare)[-1].one("Node") == "vehicle01"

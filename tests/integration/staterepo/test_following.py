@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from collections.abc import Iterator
 from concurrent.futures import TimeoutError as NotAnswered
 from pathlib import Path
 
@@ -22,8 +21,8 @@ from demandops.service import Generator
 from demandops.staterepo.load import problem_report
 from demandops.staterepo.write.journal import Journal
 
-from tests.kit import rig
-from tests.kit.git_over_http import Server, serving
+from tests.kit import goals, rig
+from tests.kit.git_over_http import Server
 from tests.kit.repo import read as file_of
 from tests.kit.rig import Person, Stages, goal, leave
 
@@ -34,28 +33,11 @@ SOON_S = 0.1
 
 
 @pytest.fixture
-def server(bare: Path) -> Iterator[Server]:
-    with serving(bare.parent) as running:
-        yield running
-
-
-@pytest.fixture
-def http(server: Server) -> str:
-    return f"{server.url}/state.git"
-
-
-@pytest.fixture
 def place(request: pytest.FixtureRequest, bare: Path) -> str:
     """The same state repo by all three ways."""
     if request.param == "embedded":
         return str(bare)
     return bare.as_uri() if request.param == "file-url" else request.getfixturevalue("http")
-
-
-def without_vehicle01(bare: Path) -> dict[str, str | None]:
-    nodes = file_of(bare, NODES)
-    start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
-    return {NODES: nodes[:start] + nodes[end:]}
 
 
 def claim_of(bare: Path, who: str) -> str:
@@ -120,7 +102,6 @@ CHANGES = {
     "deleted-claim": ("embedded", _delete_claim, lambda text: "user1" not in text),
     "edited-claim": ("file-url", _edit_claim, lambda text: "/another/topic" in text),
     "moved-node": ("http", _move_node, lambda text: "garage" in text),
-    "moved-broker": ("embedded", _move_broker, lambda text: "elsewhere" in text),
     "bumped-chart": ("file-url", _bump_chart, lambda text: "9.8.7" in text),
 }
 """Each by one of the three ways, because what a change leads to does not depend on them."""
@@ -173,17 +154,11 @@ def _appdef_in_use_gone(bare: Path) -> dict[str, str | None]:
     return {APPDEF: None}
 
 
-def _no_version(bare: Path) -> dict[str, str | None]:
-    return {CHARTS: file_of(bare, CHARTS).replace("    version:", "    verison:")}
-
-
 BREAKS = {
     "claim-that-does-not-parse": ("embedded", _break_claim, "ledger/applications/"),
     "claim-on-an-unknown-node": ("file-url", _claim_on_no_node, "ledger/applications/"),
-    "node-on-an-unknown-cluster": ("embedded", _node_on_no_cluster, NODES),
-    "node-in-use-gone": ("file-url", without_vehicle01, NODES),
+    "node-in-use-gone": ("file-url", rig.without_vehicle01, NODES),
     "appdef-in-use-gone": ("embedded", _appdef_in_use_gone, APPDEF),
-    "misspelt-registry": ("file-url", _no_version, CHARTS),
 }
 
 
@@ -390,16 +365,15 @@ def test_all_that_waits_while_the_remote_is_away_survives_a_kill(
     """More than go into one push: those behind it are on the disk as well."""
     many = 250
     rig.restart(url)  # makes the clone
-    away = bare.rename(bare.with_name("away.git"))
-    lanes = [[rig.demand(f"{n}", goal(n % 3))] for n in range(many)]
-    run = drivers.start(url, lanes)
-    journal = settings.data_home(url) / "slot-0" / "outbox.jsonl"
-    watcher = threading.Thread(target=run.listen)
-    watcher.start()
-    rig.wait_until(lambda: len(_kept(journal)) == many, "all are in the outbox")
-    run.kill()
-    watcher.join()
-    away.rename(bare)
+    with rig.away(bare):
+        lanes = [[rig.demand(f"{n}", goal(n % 3))] for n in range(many)]
+        run = drivers.start(url, lanes)
+        journal = settings.data_home(url) / "slot-0" / "outbox.jsonl"
+        watcher = threading.Thread(target=run.listen)
+        watcher.start()
+        rig.wait_until(lambda: len(_kept(journal)) == many, "all are in the outbox")
+        run.kill()
+        watcher.join()
     assert rig.restart(url) is True
     assert rig.books(bare) == rig.books_after(map(goal, range(3)))
     assert Journal(journal).pending == {}
@@ -412,20 +386,7 @@ def _kept(journal: Path) -> list[str]:
 def test_a_lease_that_ends_while_the_remote_is_away_goes_when_it_is_back(
     http: str, server: Server, bare: Path, person: Person
 ) -> None:
-    short = {
-        "kind": "Demand",
-        "demand": "short",
-        "requesters": ["vehicle00"],
-        "lease": 1,
-        "applications": [
-            {
-                "id": "edge/short",
-                "type": "object-detection-fusion",
-                "node": "edge",
-                "inputs": {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]},
-            }
-        ],
-    }
+    short = goals.put("short", lease=1)
     domains = "policy/access-domains.yaml"
     person.change(
         {

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from demandops.staterepo import reader
-from demandops.staterepo.git import repository_choice
+from demandops.staterepo.git.address import connect
 
 from tests.kit import rig
 from tests.kit.rig import Person
@@ -24,7 +24,8 @@ def line(bare: Path, tmp_path: Path) -> list[str]:
 
 
 def test_a_commit_includes_those_before_it(bare: Path, line: list[str]) -> None:
-    with reader.opened(str(bare)) as repo:
+    with reader.opened(str(bare)) as opened:
+        repo = opened.repository
         assert repo.includes(line[2], line[0]) and repo.includes(line[1], line[1])
         assert not repo.includes(line[0], line[1])
         assert not repo.includes("f" * 40, line[0])
@@ -32,7 +33,8 @@ def test_a_commit_includes_those_before_it(bare: Path, line: list[str]) -> None:
 
 def test_a_folder_is_unchanged_where_its_content_is(bare: Path, line: list[str]) -> None:
     first, other, chart = line
-    with reader.opened(str(bare)) as repo:
+    with reader.opened(str(bare)) as opened:
+        repo = opened.repository
         assert repo.unchanged(first, other, CHART)
         assert not repo.unchanged(first, chart, CHART)
         assert not repo.unchanged(first, other, ".")
@@ -43,7 +45,7 @@ def test_a_folder_is_unchanged_where_its_content_is(bare: Path, line: list[str])
 
 
 def test_the_paths_that_differ_are_told(bare: Path, tmp_path: Path, line: list[str]) -> None:
-    repository = repository_choice.connect(str(bare), tmp_path / "data")
+    repository = connect(str(bare), tmp_path / "data")
     assert repository.changed_paths(line[0], line[2]) == [f"{CHART}/notes.txt", "notes.txt"]
     assert repository.changed_paths(line[2], line[2]) == []
     assert repository.changed_paths("", line[2]) is None

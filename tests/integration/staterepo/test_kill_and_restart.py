@@ -114,16 +114,16 @@ def test_killed_at_a_point_each_demand_is_committed_once(
 
 @pytest.mark.parametrize("point", ["journaled", "published"])
 def test_a_demand_that_was_taken_up_again_is_not_taken_up_a_third_time(
-    drivers: Drivers, address: str, bare: Path, point: str, caplog: pytest.LogCaptureFixture
+    drivers: Drivers, url: str, bare: Path, point: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    drivers.start(address, [[demand("join-1", goal(1))]], die_at=point).listen()
+    drivers.start(url, [[demand("join-1", goal(1))]], die_at=point).listen()
     with caplog.at_level("INFO", "demandops"):
-        assert rig.restart(address) is True
+        assert rig.restart(url) is True
     assert "resuming demand op-join-1 from the journal" in caplog.text
     tip = rig.tip(bare)
     caplog.clear()
     with caplog.at_level("INFO", "demandops"):
-        assert rig.restart(address) is True
+        assert rig.restart(url) is True
     assert "from the journal" not in caplog.text
     assert rig.tip(bare) == tip
 
@@ -146,45 +146,45 @@ def test_a_published_join_that_is_replayed_after_its_release_is_skipped(
 
 
 def test_a_release_in_the_same_batch_as_its_join_stays_when_both_are_replayed(
-    drivers: Drivers, address: str, bare: Path
+    drivers: Drivers, url: str, bare: Path
 ) -> None:
     lanes = [[demand("join-1", goal(1))], [demand("leave-1", leave(1))]]
-    drivers.start(address, lanes, opening=demand("join-0", goal(0)), die_at="published:2").listen()
+    drivers.start(url, lanes, opening=demand("join-0", goal(0)), die_at="published:2").listen()
     tip = rig.tip(bare)
     assert rig.operations(bare) == ["op-join-0", "op-join-1", "op-leave-1"]
 
-    assert rig.restart(address) is True
+    assert rig.restart(url) is True
     assert rig.tip(bare) == tip
     assert rig.claims(bare, "user1") == []
 
 
 def test_a_join_that_changed_nothing_before_its_release_is_not_booked_by_a_replay(
-    drivers: Drivers, address: str, bare: Path
+    drivers: Drivers, url: str, bare: Path
 ) -> None:
     """The repeated join has no commit that shows it was dealt with; the release behind it does."""
     opening = demand("join-1", goal(1))
     lanes = [[demand("join-1-again", goal(1))], [demand("leave-1", leave(1))]]
-    drivers.start(address, lanes, opening=opening, die_at="published:2").listen()
+    drivers.start(url, lanes, opening=opening, die_at="published:2").listen()
     assert rig.operations(bare) == ["op-join-1", "op-leave-1"]
     tip = rig.tip(bare)
 
-    assert rig.restart(address) is True
+    assert rig.restart(url) is True
     assert rig.claims(bare) == [], "what was released stands again"
     assert rig.tip(bare) == tip
 
 
 def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
-    drivers: Drivers, address: str, bare: Path
+    drivers: Drivers, bare: Path
 ) -> None:
     """Judged again behind the release, nothing stands in its way any more; in order, it had."""
     elsewhere = goal(1)
     elsewhere["apps"][0]["header"]["node_id"] = "cloud"
     lanes = [[demand("join-elsewhere", elsewhere)], [demand("leave-1", leave(1))]]
     opening = demand("join-1", goal(1))
-    drivers.start(address, lanes, opening=opening, die_at="published:2").listen()
+    drivers.start(bare, lanes, opening=opening, die_at="published:2").listen()
     assert rig.operations(bare) == ["op-join-1", "op-leave-1"]
 
-    assert rig.restart(address) is True
+    assert rig.restart(bare) is True
     assert rig.claims(bare) == [], "its requester has left since"
 
 
@@ -240,13 +240,11 @@ def test_a_clone_cut_off_half_way_is_made_anew(url: str, bare: Path, data_home: 
 
 def _leave_pending(url: str, bare: Path, numbers: list[int]) -> None:
     """Have a generator accept demands that it cannot publish, and end."""
-    away = bare.with_name("away.git")
     generator = Generator(url)
-    bare.rename(away)
-    for number in numbers:
-        generator.submit(goal(number), f"op-{number}")
-    assert generator.close(timeout=0) is False
-    away.rename(bare)
+    with rig.away(bare):
+        for number in numbers:
+            generator.submit(goal(number), f"op-{number}")
+        assert generator.close(timeout=0) is False
 
 
 def _torn(text: bytes) -> bytes:
@@ -255,9 +253,6 @@ def _torn(text: bytes) -> bytes:
 
 def _of_the_first_version(text: bytes) -> bytes:
     return re.sub(rb', "digest": "\w+"', b"", text)
-
-
-TAKEN_UP: list[Callable[[bytes], bytes]] = [bytes, _torn, _of_the_first_version]
 
 
 def _leave_journal(url: str, bare: Path, data_home: Path, whose: str) -> Path:
@@ -271,8 +266,9 @@ def _leave_journal(url: str, bare: Path, data_home: Path, whose: str) -> Path:
     return journal.rename(slot / journal.name)
 
 
-@pytest.mark.parametrize("change", TAKEN_UP, ids=lambda change: change.__name__.strip("_"))
-@pytest.mark.parametrize("whose", ["own", "orphan"])
+@pytest.mark.parametrize(
+    ("whose", "change"), [("orphan", bytes), ("own", _torn), ("own", _of_the_first_version)]
+)
 def test_a_journal_is_taken_up_as_a_crash_left_it(
     url: str, bare: Path, data_home: Path, change: Callable[[bytes], bytes], whose: str
 ) -> None:

@@ -12,11 +12,10 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
-import yaml
 from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.errors import DemandOpsError
 
-from tests.kit import rig
+from tests.kit import config, rig
 from tests.kit.rig import Person
 
 STEPS = 25
@@ -25,13 +24,11 @@ Write = Callable[[random.Random], str]
 
 
 def override(select: dict[str, object], **effects: object) -> Write:
-    head = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "chance", "owner": "petra"}
-
     def write(chance: random.Random) -> str:
         drawn = {
             name: value(chance) if callable(value) else value for name, value in effects.items()
         }
-        return yaml.safe_dump(head | {"select": [select]} | drawn)
+        return config.override(select, **drawn)
 
     return write
 

@@ -17,6 +17,7 @@ import yaml
 from demandops.service import Generator
 
 from tests.kit import rig
+from tests.kit.config import override
 from tests.kit.repo import read as text
 from tests.kit.rig import Person
 
@@ -27,15 +28,8 @@ EDGE = "clusters/c-its/perception/edge"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"
 FUSION = f"{EDGE}/of-edge-fusion-1-118f66a66700.yaml"
 FUSION_2 = f"{EDGE}/of-edge-fusion-2-0eb2168b8c74.yaml"
-OVERRIDE = """\
-apiVersion: demandops/v1
-kind: Override
-reason: Two for each point cloud
-owner: petra
-select: [{services: [object-detection], nodes: [edge]}]
-replicas: 2
-"""
-BROKEN = OVERRIDE.replace("replicas: 2", "replicas: many").replace("detection]", "fusion]")
+OVERRIDE = override({"services": ["object-detection"], "nodes": ["edge"]}, replicas=2)
+BROKEN = override({"services": ["object-fusion"], "nodes": ["edge"]}, replicas="many")
 REPORT = ".demandops/reports/problems.yaml"
 
 

@@ -2,35 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from demandops.errors import QueueFull, Refused, ShuttingDown, StateRepoError, Withdrawn
+from demandops.errors import Refused, ShuttingDown, StateRepoError
 from demandops.service import Generator
 
 from tests.kit import rig
-from tests.kit.rig import Gate, Stages, goal, leave
-
-
-@contextmanager
-def away(bare: Path) -> Iterator[None]:
-    """The remote's folder is somewhere else for the length of a block."""
-    elsewhere = bare.rename(bare.with_name("away.git"))
-    try:
-        yield
-    finally:
-        elsewhere.rename(bare)
-
-
-def _hook(bare: Path, name: str, script: str) -> Path:
-    path = bare / "hooks" / name
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(f"#!/bin/sh\n{script}\n")
-    path.chmod(0o755)
-    return path
-
+from tests.kit.rig import Gate, Stages, goal
 
 # ---- away and back ----
 
@@ -40,7 +19,7 @@ def test_goals_stay_open_while_the_remote_is_away_and_are_published_once_it_is_b
 ) -> None:
     with rig.running(url) as generator:
         rig.book(generator, goal(0))
-        with away(bare):
+        with rig.away(bare):
             stages = Stages()
             tickets = [generator.submit(goal(1), listener=stages)]
             rig.wait_until(lambda: "committed" in stages.names, "the first demand is committed")
@@ -56,32 +35,16 @@ def test_goals_stay_open_while_the_remote_is_away_and_are_published_once_it_is_b
     rig.assert_sound(bare)
 
 
-def test_closing_while_the_remote_is_away_leaves_the_demands_to_the_next_start(
-    url: str, bare: Path
-) -> None:
-    generator = Generator(url)
-    with away(bare):
-        tickets = [generator.submit(goal(number), f"op-{number}") for number in range(3)]
-        assert generator.close(timeout=0.3) is False
-        for ticket in tickets:
-            with pytest.raises(ShuttingDown, match="stays in the journal"):
-                ticket.future.result(0)
-    assert rig.operations(bare) == []
-    assert rig.restart(url) is True
-    assert rig.operations(bare) == ["op-0", "op-1", "op-2"], "in the order in which they came"
-    assert rig.books(bare) == rig.books_after(map(goal, range(3)))
-    rig.assert_sound(bare)
-
-
 def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     generator = Generator(url)
     rig.book(generator, goal(0))
-    with away(bare):
+    with rig.away(bare):
         left = generator.submit(goal(1), "op-1")
         assert generator.close(timeout=0.3) is False
-        assert isinstance(left.future.exception(0), ShuttingDown)
+        with pytest.raises(ShuttingDown, match="stays in the journal"):
+            left.future.result(0)
         with pytest.raises(StateRepoError, match="cannot be fetched"):
             Generator(url, start_offline=False)
         generator = Generator(url)
@@ -101,7 +64,7 @@ def test_what_waits_in_the_outbox_is_judged_on_what_the_remote_has_become(
 ) -> None:
     """A join waits; meanwhile another generator books the same, and somebody takes a claim away."""
     generator = Generator(url)
-    with away(bare):
+    with rig.away(bare):
         generator.submit(goal(1), "op-1")
         generator.submit(goal(2), "op-2")
         generator.close(timeout=0)
@@ -129,37 +92,6 @@ def test_a_demand_that_the_new_tip_makes_impossible_is_refused_with_the_reason(
     rig.assert_sound(bare)
 
 
-def test_a_demand_taken_back_while_the_remote_is_away_is_answered_and_never_published(
-    url: str, bare: Path
-) -> None:
-    gate = Gate()
-    generator = Generator(url)
-    with away(bare):
-        generator.submit(goal(1), "op-1", gate)
-        assert gate.reached.wait(rig.PATIENCE_S)
-        ticket = generator.submit(goal(2), "op-2")
-        assert generator.withdraw("op-2") is True
-        gate.open.set()
-        with pytest.raises(Withdrawn):
-            ticket.future.result(5)
-        generator.close(timeout=0)
-    assert rig.restart(url) is True
-    assert rig.operations(bare) == ["op-1"]
-
-
-def test_more_demands_than_may_wait_are_not_kept_while_the_remote_is_away(
-    url: str, bare: Path
-) -> None:
-    tickets = []
-    with rig.running(url, queue_limit=5) as generator:
-        with away(bare), pytest.raises(QueueFull):
-            for number in range(500):
-                tickets.append(generator.submit(goal(number)))
-        for ticket in tickets:
-            assert rig.receipt(ticket).outcome == "booked", "what was taken is not lost"
-    assert rig.books(bare) == rig.books_after(map(goal, range(len(tickets))))
-
-
 def test_without_a_clone_a_remote_that_is_away_is_told_at_once(bare: Path) -> None:
     with pytest.raises(StateRepoError) as error:
         Generator(bare.with_name("nothing.git").as_uri())
@@ -177,7 +109,7 @@ def test_a_declined_push_fails_the_demand_with_the_hooks_words_and_leaves_no_tra
 ) -> None:
     with rig.running(url) as generator:
         rig.book(generator, goal(0))
-        hook = _hook(bare, name, "echo 'main is frozen until Monday' >&2; exit 1")
+        hook = rig.hook(bare, name, "echo 'main is frozen until Monday' >&2; exit 1")
         with pytest.raises(StateRepoError, match="main is frozen until Monday"):
             rig.receipt(generator.submit(goal(1), "op-denied"))
         hook.unlink()
@@ -195,7 +127,7 @@ def test_a_declined_push_is_told_to_all_of_its_batch_but_not_to_those_refused_be
     url: str, bare: Path
 ) -> None:
     gate = Gate()
-    hook = _hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
+    hook = rig.hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
     with rig.running(url) as generator:
         tickets = [generator.submit(goal(1), listener=gate)]
         assert gate.reached.wait(rig.PATIENCE_S)
@@ -211,17 +143,6 @@ def test_a_declined_push_is_told_to_all_of_its_batch_but_not_to_those_refused_be
         rig.book(generator, goal(4))
     assert rig.books(bare) == rig.books_after([goal(4)])
     rig.assert_sound(bare)
-
-
-def test_a_declined_release_leaves_what_is_held(url: str, bare: Path) -> None:
-    with rig.running(url) as generator:
-        rig.book(generator, goal(1))
-        hook = _hook(bare, "pre-receive", "exit 1")
-        with pytest.raises(StateRepoError, match="rejects the push"):
-            rig.book(generator, leave(1))
-        assert len(rig.claims(bare, "user1")) == 2
-        hook.unlink()
-        assert rig.book(generator, leave(1))[0].outcome == "released"
 
 
 @pytest.mark.limit(15)

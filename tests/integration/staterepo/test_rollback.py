@@ -17,8 +17,8 @@ def goal_of(to: str, *, drop_newer: bool) -> dict[str, object]:
     return rollback_goal.goal(to, drop_newer=drop_newer, reason="a test", who=who)
 
 
-def test_it_is_judged_on_what_others_booked_meanwhile(address: str, bare: Path) -> None:
-    with rig.running(address) as one, rig.running(address) as other:
+def test_it_is_judged_on_what_others_booked_meanwhile(url: str, bare: Path) -> None:
+    with rig.running(url) as one, rig.running(url) as other:
         rig.book(one, rig.goal(1))
         then = rig.tip(bare)
         rig.book(other, rig.goal(2))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,33 +14,6 @@ from tests.kit import rig
 from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server, serving
 from tests.kit.rig import Gate, goal, leave
-
-
-@pytest.fixture
-def server(bare: Path) -> Iterator[Server]:
-    with serving(bare.parent) as running:
-        yield running
-
-
-@pytest.fixture
-def http(server: Server) -> str:
-    return f"{server.url}/state.git"
-
-
-def test_demands_over_http_are_published_one_commit_each(
-    http: str, server: Server, bare: Path
-) -> None:
-    gate = Gate()
-    with rig.running(http) as generator:
-        first = generator.submit(goal(0), listener=gate)
-        assert gate.reached.wait(rig.PATIENCE_S)
-        rest = [generator.submit(made) for made in (goal(1), goal(2), leave(1), goal(3))]
-        gate.open.set()
-        outcomes = [rig.receipt(ticket).outcome for ticket in (first, *rest)]
-    assert outcomes == ["booked", "booked", "booked", "released", "booked"]
-    assert server.taken == 2
-    assert rig.books(bare) == rig.books_after(map(goal, (0, 2, 3)))
-    rig.assert_sound(bare)
 
 
 def test_an_answer_lost_after_the_push_was_taken_counts_the_demand_once(
@@ -112,24 +84,9 @@ def _cut(server: Server) -> None:
     server.faults.cut_answers, server.faults.away_after_cut = 1, True
 
 
-def test_a_server_that_is_away_for_a_while_is_waited_for(
-    http: str, server: Server, bare: Path
-) -> None:
-    with rig.running(http) as generator:
-        rig.book(generator, goal(0))
-        server.faults.away = True
-        tickets = [generator.submit(goal(number)) for number in (1, 2)]
-        rig.wait_until(lambda: server.refused > 4, "it was asked again in vain")
-        assert not any(ticket.future.done() for ticket in tickets)
-        server.faults.away = False
-        assert [rig.receipt(ticket).outcome for ticket in tickets] == ["booked"] * 2
-    assert rig.books(bare) == rig.books_after(map(goal, range(3)))
-    rig.assert_sound(bare)
-
-
-# 403 in an address, a port or a commit's id says nothing about rights
-@pytest.mark.parametrize("prefix", ["", "/403", "/denied-and-rejected"])
-def test_a_server_that_takes_no_push_for_a_while_is_waited_for(bare: Path, prefix: str) -> None:
+def test_a_server_that_takes_no_push_for_a_while_is_waited_for(bare: Path) -> None:
+    """Words in an address, a port or a commit's id say nothing about rights."""
+    prefix = "/403/denied-and-rejected"
     with serving(bare.parent, prefix) as server, rig.running(f"{server.url}/state.git") as one:
         server.faults.no_pushes, server.faults.status = 3, 503
         assert rig.receipt(one.submit(goal(1))).outcome == "booked"
@@ -171,15 +128,3 @@ def test_closing_does_not_wait_for_a_server_that_never_answers(
     assert published is False
     assert rig.restart(http) is True
     assert rig.operations(bare)[-1] == "op-2"
-
-
-def test_two_generators_push_over_http_at_once(
-    http: str, server: Server, bare: Path, tmp_path: Path
-) -> None:
-    with rig.running(http) as first, rig.running(http, data=tmp_path / "other") as second:
-        tickets = [(first, second)[n % 2].submit(goal(n), f"op-{n}") for n in range(10)]
-        for ticket in tickets:
-            assert rig.receipt(ticket).outcome == "booked"
-    assert sorted(rig.operations(bare)) == sorted(f"op-{n}" for n in range(10))
-    assert rig.books(bare) == rig.books_after(map(goal, range(10)))
-    rig.assert_sound(bare)

@@ -1,7 +1,7 @@
 """The charts of object detection and fusion, as far as they can be judged without Helm.
 
-Schemas, default values and values templates are checked here against each other; what the charts
-render is checked with the real Helm in tests/e2e.
+Schemas and default values are checked here against each other. tests/golden holds the values that
+the generator gives; what the charts render is checked with the real Helm in tests/e2e.
 """
 
 from __future__ import annotations
@@ -16,63 +16,13 @@ from typing import Any
 import jsonschema_rs
 import pytest
 import yaml
-from jinja2 import StrictUndefined, Undefined
-from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from tests.kit.config import edited
+from tests.kit.goals import EGO, application, goal
+from tests.kit.memory import MemoryRepo
 
 APPDEF = Path(__file__).parents[3] / "appdefs" / "object-detection-fusion"
 CHARTS = ("object-detection", "object-fusion")
-
-NODE: dict[str, Any] = {
-    "id": "edge",
-    "selector": {"node_id": "edge"},
-    "tolerations": [{"key": "edge", "operator": "Exists", "effect": "NoSchedule"}],
-    "image_pull_secrets": [],
-    "host_network": False,
-    "ros": {"domain_id": 7, "rmw": "rmw_fastrtps_cpp"},
-}
-IMAGES = {
-    name: {"repository": f"ghcr.io/example/{name}", "tag": "1.2", "digest": ""}
-    for name in ("object-detection", "object-fusion", "k8s-configmap-watcher")
-}
-CONTEXTS: dict[str, dict[str, Any]] = {
-    "object-detection": {
-        "release": "od-edge-vehicle00",
-        "service": "object-detection",
-        "node": NODE,
-        "source": "vehicle00",
-        "source_topic": "/vehicle00/points",
-        "inputs": {
-            "point_cloud": [{"topic": "/vehicle00/points", "source": "vehicle00", "type": ""}]
-        },
-        "outputs": {"object_list": "/vehicle00_local_objectlist"},
-        "parameters": {},
-        "images": IMAGES,
-        "replicas": 1,
-    },
-    "object-fusion": {
-        "release": "of-edge-object-detection-fusion",
-        "service": "object-fusion",
-        "node": NODE,
-        "application": "edge/object_detection_fusion",
-        "inputs": {
-            "ego_data": [
-                {"topic": "/vehicle00/ego", "source": "vehicle00", "type": ""},
-                {"topic": "/vehicle01/ego", "source": "vehicle01", "type": ""},
-            ],
-            "object_list": [
-                {"topic": "/station00_local_objectlist", "source": "station00", "type": ""},
-            ],
-        },
-        "outputs": {
-            "fused_objects": "/fused_objects",
-            "fused_trajectories": "/fused_trajectories",
-            "raw_objects": "/raw_objects",
-        },
-        "parameters": {},
-        "images": IMAGES,
-        "replicas": 1,
-    },
-}
 
 
 def chart_values(chart: str) -> dict[str, Any]:
@@ -86,22 +36,6 @@ def chart_schema(chart: str) -> dict[str, Any]:
 def faults(chart: str, values: dict[str, Any]) -> list[str]:
     validator = jsonschema_rs.Draft7Validator(chart_schema(chart))
     return [error.message for error in validator.iter_errors(values)]
-
-
-def as_json(value: object) -> str:
-    if isinstance(value, Undefined):
-        str(value)  # a StrictUndefined says here which name is missing
-    return json.dumps(value)
-
-
-def render(chart: str, **changes: object) -> dict[str, Any]:
-    """Render the values template of ``chart`` the way the generator's engine does."""
-    environment = ImmutableSandboxedEnvironment(
-        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=as_json
-    )
-    environment.filters["ros_name"] = lambda name: name.replace("-", "_")
-    source = (APPDEF / "values" / f"{chart}.yaml.j2").read_text("utf-8")
-    return dict(yaml.safe_load(environment.from_string(source).render(CONTEXTS[chart] | changes)))
 
 
 def merged(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
@@ -236,61 +170,20 @@ def test_values_that_people_override_are_accepted(chart: str) -> None:
     assert faults(chart, merged(chart_values(chart), change)) == []
 
 
-@pytest.mark.parametrize("chart", CHARTS)
-@pytest.mark.parametrize("secrets", [[], ["one", "two"]])
-def test_rendered_values_satisfy_the_schema(chart: str, secrets: list[str]) -> None:
-    values = render(chart, node={**NODE, "image_pull_secrets": secrets, "host_network": True})
-    assert faults(chart, merged(chart_values(chart), values)) == []
-    assert values.get("imagePullSecrets", []) == [{"name": secret} for secret in secrets]
-    assert values["hostNetwork"] is True
-    assert values["nodeSelector"] == NODE["selector"]
-    assert values["tolerations"] == NODE["tolerations"]
-    assert values["ros"] == {"domainId": 7, "rmwImplementation": "rmw_fastrtps_cpp"}
-
-
-def test_values_of_a_detection() -> None:
-    assert render("object-detection")["detection"] == {
-        "nodeName": "od_edge_vehicle00",
-        "pointCloudTopic": "/vehicle00/points",
-        "objectListTopic": "/vehicle00_local_objectlist",
-    }
-
-
-def test_values_of_a_fusion() -> None:
-    values = render("object-fusion")
-    assert values["fusion"] == {
-        "nodeName": "of_edge_object_detection_fusion",
-        "rawObjectListsTopic": "/raw_objects",
-        "fusedObjectListsTopic": "/fused_objects",
-        "fusedTrajectoriesTopic": "/fused_trajectories",
-    }
-    assert values["inputs"] == {
-        "egoData": ["/vehicle00/ego", "/vehicle01/ego"],
-        "objectList": ["/station00_local_objectlist"],
-    }
-    assert values["watcher"] == {
-        "image": IMAGES["k8s-configmap-watcher"],
-        "nodeName": "of_edge_object_detection_fusion__watcher",
-    }
-
-
 def test_a_topic_of_two_sources_is_read_once() -> None:
-    twice = [{"topic": topic, "source": "v", "type": ""} for topic in ("/A", "/a", "/a")]
-    values = render("object-fusion", inputs={"ego_data": twice, "object_list": []})
-    assert values["inputs"]["egoData"] == ["/A", "/a"]
+    repo = MemoryRepo()
+    topics = [("/a", "vehicle01"), ("/A", "vehicle01"), ("/a", "vehicle00")]
+    repo.send(goal([application(ego=topics, clouds=[])]))
+    (release,) = repo.objects("HelmRelease").values()
+    assert release["spec"]["values"]["inputs"]["egoData"] == ["/A", "/a"]
 
 
-@pytest.mark.parametrize("given", [{}, {"use_sim_time": False}])
-def test_simulated_time_is_the_charts_unless_demanded(given: dict[str, bool]) -> None:
-    fusion = render("object-fusion", parameters=given)["fusion"]
-    assert fusion.get("useSimTime", "default") == given.get("use_sim_time", "default")
-
-
-def test_a_hostile_topic_stays_text_and_the_schema_refuses_it() -> None:
-    hostile = '/a"\n}: {{ x }} $(reboot) #'
-    values = render("object-detection", source_topic=hostile)
-    assert values["detection"]["pointCloudTopic"] == hostile
-    assert faults("object-detection", merged(chart_values("object-detection"), values))
+def test_a_definition_may_take_simulated_time_as_a_parameter() -> None:
+    parameter = "parameters: {use_sim_time: {default: false}}\nservices:\n"
+    repo = MemoryRepo(edited(f"appdefs/{APPDEF.name}/appdef.yaml", "services:\n", parameter))
+    repo.send(goal([application(ego=[EGO], clouds=[])]))
+    (release,) = repo.objects("HelmRelease").values()
+    assert release["spec"]["values"]["fusion"]["useSimTime"] is False
 
 
 def test_inputs_reach_one_configmap_and_nothing_else() -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from demandops.cluster import access, controller_webhook
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
-from demandops.errors import InvalidInput
 
 from tests.kit.generator import wait_until
 from tests.kit.golden import start
 from tests.kit.http import Answer, Server, serving
+from tests.unit.cluster.test_reconcile_trigger import trigger
 
 SECRET = "It's a Secret to Everybody"  # noqa: S105 - of an example
 
@@ -46,15 +46,8 @@ def test_the_signature_is_the_one_that_github_documents() -> None:
     assert controller_webhook.signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
 
 
-def woken(case: str, reached: access.ClusterAccess, changed: list[str] | None = None) -> None:
-    state, _ = start(case)
-    waker = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
-    waker(state.config)
-    waker.close()
-
-
 def test_a_receiver_of_flux_is_called_with_a_signature(hook: Server, secret_file: Path) -> None:
-    woken("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
+    trigger("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     call = hook.calls[0]
     assert call.headers["X-Signature"] == by_openssl(call.body)
 
@@ -67,7 +60,7 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file:
         "ledger/applications/aa/b/c.yaml",
     ]
     reached = access.ClusterAccess(webhook=hook.url, secret_file=secret_file)
-    woken("argocd-experiment", reached, changed)
+    trigger("argocd-experiment", reached, changed)
     headers, body = hook.calls[0].headers, hook.calls[0].body
     assert headers["X-Hub-Signature-256"] == by_openssl(body)
     assert (headers["X-GitHub-Event"], headers["Content-Type"]) == ("push", "application/json")
@@ -85,7 +78,7 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file:
 def test_where_nothing_is_known_of_what_changed_argo_cd_looks_at_all(
     hook: Server, secret_file: Path
 ) -> None:
-    woken("argocd-experiment", access.ClusterAccess(webhook=hook.url, secret_file=secret_file))
+    trigger("argocd-experiment", access.ClusterAccess(webhook=hook.url, secret_file=secret_file))
     assert hook.calls[0].json()["commits"] == []
 
 
@@ -119,7 +112,7 @@ def test_what_is_not_taken_is_told_and_no_redirection_followed(
     hook: Server, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
 ) -> None:
     hook.answer = lambda call: Answer(status, headers={"Location": "/elsewhere"})
-    woken("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
+    trigger("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
     assert len(hook.calls) in (1, 2)  # the second, as it is closed
     assert SECRET not in caplog.text and "/hook" not in caplog.text
@@ -132,7 +125,7 @@ def test_what_is_not_taken_is_told_and_no_redirection_followed(
 def test_the_other_controller_s_webhook_is_not_called(
     hook: Server, caplog: pytest.LogCaptureFixture, case: str, other: str, needs: str
 ) -> None:
-    woken(case, access.ClusterAccess.model_validate({other: hook.url}))
+    trigger(case, access.ClusterAccess.model_validate({other: hook.url}))
     assert hook.calls == []
     assert f"(it has neither a kubeconfig nor a {needs})" in caplog.text
 
@@ -153,40 +146,3 @@ def test_a_repository_is_named_by_the_page_that_a_forge_would_name(repo: str, pa
 def test_a_repository_without_a_host_cannot_be_named() -> None:
     with pytest.raises(access.NoAccess, match="names no host"):
         controller_webhook.web_address("file:///srv/fleet.git")
-
-
-@pytest.mark.parametrize(
-    ("text", "mode", "message"),
-    [
-        (None, 0, "{file} cannot be read: No such file or directory; put the secret there"),
-        ("", 0o600, "{file} is empty; put the secret there"),
-        (" \r\n", 0o600, "{file} is empty; put the secret there"),
-        (SECRET, 0o644, "{file} may be read by everybody on this machine; run chmod o= on it"),
-    ],
-)
-def test_a_secret_that_cannot_be_used_is_told_at_the_start(
-    tmp_path: Path, text: str | None, mode: int, message: str
-) -> None:
-    file = tmp_path / "secret"
-    if text is not None:
-        file.write_text(text)
-        file.chmod(mode)
-    clusters = tmp_path / "clusters.yaml"
-    clusters.write_text(
-        "apiVersion: demandops/v1\nkind: ClusterAccess\n"
-        f"clusters: {{a: {{receiver: 'http://h/hook', secret_file: {file}}}}}\n"
-    )
-    with pytest.raises(InvalidInput) as caught:
-        access.read(clusters)
-    told = message.format(file=file)
-    assert str(caught.value) == f"{clusters}: clusters.a.secret_file: {told}"
-
-
-def test_a_secret_that_signs_nothing_is_a_fault(tmp_path: Path) -> None:
-    clusters = tmp_path / "clusters.yaml"
-    clusters.write_text(
-        "apiVersion: demandops/v1\nkind: ClusterAccess\n"
-        "clusters: {a: {kubeconfig: /k, secret_file: /s}}\n"
-    )
-    with pytest.raises(InvalidInput, match="but no URL; add a receiver or a webhook"):
-        access.read(clusters)

@@ -1,7 +1,7 @@
 """What people mistype in a state repo.
 
-Each case of ``EDITS`` is one edit of a file of the skeleton; ``tests/unit/messages`` holds what is
-said of it. ``test_mistakes_anywhere`` tries every mistake that a JSON schema knows.
+``tests/unit/messages`` holds what is said of each case of ``MISTAKES``.
+``test_mistakes_anywhere`` tries every mistake that a JSON schema knows.
 """
 
 from __future__ import annotations
@@ -35,12 +35,37 @@ def refused(changed: Mapping[str, str | None]) -> tuple[Fault, ...]:
     return invalid.value.faults
 
 
-def faults(changed: Mapping[str, str | None]) -> list[str]:
-    """Return the same as text."""
-    return [str(found) for found in refused(changed)]
+def argocd(**section: object) -> dict[str, str]:
+    """Return a ``demandops.yaml`` for Argo CD with this section."""
+    text = skeleton("argocd")[ROOT]
+    url = "  url: https://git.example/fleet/state-repo.git\n"
+    assert url in text
+    return {ROOT: text.replace(url, f"  {json.dumps(section)}\n")}
 
 
-EDITS: dict[str, tuple[str, str, str]] = {
+def second_definition(*edits: tuple[str, str]) -> dict[str, str]:
+    """Return a copy of the application definition in another folder, with texts replaced."""
+    copy = {
+        path.replace("object-detection-fusion/", "copy/", 1): text
+        for path, text in skeleton().items()
+        if path.startswith("appdefs/object-detection-fusion/") and "/charts/" not in path
+    }
+    for old, new in edits:
+        copy["appdefs/copy/appdef.yaml"] = copy["appdefs/copy/appdef.yaml"].replace(old, new)
+    return copy
+
+
+URL = "https://git.example/state.git"
+TEMPLATE = "appdefs/copy/values/object-detection.yaml.j2"
+SHARED = second_definition(
+    ("name: object-detection-fusion", "name: copy"),
+    ("type: 1\n", "type: 2\n"),
+    ("prefix: of", "prefix: cp"),
+    ("object-fusion:\n", "copy-fusion:\n"),
+)
+"""A second application that shares its detections with the first."""
+
+_EDITS: dict[str, tuple[str, str, str]] = {
     # what any file can get wrong
     "a colon too many": (ROOT, "kind: StateRepository", "kind: State: Repository"),
     "a tab": (CLUSTERS, "  - name: c-its", "\t- name: c-its"),
@@ -74,7 +99,7 @@ EDITS: dict[str, tuple[str, str, str]] = {
     ),
     # demandops.yaml
     "a controller without its section": (ROOT, "gitops: flux", "gitops: argocd"),
-    "a newer generator's rendering": (ROOT, "renderVersion: 1", "renderVersion: 2"),
+    "a newer generator's rendering": (ROOT, "renderVersion: 2", "renderVersion: 3"),
     # inventory/clusters.yaml
     "a cluster twice": (CLUSTERS, "  - name: c-its", "  - name: c-its\n  - name: c-its"),
     "a cluster that is no folder": (CLUSTERS, "name: c-its", "name: ../c-its"),
@@ -138,7 +163,72 @@ EDITS: dict[str, tuple[str, str, str]] = {
     "bounds the wrong way round": (
         APPDEF, "prefix: of\n", "prefix: of\n    scaling: {min: 3, max: 2}\n",
     ),
+    "a node in two access domains": (
+        DOMAINS,
+        "domains:\n",
+        'domains:\n  - name: other\n    namespace: other\n    nodes: ["*0"]\n',
+    ),
+    "a usual topic for an input of no application": (NODES, "ego_data: /", "ego_date: /"),
+    "a toleration that Kubernetes refuses": (
+        NODES, V1, f"{V1}    tolerations: [{{key: a, operator: Exists, value: b}}]\n",
+    ),
+    "an appdef that is not named like its folder": (
+        APPDEF, "name: object-detection-fusion", "name: fusion",
+    ),
+    "an output with letters that ROS forbids": (
+        APPDEF, "/{instance}_local_objectlist", "/{instance}_ä",
+    ),
+    "a node's id: empty": (
+        NODES, V1, '- id: ""\n    selector: {a: b}\n',
+    ),
+    "a node's id: climbs out of a folder": (
+        NODES, V1, '- id: "../x"\n    selector: {a: b}\n',
+    ),
+    "a node's id: a line break": (
+        NODES, V1, '- id: "a\\nb"\n    selector: {a: b}\n',
+    ),
+    "a node's id: reversed text": (
+        NODES, V1, '- id: "a\\u202eb"\n    selector: {a: b}\n',
+    ),
 }  # fmt: skip
+
+MISTAKES: dict[str, Mapping[str, str | None]] = {
+    **{name: edited(*edit) for name, edit in _EDITS.items()},
+    # several places or files
+    "a chart without metadata": {f"{CHART}/Chart.yaml": "version: [\n"},
+    "every node of an unknown cluster": {
+        CLUSTERS: "apiVersion: demandops/v1\nkind: Clusters\nclusters: [{name: west}]\n"
+    },
+    "several faults of one file": {
+        NODES: skeleton()[NODES].replace("type: vehicle", "type: car").replace("id: edge", "id: 5")
+    },
+    "a fault of form and one of meaning in a file": {
+        NODES: "c-it".join(
+            skeleton()[NODES].replace("type: vehicle", "type: car", 1).rsplit("c-its", 1)
+        )
+    },
+    "a fault of form in one file and one of meaning in another": edited(
+        IMAGES, "tag: 2025-04", "tag: 2025"
+    )
+    | edited(BROKERS, "node: cloud", "node: clod"),
+    "a broken appdef and a fault of meaning": edited(APPDEF, "prefix: of", "prefix: o-f")
+    | edited(BROKERS, "node: cloud", "node: clod"),
+    "faults of many files": {
+        **edited(CLUSTERS, "name: c-its", "name: C_ITS"),
+        **edited(BROKERS, "port: 1883", "port: 0"),
+        **edited(IMAGES, "tag: 2025-04", "tag: 2025"),
+        **edited(APPDEF, "prefix: of", "prefix: o-f"),
+        CHARTS: None,
+    },
+    "Argo CD's section without its url": argocd(namespace="argo"),
+    "a field of Flux's in Argo CD's section": argocd(url=URL, interval="1m"),
+    "a domain in Argo CD's own namespace": argocd(url=URL, namespace="perception"),
+    "two definitions for one type": second_definition(
+        ("name: object-detection-fusion", "name: copy")
+    ),
+    "a shared service with two templates": SHARED | {TEMPLATE: SHARED[TEMPLATE] + "replicas: 5\n"},
+}
+"""What a configuration is refused for, as the files that are other than the skeleton's."""
 
 
 @pytest.mark.parametrize("content", [None, "", "- a\n", "a: [\n"])
@@ -148,217 +238,33 @@ def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
         assert found.file == path
 
 
-class TestArgoCd:
-    """What is asked of a state repo that Argo CD reads."""
-
-    @staticmethod
-    def root(**section: object) -> dict[str, str | None]:
-        text = skeleton("argocd")[ROOT]
-        url = "  url: https://git.example/fleet/state-repo.git\n"
-        assert url in text
-        return {ROOT: text.replace(url, f"  {json.dumps(section)}\n")}
-
-    def test_a_url_is_enough(self) -> None:
-        config = load(configuration(self.root(url="https://git.example/state.git")))
-        assert config.repo_settings.argocd
-        assert config.repo_settings.argocd.namespace == "argocd"
-
-    def test_the_other_controllers_section_may_stay(self) -> None:
-        text = skeleton()[ROOT] + "argocd:\n  url: https://git.example/state.git\n"
-        assert load(configuration({ROOT: text})).repo_settings.gitops == "flux"
-
-    def test_a_section_without_its_url(self) -> None:
-        assert faults(self.root(namespace="argo")) == [f"{ROOT}: argocd.url: is missing; add it"]
-
-    def test_a_field_of_fluxs(self) -> None:
-        found = faults(self.root(url="https://git.example/state.git", interval="1m"))
-        assert found == [
-            f"{ROOT}: argocd.interval: is not a field here; remove it or correct its spelling"
-        ]
-
-    def test_a_domain_in_argo_cds_own_namespace(self) -> None:
-        root = self.root(url="https://git.example/state.git", namespace="perception")
-        assert faults(root) == [
-            f"{DOMAINS}: domains[0].namespace: 'perception' is Argo CD's own namespace, where an "
-            f"Application may do all that Argo CD may; choose another"
-        ]
+@pytest.mark.parametrize("id", ["vehicle/01", "vehicle 01", "é", "x" * 64, "-a"])
+def test_an_id_that_is_no_label_needs_a_selector(id: str) -> None:
+    """Without one, ``node_id: <id>`` would be written, which the API server refuses."""
+    (found,) = refused(edited(NODES, V1, f'- id: "{id}"\n'))
+    assert found.file == NODES
+    assert "selector" in str(found)
+    load(configuration(edited(NODES, V1, f'- id: "{id}"\n    selector: {{a: b}}\n')))
 
 
-class TestNodes:
-    """Ids are the field's own and may be nearly any text; what cannot work is told in time."""
-
-    @pytest.mark.parametrize(
-        ("id", "message"),
-        [
-            ("", "is empty; give an id"),
-            ("../x", "'../x' holds '..'; choose an id without it"),
-            (r"a\nb", r"'a\nb' holds the control character U+000A; choose an id without it"),
-            (
-                r"a\u202eb",
-                r"'a\u202eb' holds the control character U+202E; choose an id without it",
-            ),
-        ],
-    )
-    def test_an_id_that_no_demand_could_name_is_refused(self, id: str, message: str) -> None:
-        """A demand that names it is refused for its id, so such a node is of no use."""
-        change = edited(NODES, V1, f'- id: "{id}"\n    selector: {{a: b}}\n')
-        assert faults(change) == [f"{NODES}: nodes[1].id: {message}"]
-
-    @pytest.mark.parametrize("id", ["vehicle/01", "vehicle 01", "é", "x" * 64, "-a"])
-    def test_an_id_that_is_no_label_needs_a_selector(self, id: str) -> None:
-        """Without one, ``node_id: <id>`` would be written, which the API server refuses."""
-        (found,) = faults(edited(NODES, V1, f'- id: "{id}"\n'))
-        assert found.startswith(f"{NODES}: nodes[1]")
-        assert "selector" in found
-        load(configuration(edited(NODES, V1, f'- id: "{id}"\n    selector: {{a: b}}\n')))
-
-    @pytest.mark.parametrize("topic", ["ego", "x y", "~/ego", "/a//b", "/é"])
-    def test_a_usual_topic_that_ros_forbids_is_refused(self, topic: str) -> None:
-        (found,) = faults(edited(NODES, "/vehicles/vehicle00/ego_data", f'"{topic}"'))
-        assert found.startswith(f"{NODES}: nodes[0].topics.ego_data: ")
-
-    def test_a_usual_topic_for_an_input_of_no_application_is_refused(self) -> None:
-        """It would never be found, and the releases be named in another way than meant."""
-        (found,) = faults(edited(NODES, "ego_data: /", "ego_date: /"))
-        assert found.startswith(f"{NODES}: nodes[0].topics.ego_date: ")
-        assert found.endswith("; did you mean 'ego_data'?")
-
-    def test_a_toleration_that_kubernetes_refuses_is_refused(self) -> None:
-        taint = "{key: a, operator: Exists, value: b}"
-        (found,) = faults(edited(NODES, V1, f"{V1}    tolerations: [{taint}]\n"))
-        assert found.startswith(f"{NODES}: nodes[1].tolerations[0]")
-
-    def test_every_node_of_an_unknown_cluster_is_told(self) -> None:
-        change = {CLUSTERS: "apiVersion: demandops/v1\nkind: Clusters\nclusters: [{name: west}]\n"}
-        assert faults(change) == [
-            f"{NODES}: nodes[{index}].cluster: 'c-its' is not in clusters.yaml; known: west"
-            for index in range(7)
-        ]
-
-    def test_a_node_in_two_access_domains_is_told(self) -> None:
-        other = 'domains:\n  - name: other\n    namespace: other\n    nodes: ["*0"]\n'
-        remedy = "narrow their patterns so that it is in one"
-        assert faults(edited(DOMAINS, "domains:\n", other)) == [
-            f"{NODES}: nodes[{index}].id: '{node}' is in the access domains 'other' and "
-            f"'perception'; {remedy}"
-            for index, node in ((0, "vehicle00"), (4, "station00"))
-        ]
+@pytest.mark.parametrize("topic", ["ego", "x y", "~/ego", "/a//b", "/é"])
+def test_a_usual_topic_that_ros_forbids_is_refused(topic: str) -> None:
+    (found,) = refused(edited(NODES, "/vehicles/vehicle00/ego_data", f'"{topic}"'))
+    assert (found.file, found.field) == (NODES, "nodes[0].topics.ego_data")
 
 
-class TestAppdefs:
-    """A definition is checked before anybody demands it."""
-
-    def test_a_name_that_is_not_the_folders_is_one_fault(self) -> None:
-        assert faults(edited(APPDEF, "name: object-detection-fusion", "name: fusion")) == [
-            f"{APPDEF}: name: is 'fusion', but the folder is 'object-detection-fusion'; make "
-            f"them equal"
-        ]
-
-    def test_an_output_with_letters_that_ros_forbids_is_refused(self) -> None:
-        (found,) = faults(edited(APPDEF, "/{instance}_local_objectlist", "/{instance}_ä"))
-        assert found.startswith(
-            f"{APPDEF}: services.object-detection.outputs.object_list: '/{{inst"
-        )
-
-    def test_two_definitions_for_one_type_are_told(self) -> None:
-        copy = {
-            path.replace("object-detection-fusion/", "copy/", 1): text
-            for path, text in skeleton().items()
-            if path.startswith("appdefs/object-detection-fusion/") and "/charts/" not in path
-        }
-        name = "appdefs/copy/appdef.yaml"
-        copy[name] = copy[name].replace("name: object-detection-fusion", "name: copy")
-        found = faults(copy)
-        assert found[-1] == (
-            f"{APPDEF}: deploymentRequest.type: 1 already names 'copy'; choose another number"
-        )
-        assert found[0] == (
-            f"{APPDEF}: services.object-fusion.prefix: 'of' is used by 'object-fusion' already; "
-            f"choose another (only identical services with 'each' may share a prefix)"
-        )
-
-    def test_a_shared_service_with_two_templates_is_told(self) -> None:
-        """One release can have one template only; which would it be?"""
-        copy = {
-            path.replace("object-detection-fusion/", "copy/", 1): text
-            for path, text in skeleton().items()
-            if path.startswith("appdefs/object-detection-fusion/") and "/charts/" not in path
-        }
-        name = "appdefs/copy/appdef.yaml"
-        copy[name] = (
-            copy[name]
-            .replace("name: object-detection-fusion", "name: copy")
-            .replace("type: 1\n", "type: 2\n")
-            .replace("prefix: of", "prefix: cp")
-            .replace("object-fusion:\n", "copy-fusion:\n")
-        )
-        load(configuration(copy))
-        copy["appdefs/copy/values/object-detection.yaml.j2"] += "replicas: 5\n"
-        found = faults(copy)
-        assert any("object-detection" in message for message in found)
-
-    def test_a_chart_without_metadata_is_told(self) -> None:
-        path = f"{CHART}/Chart.yaml"
-        assert faults({path: "version: [\n"})[0].startswith(
-            f"{path}: line 2, column 1: not valid YAML: "
-        )
-
-
-class TestAllTogether:
-    """All faults of all files, so that a person fixes them in one go."""
-
-    def test_faults_of_several_files(self) -> None:
-        change = {
-            **edited(CLUSTERS, "name: c-its", "name: C_ITS"),
-            **edited(BROKERS, "port: 1883", "port: 0"),
-            **edited(IMAGES, "tag: 2025-04", "tag: 2025"),
-            **edited(APPDEF, "prefix: of", "prefix: o-f"),
-            CHARTS: None,
-        }
-        found = faults(change)
-        assert {message.split(": ")[0] for message in found} == set(change)
-
-    def test_several_faults_of_one_file(self) -> None:
-        text = skeleton()[NODES].replace("type: vehicle", "type: car").replace("id: edge", "id: 5")
-        assert faults({NODES: text}) == [
-            *(
-                f"{NODES}: nodes[{index}].type: is 'car', but must be 'vehicle', 'station', 'edge' "
-                "or 'cloud'"
-                for index in range(4)
-            ),
-            f"{NODES}: nodes[5].id: must be text, not 5; put it in quotes",
-        ]
-
-    def test_a_fault_of_form_hides_no_fault_of_meaning_in_the_same_file(self) -> None:
-        text = skeleton()[NODES].replace("type: vehicle", "type: car", 1)
-        text = "c-it".join(text.rsplit("c-its", 1))
-        assert faults({NODES: text}) == [
-            f"{NODES}: nodes[0].type: is 'car', but must be 'vehicle', 'station', 'edge' or "
-            "'cloud'",
-            f"{NODES}: nodes[6].cluster: 'c-it' is not in clusters.yaml; did you mean 'c-its'?",
-        ]
-
-    def test_a_broken_file_hides_no_fault_of_meaning_in_another(self) -> None:
-        change = {
-            **edited(IMAGES, "tag: 2025-04", "tag: 2025"),
-            **edited(BROKERS, "node: cloud", "node: clod"),
-        }
-        assert sorted(faults(change)) == [
-            f"{BROKERS}: brokers[0].node: 'clod' is not in nodes.yaml; did you mean 'cloud'?",
-            f"{IMAGES}: images.object-detection.tag: must be text, not 2025; put it in quotes",
-        ]
-
-    def test_a_broken_appdef_hides_no_fault_of_another_file(self) -> None:
-        change = {
-            **edited(APPDEF, "prefix: of", "prefix: o-f"),
-            **edited(BROKERS, "node: cloud", "node: clod"),
-        }
-        assert [message.split(": ")[0] for message in faults(change)] == [APPDEF, BROKERS]
-
-
-def test_what_is_odd_but_works() -> None:
-    load(configuration(brokers()))
-    load(configuration(edited(NODES, V1, f'{V1}    selector: {{"a.b/c": "1e3", d: ""}}\n')))
-    load(configuration(edited(NODES, V1, f"{V1}    tolerations: [{{operator: Exists}}]\n")))
-    load(configuration(edited(DOMAINS, '"*"', '"*", "ghost"')))
-    load(configuration({"README.md": "x", "appdefs/notes.txt": "x", "inventory/README.md": "x"}))
+@pytest.mark.parametrize(
+    "changed",
+    [
+        brokers(),
+        edited(NODES, V1, f'{V1}    selector: {{"a.b/c": "1e3", d: ""}}\n'),
+        edited(NODES, V1, f"{V1}    tolerations: [{{operator: Exists}}]\n"),
+        edited(DOMAINS, '"*"', '"*", "ghost"'),
+        {"README.md": "x", "appdefs/notes.txt": "x", "inventory/README.md": "x"},
+        argocd(url=URL),
+        {ROOT: f"{skeleton()[ROOT]}argocd:\n  url: {URL}\n"},
+        SHARED,
+    ],
+)
+def test_what_is_odd_but_works(changed: dict[str, str]) -> None:
+    load(configuration(changed))

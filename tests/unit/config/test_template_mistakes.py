@@ -59,6 +59,8 @@ APPENDED: dict[str, tuple[str, str]] = {
     ),
     "a way to a shell by an undefined name": ("x: {{ nope.__init__.__globals__ }}\n", "unsafe"),
     "a change of what it is given": ("{% set x = node.update({'id': 'other'}) %}\n", "unsafe"),
+    "two documents": ("---\na: b\n", "found another document"),
+    "a key twice": ("hostNetwork: true\n", "not valid YAML: the key 'hostNetwork' appears twice"),
     "a loop without end": ("{% for i in range(1000000000) %}{% endfor %}\n", "Range too big"),
     "a division by nothing": ("x: {{ 1 / 0 }}\n", "zero"),
     "a value that YAML has no word for": (
@@ -67,15 +69,31 @@ APPENDED: dict[str, tuple[str, str]] = {
     ),
 }
 """A line of a template, and a word of the message; the sentence is Jinja's own."""
+TOO_LARGE = [
+    *("'a' * 1000000000", "[1] * 1000000000", "10 ** 1000", "'%1000000000d' % 1"),
+    *("'%*d' % (1000000000, 1)", "'%1000000000d' | format(1)", "'{:>1000000000}'.format(1)"),
+    *("'{:>{w}}'.format(1, w=1000000000)", "'{x:>1000000000}'.format_map({'x': 1})"),
+    *("'a'.ljust(1000000000)", "'a'.center(1000000000)", "'1'.zfill(1000000000)"),
+    *("'a' | center(1000000000)", "'a' | indent(1000000000, true)"),
+    *("[1] | batch(1000000000, 'x') | list", "[1] | slice(1000000000) | list"),
+]
+"""What would eat the memory is refused before it is made."""
 
 
-@pytest.mark.parametrize("name", APPENDED)
-def test_a_mistake_is_told_with_template_and_line(name: str) -> None:
-    text, word = APPENDED[name]
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        *APPENDED.values(),
+        *(("x: {{ " + expression + " }}\n", " too large") for expression in TOO_LARGE),
+    ],
+    ids=[*APPENDED, *TOO_LARGE],
+)
+def test_a_mistake_is_told_with_template_and_line(text: str, word: str) -> None:
     (found,) = appended(text)
-    assert found.startswith(f"{TEMPLATE}: line {LAST}: ")
+    assert found.startswith(f"{TEMPLATE}: line ")
     assert word.lower() in found.lower()
     assert found.endswith("; fix the template")
+    assert f"line {LAST}" in found or "not valid YAML" in found
 
 
 @pytest.mark.parametrize(
@@ -85,48 +103,16 @@ def test_a_mistake_is_told_with_template_and_line(name: str) -> None:
         "{% include '" + TEMPLATE + "' %}\n",
         "{% extends '" + TEMPLATE + "' %}\n",
         "{% import '" + TEMPLATE + "' as x %}\n",
-        "x: {{ 'a' * 10 ** 10 }}\n",
-        "x: {{ 10 ** 10 ** 3 }}\n",
-        "x: {{ [1] * 10 ** 10 }}\n",
         "x: {{ self }}\n",
         "x: {{ cycler }}\n",
-        "x: {{ release | int('x') / 0 }}\n",
-        "x: {{ joiner() }}\n",
         "{{ caller() }}\n",
         "{% set x = [1][5] %}{{ x }}\n",
+        *(f"podLabels: {{{key}: x}}\n" for key in ("5", "~", "true", "1.5")),
     ],
-    ids=lambda text: repr(text[:30]),
 )
 def test_whatever_a_template_does_it_is_told_as_the_templates_fault(text: str) -> None:
     (found, *_) = appended(text)
     assert found.startswith(f"{TEMPLATE}: ")
-
-
-@pytest.mark.parametrize(
-    "expression",
-    [
-        "'a' * 1000000000",
-        "[1] * 1000000000",
-        "10 ** 1000",
-        "'%1000000000d' % 1",
-        "'%*d' % (1000000000, 1)",
-        "'%1000000000d' | format(1)",
-        "'{:>1000000000}'.format(1)",
-        "'{:>{w}}'.format(1, w=1000000000)",
-        "'{x:>1000000000}'.format_map({'x': 1})",
-        "'a'.ljust(1000000000)",
-        "'a'.center(1000000000)",
-        "'1'.zfill(1000000000)",
-        "'a' | center(1000000000)",
-        "'a' | indent(1000000000, true)",
-        "[1] | batch(1000000000, 'x') | list",
-        "[1] | slice(1000000000) | list",
-    ],
-)
-def test_what_would_eat_the_memory_is_refused_before_it_is_made(expression: str) -> None:
-    (found,) = appended("x: {{ " + expression + " }}\n")
-    assert found.startswith(f"{TEMPLATE}: line {LAST}: ")
-    assert " too large" in found
 
 
 def test_formats_of_usual_size_work() -> None:
@@ -150,12 +136,6 @@ def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
 
 class TestValues:
     """What a template gives is parsed and held against the chart's schema."""
-
-    def test_a_value_that_the_chart_does_not_have(self) -> None:
-        assert appended("extra: 5\n") == [
-            f"{TEMPLATE}: values: Additional properties are not allowed ('extra' was unexpected); "
-            f"fix the template or {CHART}"
-        ]
 
     def test_every_value_that_does_not_fit(self) -> None:
         text = skeleton()[TEMPLATE].replace("replicas: {{ replicas }}", "replicas: many")
@@ -189,22 +169,9 @@ class TestValues:
         assert found.endswith("; fix the template")
         assert " of the rendered text: not valid YAML: " in found
 
-    def test_a_key_twice(self) -> None:
-        (found,) = appended("hostNetwork: true\n")
-        assert "not valid YAML: the key 'hostNetwork' appears twice" in found
-
     @pytest.mark.parametrize("text", ["", "- a\n", "true\n", "{# nothing #}", "~\n"])
     def test_no_mapping(self, text: str) -> None:
         assert faults(text) == [f"{TEMPLATE}: must give a mapping of Helm values"]
-
-    @pytest.mark.parametrize("key", ["5", "~", "true", "1.5"])
-    def test_a_key_that_is_no_text(self, key: str) -> None:
-        (found, *_) = appended(f"podLabels: {{{key}: x}}\n")
-        assert found.startswith(f"{TEMPLATE}: ")
-
-    def test_two_documents(self) -> None:
-        (found,) = appended("---\na: b\n")
-        assert found.startswith(f"{TEMPLATE}: ")
 
     @pytest.mark.parametrize("end", ["\\n", "\\n\\n", "\\n\\n\\n", "", " \\n"])
     def test_a_text_of_several_lines_stays_as_it_is(self, end: str) -> None:

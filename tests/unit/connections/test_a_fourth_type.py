@@ -164,7 +164,7 @@ def test_its_client_is_rendered_and_described_for_the_commit() -> None:
     (config,) = world.objects("ConfigMap").values()
     assert yaml.safe_load(config["data"]["relay.yaml"]) == {"fetch": {"/a": "/b"}}
     (release,) = decision.releases
-    assert (release.change, release.description) == ("start", "relay on edge")
+    assert (release.change, release.what) == ("start", "relay on edge")
 
 
 def test_a_further_connection_changes_the_shared_client_by_the_facts_that_it_adds() -> None:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
-import pytest
 import yaml
 
-from tests.kit.config import brokers
 from tests.kit.goals import connection, goal
 from tests.kit.memory import MemoryRepo
 
@@ -52,38 +50,6 @@ def carried(books: MemoryRepo) -> dict[str, dict[tuple[str, str], str]]:
 
 def pairs(books: MemoryRepo, id: str) -> dict[str, str]:
     return {source: target for (source, _), target in carried(books)[id].items()}
-
-
-def test_the_parameters_of_both_ends_are_exactly_these() -> None:
-    books = MemoryRepo(brokers("edge"))
-    books.send(
-        goal([], [connection("c", topics=["/b/points", "/a"], targets=["/x", "/y"], broker="")])
-    )
-    broker = {"host": "broker-edge", "port": 1883}
-    assert ends(books) == {
-        "mqtt-c-source": {
-            "broker": broker,
-            "client": {"id": "mqtt-c-source"},
-            "bridge": {
-                "ros2mqtt": {
-                    "ros_topics": ["/a", "/b/points"],
-                    "/a": {"mqtt_topic": "mqtt-c/a"},
-                    "/b/points": {"mqtt_topic": "mqtt-c/b/points"},
-                }
-            },
-        },
-        "mqtt-c-target": {
-            "broker": broker,
-            "client": {"id": "mqtt-c-target"},
-            "bridge": {
-                "mqtt2ros": {
-                    "mqtt_topics": ["mqtt-c/a", "mqtt-c/b/points"],
-                    "mqtt-c/a": {"ros_topic": "/y"},
-                    "mqtt-c/b/points": {"ros_topic": "/x"},
-                }
-            },
-        },
-    }
 
 
 def test_two_source_topics_may_arrive_as_one() -> None:
@@ -143,11 +109,3 @@ def test_new_topics_restart_both_ends_and_nothing_else_does() -> None:
     books.send(goal([], [connection("c", topics=["/b"])], id="3"))
     for name, deployment in books.objects("Deployment").items():
         assert deployment["spec"]["template"] != templates[name]
-
-
-@pytest.mark.parametrize("count", [1, 2, 50])
-def test_every_topic_is_listed_once(count: int) -> None:
-    books = MemoryRepo()
-    topics = [f"/t{number}" for number in range(count)]
-    books.send(goal([], [connection("c", topics=[*topics, *topics])]))
-    assert sorted(pairs(books, "c")) == sorted(topics)

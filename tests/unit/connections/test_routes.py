@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-import pytest
 from demandops.config.base_model import parse
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.route import (
@@ -15,7 +14,6 @@ from demandops.connections.route import (
     faults,
     merged_routes,
 )
-from demandops.errors import InvalidInput
 
 OPTIONS: dict[str, object] = {
     "type": "std_msgs/msg/String",
@@ -51,44 +49,6 @@ def test_options_and_routes_have_the_same_fields_and_defaults() -> None:
 def test_every_option_does_something_in_some_client() -> None:
     honoured = frozenset().union(*(known.options for known in CONNECTION_TYPES))
     assert honoured == RouteOptions.model_fields.keys() - {"type", "reverse"}
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"qos": 3}, "qos: input should be less than or equal to 2, not 3"),
-        ({"qos": -1}, "qos: input should be greater than or equal to 0, not -1"),
-        ({"qos": "1"}, "qos: must be a whole number, not '1'"),
-        ({"rate": -1}, "rate: input should be greater than or equal to 0, not -1"),
-        ({"rate": float("nan")}, "rate: input should be a finite number, not nan"),
-        ({"queue": -1}, "queue: input should be greater than or equal to 0, not -1"),
-        ({"retained": "yes"}, "retained: must be true or false, not 'yes'"),
-        (
-            {"reliability": "relaible"},
-            "reliability: is 'relaible', but must be '', 'reliable' or 'best_effort'",
-        ),
-        (
-            {"durability": "kept"},
-            "durability: is 'kept', but must be '', 'volatile' or 'transient_local'",
-        ),
-        (
-            {"type": "String"},
-            "type: 'String' is not a message type; write it like std_msgs/msg/String",
-        ),
-        (
-            {"qso": 1},
-            "qso: is not a field here; remove it or correct its spelling; did you mean 'qos'?",
-        ),
-    ],
-)
-def test_what_no_option_can_be_is_told(options: dict[str, object], expected: str) -> None:
-    with pytest.raises(InvalidInput) as invalid:
-        parse(RouteOptions, options | {"reverse": True})
-    assert told(invalid.value.faults) == [expected]
-
-
-def test_a_whole_number_is_a_rate_too() -> None:
-    assert parse(RouteOptions, {"rate": 5}).rate == 5.0
 
 
 def test_a_topic_listed_with_two_ways_to_carry_it_is_told() -> None:

@@ -1,17 +1,13 @@
-"""What a demand must not say; ``tests/unit/messages`` holds what is said of ``REFUSED``."""
+"""What a demand must not say; ``tests/unit/messages`` holds what is said of the two tables."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import pytest
 
 from tests.kit.config import brokers
 from tests.kit.goals import (
-    APP,
     BODY,
     CLOUD,
-    EGO,
     ROS_NAMES,
     Goal,
     application,
@@ -20,11 +16,6 @@ from tests.kit.goals import (
     perception,
 )
 from tests.kit.memory import MemoryRepo
-
-NODES = "cloud, edge, station00, vehicle00, vehicle01, vehicle02, vehicle03"
-TYPES = "known: 0 (ROS), 1 (MQTT), 2 (ZENOH)"
-C0 = "connections[0]"
-
 
 REFUSED: dict[str, Goal] = {
     "an application type that no definition has": goal([application(type=9)]),
@@ -83,7 +74,34 @@ REFUSED: dict[str, Goal] = {
     ),
     "a topic without a name": goal([application(clouds=[("", "vehicle00")])]),
     "a shutdown of which nothing is held": goal([application()], [connection()], shutdown=True),
+    "an application without inputs": goal([application(clouds=[])]),
+    "nothing": goal(),
+    "two nodes for one application": goal([application(), application(node="cloud")]),
+    "many faults, told in the order of the request": goal(
+        [
+            application("..", node="Mars", who=[], ego=[("/a b", "Mars")], type=7),
+            application("\n"),
+        ],
+        [connection("", who=[""], ends=("egde", "edge"), topics=["/a"], targets=[], type=5)],
+        id="a\nb",
+    ),
 }
+
+OTHER = ["vehicle01"]
+CONTRADICTING: dict[str, Goal] = {
+    "another node for an application": goal([application(node="cloud", who=OTHER)]),
+    "another node for what the same demand holds": goal([application(node="cloud")]),
+    "another source": goal([], [connection(who=OTHER, ends=("vehicle01", "edge"))]),
+    "another target": goal([], [connection(who=OTHER, ends=("vehicle00", "cloud"))]),
+    "another broker": goal([], [connection(who=OTHER, broker="cloud")]),
+    "another target for a topic that is carried": goal(
+        [], [connection(who=OTHER, topics=["/new", CLOUD[0]], targets=["/new", "/other"])]
+    ),
+    "several contradictions": goal([application(node="cloud")], [connection(broker="cloud")]),
+    "a shutdown by another requester": goal([application(who=OTHER)], shutdown=True),
+    "a shutdown with a misspelt id": goal([application("edge/fusion")], shutdown=True),
+}
+"""What is refused once ``perception()`` is booked."""
 
 
 @pytest.mark.parametrize(
@@ -111,24 +129,12 @@ def test_a_topic_name_that_ros_forbids_is_refused_wherever_it_stands(topic: str)
     ]
 
 
-def test_an_application_without_inputs_is_refused_in_the_words_of_the_wire() -> None:
-    (found,) = MemoryRepo().faults(goal([application(clouds=[])]))
-    field, _, message = found.partition(": ")
-    assert message == "is empty; list at least one topic of ego_data or point_cloud"
-    assert field.startswith("apps[0]."), f"the message has no field {field!r}"
-
-
 def test_without_any_broker_the_file_to_mend_is_told() -> None:
     (found,) = MemoryRepo(brokers()).faults(goal([], [connection(broker="")]))
     field, _, message = found.partition(": ")
     assert field == "connections[0].broker_node_id"
     assert "name one of" not in message
     assert "inventory/brokers.yaml" in message
-
-
-def test_a_request_for_nothing_is_refused() -> None:
-    (found,) = MemoryRepo().faults(goal())
-    assert "the request lists no application and no connection; list at least one" in found
 
 
 def test_a_node_in_no_access_domain_is_refused() -> None:
@@ -142,181 +148,37 @@ def test_a_node_in_no_access_domain_is_refused() -> None:
     ]
 
 
-class TestContradictions:
-    """What stands is kept, and named."""
-
-    @pytest.fixture
-    def books(self) -> MemoryRepo:
-        books = MemoryRepo()
-        books.send(perception())
-        return books
-
-    def test_another_node_for_a_claimed_application(self, books: MemoryRepo) -> None:
-        assert books.faults(goal([application(node="cloud", who=["vehicle01"])])) == [
-            f"apps[0].header.node_id: 'cloud' contradicts an existing claim: '{APP}'"
-            " is held by vehicle00 on 'edge'; request that node, or wait until it is released"
-        ]
-
-    def test_another_node_for_an_application_that_the_same_demand_claimed(
-        self, books: MemoryRepo
-    ) -> None:
-        assert len(books.faults(goal([application(node="cloud")]))) == 1
-
-    @pytest.mark.parametrize(
-        ("changed", "field", "wanted", "held"),
-        [
-            ({"ends": ("vehicle01", "edge")}, "source_node_id", "vehicle01", "source 'vehicle00'"),
-            ({"ends": ("vehicle00", "cloud")}, "target_node_id", "cloud", "target 'edge'"),
-            ({"broker": "cloud"}, "broker_node_id", "cloud", "broker 'edge'"),
-        ],
-    )
-    def test_other_ends_or_another_broker_of_a_claimed_connection(
-        self, books: MemoryRepo, changed: dict[str, Any], field: str, wanted: str, held: str
-    ) -> None:
-        assert books.faults(goal([], [connection(who=["vehicle01"], **changed)])) == [
-            f"connections[0].{field}: '{wanted}' contradicts an existing claim: 'vehicle00/edge' "
-            f"is held by vehicle00 with {held}; use the same {held.partition(' ')[0]}, or another "
-            "connection id"
-        ]
-
-    def test_another_target_for_a_topic_that_is_carried(self, books: MemoryRepo) -> None:
-        asked = connection(who=["vehicle01"], topics=["/new", CLOUD[0]], targets=["/new", "/other"])
-        assert books.faults(goal([], [asked])) == [
-            f"connections[0].target_topics[1]: '{CLOUD[0]}' goes to '{CLOUD[0]}' already: "
-            "'vehicle00/edge' is held by vehicle00; one source topic has one target, use a second "
-            "connection"
-        ]
-
-    def test_every_contradiction_of_a_request_is_told(self, books: MemoryRepo) -> None:
-        asked = goal([application(node="cloud")], [connection(broker="cloud")])
-        assert [found.split(":")[0] for found in books.faults(asked)] == [
-            "apps[0].header.node_id",
-            "connections[0].broker_node_id",
-        ]
-
-    def test_two_nodes_for_one_application_in_one_request(self) -> None:
-        asked = goal([application(), application(node="cloud")])
-        assert [found.split(":")[0] for found in MemoryRepo().faults(asked)] == [
-            "apps[1].header.node_id"
-        ]
-
-    def test_an_application_that_a_vehicle_holds_is_not_left_half_booked(
-        self, books: MemoryRepo
-    ) -> None:
-        asked = goal(
-            [application("new", who=["vehicle01"])],
-            [connection(who=["vehicle01"], broker="cloud")],
-        )
-        books.faults(asked)
-        assert books.books()["services"].keys() == {
-            "od-edge-vehicle00",
-            "of-edge-object-detection-fusion-cf7e0180a8bb",
-        }
-
-
-class TestShutdowns:
-    """A shutdown releases what is held, nothing else, and never by guess."""
-
-    def test_a_typo_shows_with_the_claims_that_come_near(self) -> None:
-        books = MemoryRepo()
-        books.send(perception())
-        assert books.faults(goal([application(who=["vehicle01"])], shutdown=True)) == [
-            "apps[0].header.id: nothing that the shutdown lists is held; similar claims: "
-            "application 'edge/object_detection_fusion' for vehicle00 (request 'request')"
-        ]
-
-    def test_a_misspelt_id_shows_what_the_requester_holds(self) -> None:
-        books = MemoryRepo()
-        books.send(perception())
-        assert books.faults(goal([application("edge/fusion")], shutdown=True)) == [
-            "apps[0].header.id: nothing that the shutdown lists is held; similar claims: "
-            "application 'edge/object_detection_fusion' for vehicle00; "
-            "connection 'vehicle00/edge' for vehicle00"
-        ]
-
-    def test_a_shutdown_sent_again_does_no_harm(self) -> None:
-        books = MemoryRepo()
-        books.send(perception())
-        who = ["vehicle01"]
-        books.send(goal([application("other", who=who)], [connection(who=who)], id="other"))
-        assert books.send(perception(shutdown=True)).outcome == "released"
-        standing = books.books()
-        books.faults(perception(shutdown=True))
-        assert books.books() == standing
-
-    def test_what_was_not_held_is_named_and_the_rest_released(self) -> None:
-        books = MemoryRepo()
-        books.send(perception())
-        asked = goal(
-            [application(), application("nothing")],
-            [connection(topics=[CLOUD[0], "/never"])],
-            shutdown=True,
-        )
-        decision = books.send(asked)
-        assert decision.outcome == "released"
-        assert decision.changes.not_held == (
-            "application 'nothing' for vehicle00",
-            "connection 'vehicle00/edge': topic /never",
-        )
-        assert books.books() == {"services": {}, "connections": {}}
-
-    def test_an_unknown_requester_on_shutdown_leaves_nothing_half_booked(self) -> None:
-        books = MemoryRepo()
-        books.send(perception())
-        asked = goal([application(who=["nobody"])], [connection(who=["nobody"])], shutdown=True)
-        assert len(books.faults(asked)) == 1
-        assert books.books()["connections"]["vehicle00/edge"]["requesters"] == ["vehicle00"]
-
-    def test_which_of_several_claims_is_meant_is_not_guessed(self) -> None:
-        books = MemoryRepo()
-        for id in ("one", "two"):
-            books.send(goal([application(who=["vehicle00", id])], id=id))
-        asked = goal([application()], id="three", shutdown=True)
-        assert len(books.faults(asked)) == 1
-
-    def test_a_shutdown_by_one_of_the_requesters_releases_the_only_claim_that_has_it(self) -> None:
-        books = MemoryRepo()
-        books.send(goal([application(who=["vehicle00", "station00"])]))
-        asked = goal([application(who=["station00"])], shutdown=True)
-        assert books.send(asked).outcome == "released"
-        assert books.books()["services"] == {}
-
-
-def test_every_fault_of_a_request_is_told_at_once() -> None:
+def test_what_was_not_held_is_named_and_the_rest_released() -> None:
+    books = MemoryRepo()
+    books.send(perception())
     asked = goal(
-        [application("..", node="Mars", who=[], ego=[("/a b", "Mars")], type=7)],
-        [connection("", who=[""], ends=("egde", "edge"), topics=["/a"], targets=[], type=5)],
-        id="a\nb",
+        [application(), application("nothing")],
+        [connection(topics=[CLOUD[0], "/never"])],
+        shutdown=True,
     )
-    assert sorted(MemoryRepo().faults(asked)) == sorted(
-        [
-            r"id: 'a\nb' holds the control character U+000A; choose an id without it",
-            "apps[0].header.id: '..' holds '..'; choose an id without it",
-            f"apps[0].header.node_id: 'Mars' is not in inventory/nodes.yaml; known: {NODES}",
-            f"{BODY}.requester_ids: is empty; list at least one requester",
-            f"{BODY}.ego_data_topics[0].topic_name: '/a b' {ROS_NAMES}",
-            f"{BODY}.ego_data_topics[0].source_node_id: 'Mars' is not in inventory/nodes.yaml; "
-            f"known: {NODES}",
-            "apps[0].type: 7 is not a known application type; known: 1 (object-detection-fusion)",
-            f"{C0}.id: is empty; give an id",
-            f"{C0}.requester_ids[0]: is empty; give an id",
-            f"{C0}.source_node_id: 'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",
-            f"{C0}.target_topics: has 0 names for 1 in source_topics; source topic i goes to "
-            "target topic i, so list as many of each",
-            f"{C0}.type: 5 is not a connection type; {TYPES}",
-        ]
+    decision = books.send(asked)
+    assert decision.outcome == "released"
+    assert decision.changes.not_held == (
+        "application 'nothing' for vehicle00",
+        "connection 'vehicle00/edge': topic /never for vehicle00",
     )
+    assert books.books() == {"services": {}, "connections": {}}
 
 
-def test_faults_are_in_the_order_of_the_request() -> None:
-    asked = goal([application(who=[]), application("..")], [connection(who=[])], id="\n")
-    fields = [found.split(": ")[0] for found in MemoryRepo().faults(asked)]
-    assert fields == ["id", f"{BODY}.requester_ids", "apps[1].header.id", f"{C0}.requester_ids"]
+def test_the_oldest_claim_gives_first_and_only_the_hold_of_the_one_that_leaves() -> None:
+    books = MemoryRepo()
+    books.take_all(goal([application(who=["vehicle00", id])], id=id) for id in ("one", "two"))
+    assert books.send(goal([application()], id="three", shutdown=True)).outcome == "released"
+    left = sorted(claim.requesters for claim in books.state.ledger)
+    assert left == [("one",), ("two", "vehicle00")]
 
 
-def test_a_warning_and_no_refusal_for_an_input_that_no_connection_carries() -> None:
-    asked = goal([application(APP, ego=[EGO])], [connection()])
-    assert MemoryRepo().send(asked).warnings == (
-        "application 'edge/object_detection_fusion': no connection carries ego_data "
-        "/vehicles/vehicle00/ego_data of 'vehicle00' to 'edge'",
-    )
+def test_a_shutdown_sent_again_changes_nothing_and_says_so() -> None:
+    books = MemoryRepo()
+    books.send(perception())
+    books.send(perception(id="other"))
+    assert books.send(perception(shutdown=True)).outcome == "released"
+    standing = books.books()
+    again = books.send(perception(shutdown=True))
+    assert (again.outcome, again.files, books.books()) == ("unchanged", {}, standing)
+    assert again.warnings[0].startswith("the same shutdown was carried out at ")

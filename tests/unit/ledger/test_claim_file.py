@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
+from random import Random
 from types import MappingProxyType
 
+import pytest
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.mqtt import MQTT
@@ -12,13 +15,16 @@ from demandops.connections.route import Route, merged_routes
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, ClaimKey, demand_id
 from demandops.demand.demand_request import id_problem
+from demandops.demand.lease import LONGEST_S, Lease
+from demandops.errors import InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.subject import Subject, SubjectKind
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.chance import examples
+from tests.kit.chance import chances, examples
+from tests.kit.memory import rebuilt
 
 TRICKY = [
     *("null", "~", "yes", "on", "1", "1e3", "0x1f", "1_000", "12:30:45", "2026-01-31", ".inf"),
@@ -43,7 +49,13 @@ ids = st.one_of(st.sampled_from(TRICKY), st.text(min_size=1, max_size=20)).filte
     lambda text: not id_problem(text)
 )
 topics = st.from_regex(r"(/[a-zA-Z_][a-zA-Z0-9_]{0,6}){1,3}", fullmatch=True)
-moments = st.datetimes(datetime(2000, 1, 1), datetime(2100, 1, 1), timezones=st.just(timezone.utc))
+zones = [timezone(timedelta(hours=hours, minutes=45)) for hours in (-11, 5)]
+moments = st.datetimes(
+    datetime(2000, 1, 1),
+    datetime(2100, 1, 1),
+    timezones=st.sampled_from([timezone.utc, *zones]),
+)
+leases = st.none() | st.builds(Lease, st.integers(1, LONGEST_S), st.integers(0, LONGEST_S), moments)
 people = st.lists(ids, min_size=1, max_size=4, unique=True).map(lambda who: tuple(sorted(who)))
 inputs = st.lists(st.builds(InputTopic, topics, ids, st.just("") | ids), min_size=1, max_size=4)
 routes = st.builds(
@@ -60,9 +72,10 @@ routes = st.builds(
     queue=st.integers(0, 1000),
     rate=st.sampled_from([0.0, 0.5, 10.0]),
 )
+words = ids | st.text(st.characters(codec="utf-8"))
 values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | ids,
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(ids, inner, max_size=3),
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | words,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3),
     max_leaves=6,
 )
 
@@ -76,7 +89,7 @@ def by_place(found: list[InputTopic]) -> tuple[InputTopic, ...]:
 def applications(draw: st.DrawFn) -> Application:
     return Application(
         id=draw(ids),
-        appdef="object-detection-fusion",
+        appdef=draw(ids),
         node=draw(ids),
         inputs=MappingProxyType(
             {
@@ -86,6 +99,7 @@ def applications(draw: st.DrawFn) -> Application:
             }
         ),
         parameters=MappingProxyType(draw(st.dictionaries(ids, values, max_size=3))),
+        version=draw(st.sampled_from(["", "1.0.0", "1e3", "0x10", "next", "on", "2024-01-01"])),
     )
 
 
@@ -100,37 +114,41 @@ connections = st.builds(
 )
 
 
+claims = st.builds(
+    Claim,
+    held=applications() | connections,
+    demand=ids,
+    request=st.just("") | ids,
+    requesters=people,
+    booked=moments,
+    lease=leases,
+)
+
+
 @st.composite
-def all_claims(draw: st.DrawFn) -> Claim:
-    request, who = draw(st.just("") | ids), draw(people)
-    held = draw(applications() | connections)
-    return Claim(held, demand_id(request, who), request, who, draw(moments))
+def joined_claims(draw: st.DrawFn) -> Claim:
+    """Return a claim of the reference's action; some of its requesters hold each topic."""
+    claim = replace(draw(claims), joined=True)
+    some = st.sets(st.sampled_from(claim.requesters), min_size=1)
+    holders = {topic: tuple(sorted(draw(some))) for topic in claim.held.topic_keys()}
+    return claim.with_holders(claim.held, holders)
 
 
-claims = all_claims()
-
-
-@examples(50)
-@given(claims)
+@examples(100)
+@given(claims | joined_claims())
 def test_every_claim_survives_its_file(claim: Claim) -> None:
     path, text = claim_file.path_of(claim.key), claim_file.text_of(claim)
 
-    read = claim_file.read(text, path)
+    read = claim_file.read(text.encode().decode(), path)
 
     assert read == claim
+    if claim.is_on_application:  # 1, 1.0 and True are equal
+        parameters = (sorted(held.application.parameters.items()) for held in (read, claim))
+        assert len(set(map(repr, parameters))) == 1
     assert claim_file.text_of(read) == text
     assert claim_file.kind_of(path) is claim.subject.kind
     assert path.isascii()
     assert all(0 < len(part) <= 100 for part in path.split("/"))
-
-
-@examples(30)
-@given(claims)
-def test_a_claim_that_is_booked_and_dropped_leaves_an_empty_ledger(claim: Claim) -> None:
-    ledger = Ledger().replace(claim.key, claim)
-
-    assert list(ledger) == [claim]
-    assert ledger.replace(claim.key, None) == Ledger()
 
 
 @examples(30)
@@ -143,13 +161,65 @@ def test_two_claims_never_share_a_file(keys: dict[tuple[SubjectKind, str, str], 
     assert len(paths) == len(keys)
 
 
-@examples(60)
-@given(moments, st.integers(-12, 14))
-def test_a_time_is_the_same_moment_in_any_zone(moment: datetime, hours: int) -> None:
-    here = moment.astimezone(timezone(timedelta(hours=hours)))
+def everything(ledger: Ledger) -> tuple[object, ...]:
+    return ledger.claims, ledger.index, ledger.minutes
+
+
+@examples(35)
+@given(st.lists(claims, max_size=8), chances)
+def test_a_ledger_is_the_same_in_whatever_order_it_was_built(
+    claims: list[Claim], random: Random
+) -> None:
+    ledger = rebuilt(claims)
+    for claim in random.sample(claims, len(claims) // 2):
+        ledger = ledger.replace(claim.key, None)
+    rest = list(ledger)
+    assert everything(ledger) == everything(rebuilt(random.sample(rest, len(rest))))
+    ends = [claim.lease.expires_at for claim in rest if claim.lease]
+    assert ledger.next_lease_end() == min(ends, default=None)
+    for now in ends:
+        gone = [claim.lease.expires_at for claim in ledger.ended_claims(now) if claim.lease]
+        assert gone == sorted(end for end in ends if end < now)
+    for claim in rest:
+        ledger = ledger.replace(claim.key, None)
+    assert everything(ledger) == everything(Ledger())
+
+
+def written(claim: Claim, *changes: tuple[str, str]) -> Claim:
+    """Return what is read of a claim's file that a person changed."""
+    text = claim_file.text_of(claim)
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return claim_file.read(text, claim_file.path_of(claim.key))
+
+
+@pytest.mark.parametrize(("demand", "joined"), [(demand_id("r", ["c"]), True), ("trip-7", False)])
+def test_the_first_schema_has_no_action_and_the_demand_id_tells_it(
+    demand: str, joined: bool
+) -> None:
     connection = Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"),))
-    claim = Claim(connection, "b", "", ("c",), here)
+    claim = Claim(connection, demand, "r", ("c",), datetime(2026, 1, 31, tzinfo=timezone.utc))
 
-    read = claim_file.read(claim_file.text_of(claim), claim_file.path_of(claim.key))
+    assert written(claim) == claim
+    assert written(claim, ("ledger/v2", "ledger/v1")) == replace(claim, joined=joined)
 
-    assert read.booked == moment
+
+def test_a_topic_names_requesters_of_the_claim_only() -> None:
+    inputs = {"point_cloud": (InputTopic("/a", "v"), InputTopic("/b", "v"))}
+    claims = [
+        Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"), Route("/c", "/d"))),
+        Application("a", "object-detection-fusion", "edge", inputs),
+    ]
+    places = ("topics./a.requesters", "inputs.point_cloud[0].requesters")
+    for held, place in zip(claims, places, strict=True):
+        first, second = held.topic_keys()
+        claim = Claim(held, "d", "r", ("c", "e"), datetime(2026, 1, 31, tzinfo=timezone.utc))
+        claim = claim.with_holders(held, {first: ("e",), second: ("c", "e")})
+        with pytest.raises(InvalidInput) as error:
+            written(claim, ("    - e\n", "    - e\n    - x\n"))
+        (found,) = error.value.faults
+        assert found.field == place
+        assert found.message == (
+            "x is not among the requesters of the claim; add it there, or remove it here"
+        )

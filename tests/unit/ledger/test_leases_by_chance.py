@@ -6,27 +6,24 @@ Held against ``tests/model/leases.py``, which knows what is promised and not the
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import datetime, timedelta, timezone
+from datetime import timedelta
+from itertools import combinations
 from random import Random
-from types import MappingProxyType
 from typing import Any
 
 from demandops.config.load import load
-from demandops.connections.connection import Connection
-from demandops.connections.connection_types import CONNECTION_TYPES
-from demandops.connections.route import Route, merged_routes
 from demandops.decision import Decision, State
-from demandops.demand.application import Application, InputTopic
-from demandops.demand.claim import Claim
-from demandops.demand.lease import LONGEST_S, Lease
-from demandops.identifiers import id_problem
+from demandops.demand.application import Application
+from demandops.demand.claim import Claim, demand_id
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.recent_shutdowns import RecentShutdowns
 from hypothesis import given, note
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
-from tests.model.leases import BY_MESSAGE, Goal, Promises, Subject
+from tests.kit.memory import ledger_in
+from tests.model.leases import Goal, Promises, Subject, by_message
 from tests.scenarios import running
 
 SLACK_S = 30
@@ -41,7 +38,7 @@ EMPTY = State.of(load(FILES), Ledger())
 DEMANDS = ("d0", "d1", "D1", "d/2")
 PEOPLE = ("vehicle00", "vehicle01", "station00")
 LEASES = (None, 10, 60, 90)
-PAUSES = (0, 0, 1, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 3600)
+PAUSES = (1, 1, 2, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 900, 3600)
 
 
 class Maker:
@@ -50,6 +47,7 @@ class Maker:
     def __init__(self, random: Random) -> None:
         self._random = random
         self._puts: list[Goal] = []
+        self._shutdowns: list[Goal] = []
 
     def any(self) -> Goal:
         kind = self._random.randrange(20)
@@ -60,6 +58,8 @@ class Maker:
             return self._puts[-1]
         if kind < 16:
             return self._named("release" if kind == 14 else "renew")
+        if kind == 19 and self._shutdowns:
+            return self._random.choice(self._shutdowns[-2:])
         return self._message(shutdown=kind > 17)
 
     def _of_known(self, kind: int) -> Goal:
@@ -124,16 +124,26 @@ class Maker:
             "target_topics": topics,
         }
         request = self._random.choice(["m0", "m1"])
-        return {"id": request, "shutdown": shutdown, "connections": [item]}
+        made = {"id": request, "shutdown": shutdown, "connections": [item]}
+        if shutdown:
+            self._shutdowns.append(made)
+        return made
 
 
 Name = tuple[str, Subject]
 
 
+MESSAGES = {
+    demand_id(request, who): by_message(request, who)
+    for request in ("m0", "m1")
+    for count in (1, 2, 3)
+    for who in combinations(PEOPLE, count)
+}
+
+
 def name_of(claim: Claim) -> Name:
     """Return what the model knows a claim by."""
-    by_message = f"{BY_MESSAGE}{claim.request} {sorted(claim.requesters)}"
-    demand = claim.demand if claim.demand in DEMANDS else by_message
+    demand = MESSAGES.get(claim.demand, claim.demand)
     return demand, (claim.subject.kind.value, claim.subject.id)
 
 
@@ -152,24 +162,16 @@ def claims_of(world: running.World) -> dict[Name, tuple[dict[str, Any], frozense
         else:
             topics = {route.source: route.target for route in held.topics}
             what = {"source": held.source, "target": held.target, "topics": topics}
+            what["holds"] = {one: frozenset(claim.holders((one,))) for one in topics}
         found[name_of(claim)] = what, frozenset(claim.requesters)
     return found
 
 
 def restart(world: running.World, random: Random) -> None:
     """Go on from the files alone, read in any order."""
-    claims = [
-        claim_file.read(text, path)
-        for path, text in world.files.items()
-        if claim_file.kind_of(path)
-    ]
-    random.shuffle(claims)
-    ledger = running.rebuilt(claims)
-    assert (ledger.claims, ledger.index, ledger.minutes) == (
-        world.state.ledger.claims,
-        world.state.ledger.index,
-        world.state.ledger.minutes,
-    )
+    files = random.sample(sorted(world.files.items()), len(world.files))
+    ledger = ledger_in(dict(files))
+    assert ledger == world.state.ledger
     world.state = replace(world.state, ledger=ledger)
     world.restart()
 
@@ -244,103 +246,6 @@ def leave_all(world: running.World, promises: Promises, now: int) -> None:
             continue  # went with another of its demand
         release = {"kind": "Demand", "operation": "release", "demand": claim.demand}
         world.take(release | {"requesters": list(claim.requesters)})
-    assert world.state.ledger == Ledger()
+    assert replace(world.state.ledger, shutdowns=RecentShutdowns()) == Ledger()
     assert world.rendered() == {}
     assert not [path for path in world.files if claim_file.kind_of(path)]
-
-
-# What is written is what is read
-
-letters = st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Zs", "Zl", "Zp"])
-ids = st.text(letters, min_size=1, max_size=20).filter(lambda text: not id_problem(text))
-topics = st.from_regex(r"(/[a-z_]{1,9}){1,3}", fullmatch=True)
-values = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats(allow_nan=False, allow_infinity=False)
-    | st.text(st.characters(codec="utf-8")),
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.dictionaries(st.text(st.characters(codec="utf-8")), inner, max_size=3)
-    ),
-    max_leaves=8,
-)
-moments = st.datetimes(
-    datetime(2000, 1, 1), datetime(2100, 1, 1), timezones=st.sampled_from([
-        timezone.utc, timezone(timedelta(hours=5, minutes=45)), timezone(timedelta(hours=-11)),
-    ]),
-)  # fmt: skip
-leases = st.none() | st.builds(Lease, st.integers(1, LONGEST_S), st.integers(0, LONGEST_S), moments)
-people = st.sets(ids, min_size=1, max_size=3).map(lambda found: tuple(sorted(found)))
-common = {
-    "demand": ids, "request": ids, "requesters": people, "booked": moments, "lease": leases,
-}  # fmt: skip
-inputs = st.dictionaries(
-    st.sampled_from(["ego_data", "point_cloud"]),
-    st.sets(st.builds(InputTopic, topics, ids), min_size=1, max_size=3).map(
-        lambda found: tuple(sorted(found))
-    ),
-)
-applications = st.builds(
-    Application,
-    id=ids,
-    appdef=ids,
-    node=ids,
-    inputs=inputs.map(lambda found: MappingProxyType(dict(sorted(found.items())))),
-    parameters=st.dictionaries(ids, values, max_size=3).map(MappingProxyType),
-    version=st.just("") | st.sampled_from(["1.0.0", "1e3", "0x10", "next", "on", "2024-01-01"]),
-)
-routes = st.builds(Route, topics, topics, reverse=st.booleans(), qos=st.integers(0, 2))
-connections = st.builds(
-    Connection,
-    id=ids,
-    type=st.sampled_from(CONNECTION_TYPES),
-    source=ids,
-    target=ids,
-    broker=st.just("") | ids,
-    topics=st.lists(routes, min_size=1, max_size=3).map(merged_routes),
-)
-all_claims = st.builds(Claim, held=applications | connections, **common)
-
-
-@examples(100)
-@given(all_claims)
-def test_a_claim_is_read_as_it_was_written(claim: Claim) -> None:
-    path = claim_file.path_of(claim.key)
-    text = claim_file.text_of(claim)
-    found = claim_file.read(text.encode().decode(), path)
-    assert found == claim
-    assert claim_file.text_of(found) == text
-    if claim.is_on_application:
-        assert repr(sorted(found.application.parameters.items())) == repr(
-            sorted(claim.application.parameters.items())
-        )
-
-
-@examples(35)
-@given(st.lists(all_claims, max_size=8), chances)
-def test_the_index_is_that_of_a_ledger_built_in_any_order(
-    claims: list[Claim], random: Random
-) -> None:
-    ledger = running.rebuilt(claims)
-    for claim in random.sample(claims, len(claims) // 2):
-        ledger = ledger.replace(claim.key, None)
-    rest = list(ledger)
-    random.shuffle(rest)
-    again = running.rebuilt(rest)
-    assert (ledger.claims, ledger.index, ledger.minutes) == (
-        again.claims,
-        again.index,
-        again.minutes,
-    )
-    ends = [claim.lease.expires_at for claim in rest if claim.lease]
-    assert ledger.next_lease_end() == min(ends, default=None)
-    for now in ends:
-        gone = ledger.ended_claims(now)
-        assert {claim.key for claim in gone} == {
-            claim.key for claim in rest if claim.lease and claim.lease.expires_at < now
-        }
-        assert [c.lease.expires_at for c in gone if c.lease] == sorted(
-            c.lease.expires_at for c in gone if c.lease
-        )

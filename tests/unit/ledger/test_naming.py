@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples, told
+from tests.kit.goals import EGO, application, connection, goal
 from tests.kit.memory import MemoryRepo
-from tests.model.goals import goal
 
 DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
 ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -36,8 +36,9 @@ hashed = st.builds(
     st.text("0123456789abcdef", min_size=12, max_size=12),
 )
 long = st.builds(
-    lambda filler, end: filler * (300 // len(filler)) + end,
+    lambda filler, size, end: filler * (size // len(filler)) + end,
     st.sampled_from(["a", "ab-", "a/", "x_", "ü"]),
+    st.sampled_from([54, 300, 1000]),
     st.sampled_from(["", "a", "b", "-", "_a"]),
 )
 anything = st.text(min_size=1, max_size=12)
@@ -141,47 +142,20 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
     nodes: list[str], applications: list[str], connections: list[str], clouds: list[str]
 ) -> None:
     repo = with_nodes(nodes)
-    asked = [(node, cloud) for node in nodes for cloud in [usual_cloud(nodes, node), *clouds]]
-    request = told(
-        [
-            goal(
-                "",
-                [
-                    {
-                        "header": {"id": id_, "node_id": nodes[place % len(nodes)]},
-                        "type": 1,
-                        "object_detection_fusion_app": {
-                            "requester_ids": ["somebody"],
-                            "pointcloud_topics": [
-                                {"source_node_id": node, "topic_name": cloud}
-                                for node, cloud in asked
-                            ],
-                        },
-                    }
-                    for place, id_ in enumerate(applications)
-                ],
-                [
-                    {
-                        "id": id_,
-                        "type": 1,
-                        "broker_node_id": "edge",
-                        "requester_ids": ["somebody"],
-                        "source_node_id": nodes[0],
-                        "target_node_id": nodes[1],
-                        "source_topics": ["/a"],
-                        "target_topics": ["/b"],
-                    }
-                    for id_ in connections
-                ],
-            )
-        ]
-    )[0]
+    asked = [(cloud, node) for node in nodes for cloud in [usual_cloud(nodes, node), *clouds]]
+    places = [nodes[place % len(nodes)] for place in range(len(applications))]
+    apps = [
+        application(id_, node=node, clouds=asked)
+        for id_, node in zip(applications, places, strict=True)
+    ]
+    ends = nodes[0], nodes[1]
+    links = [connection(id_, ends=ends, topics=["/a"], targets=["/b"]) for id_ in connections]
+    (request,) = told([goal(apps, links)])
 
     taken = repo.take(request)
 
     assert isinstance(taken, Decision), taken
-    places = {nodes[place % len(nodes)] for place in range(len(applications))}
-    releases = len(places) * len(asked) + len(applications) + 2 * len(connections)
+    releases = len(set(places)) * len(asked) + len(applications) + 2 * len(connections)
     assert len(taken.releases) == len({release.name for release in taken.releases}) == releases
     manifests = [
         text for path, text in taken.files.items() if text and path.startswith("clusters/")
@@ -189,8 +163,8 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
     assert len(manifests) == releases
     lowered = [path.lower() for path in taken.files]
     assert len(set(lowered)) == len(lowered), "a file system without case would mix them up"
-    assert all(len(part) <= 255 for path in taken.files for part in path.split("/"))
-    for node in places:
+    assert all(len(part) <= 100 for path in taken.files for part in path.split("/"))
+    for node in set(places):
         produced = [
             topic
             for text in manifests
@@ -201,28 +175,13 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
         assert all(ROS_TOPIC.fullmatch(topic) for topic in produced)
     shutdown = repo.take({**request, "shutdown": True})
     assert isinstance(shutdown, Decision), shutdown
+    repo.forget_shutdowns()
     assert repo.files == with_nodes(nodes).files
 
 
 def test_the_watcher_of_one_application_is_not_named_like_the_fusion_of_another() -> None:
     repo = MemoryRepo()
-    item = {
-        "requester_ids": ["somebody"],
-        "ego_data_topics": [{"source_node_id": "vehicle00", "topic_name": "/ego"}],
-    }
-    repo.take(
-        goal(
-            "",
-            [
-                {
-                    "header": {"id": id_, "node_id": "edge"},
-                    "type": 1,
-                    "object_detection_fusion_app": item,
-                }
-                for id_ in ("x", "x-watcher")
-            ],
-        )
-    )
+    repo.send(goal([application(id_, ego=[EGO], clouds=[]) for id_ in ("x", "x-watcher")]))
 
     texts = repo.below("clusters").values()
     names = [name for text in texts for name in re.findall(r"nodeName: (\S+)", text)]

@@ -5,111 +5,130 @@ The model in ``tests/model`` knows the design and not the program; both take the
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from datetime import timedelta
 from random import Random
 
 import pytest
-from demandops.decision import Decision, State, rendered_files
-from demandops.demand.claim import Claim
-from demandops.errors import Refused
+from demandops.decision import Decision, rendered_files
+from demandops.demand.claim import ClaimKey, demand_id
 from demandops.ledger import claim_file
-from demandops.ledger.ledger import Ledger
-from hypothesis import assume, given, note
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import TIMES, chances, examples, told
-from tests.kit.memory import NOW, MemoryRepo, outcome
-from tests.model.books import Books, Demand, Goal
-from tests.model.goals import (
-    SKELETON,
-    STATION_CLOUD,
-    VEHICLE_CLOUD,
-    Maker,
-    application,
-    connection,
-    ego,
-    goal,
-    shutdown_of,
-    summary,
-)
+from tests.kit.goals import application, connection, goal
+from tests.kit.memory import MemoryRepo, ledger_in, outcome
+from tests.model.books import Books, Demand, Goal, Result
+from tests.model.goals import SKELETON, Maker, ego, shutdown_of
+
+PAUSES = (1, 1, 1, 60, 400, 899, 900, 901)
+"""Seconds between two requests; a shutdown is remembered for 900."""
+
+Key = tuple[tuple[str, str], str]
+"""A subject and a demand id."""
 
 
-def demand_in(claim: Claim) -> tuple[str, str, Demand]:
-    """Return what the model knows a claim by."""
-    kind = "application" if claim.is_on_application else "connection"
-    return kind, claim.subject.id, (claim.request, claim.requesters)
+def key_of(subject: tuple[str, str], demand: Demand) -> Key:
+    """Return what the program knows a claim of the model by."""
+    return subject, demand_id(*demand)
 
 
-def ledger_in(repo: MemoryRepo) -> Ledger:
-    """Return the ledger as one who only has the files reads it."""
-    ledger = Ledger()
-    for path, text in repo.below("ledger").items():
-        claim = claim_file.read(text, path)
-        ledger = ledger.replace(claim.key, claim)
-    return ledger
+def key_in(key: ClaimKey) -> Key:
+    """Return the key of a claim in plain words."""
+    return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
 
 
-# As the model has it
+class Walk:
+    """A repo and the model, which take the same requests; what must hold is seen after each."""
+
+    def __init__(self, random: Random) -> None:
+        self.maker = Maker(random)
+        self._random = random
+        self._repo, self._books = MemoryRepo(), Books(SKELETON)
+
+    def take(self, request: Goal) -> None:
+        pause = self._random.choice(PAUSES)
+        self._repo.now += timedelta(seconds=pause)
+        expected = self._books.take(request, pause)
+        taken = self._repo.take(request)
+        assert outcome(taken) == expected.outcome, (pause, expected, taken)
+        holds = {key_of(*key): holds for key, holds in self._books.holds().items()}
+        assert self._holds() == holds, (pause, request)
+        assert self._repo.view() == self._books.view()
+        if isinstance(taken, Decision):
+            assert_changes(taken, expected)
+            if not request["shutdown"]:
+                self._assert_counts_once(request)
+
+    def assert_rendered_from_the_files(self) -> None:
+        """Step by step gave what one gives who only has the claims' files."""
+        fresh = replace(self._repo.state, ledger=ledger_in(self._repo.files))
+        assert fresh.ledger == self._repo.state.ledger
+        at_once = rendered_files(fresh)
+        assert self._repo.below(*{path.split("/")[0] for path in at_once}) == at_once
+
+    def _holds(self) -> dict[Key, dict[tuple[str, ...], set[str]]]:
+        return {
+            key_in(claim.key): {key: set(claim.holders(key)) for key in claim.held.topic_keys()}
+            for claim in self._repo.state.ledger
+        }
+
+    def _assert_counts_once(self, request: Goal) -> None:
+        same = self.maker.again(request)
+        again = self._repo.decide(same, self._repo.now + timedelta(days=1))
+        assert again.outcome == "unchanged", same
+        assert again.state == self._repo.state
+        assert (dict(again.files), again.changes.claims, again.releases) == ({}, (), ())
 
 
-@examples(45)
+def assert_changes(taken: Decision, expected: Result) -> None:
+    """The claims that change are written, no others, and what was not held is named."""
+    changed = {key_in(change.key) for change in taken.changes.claims}
+    assert changed == {key_of(*key) for key in expected.touched}
+    paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
+    assert {path for path in taken.files if claim_file.kind_of(path)} == paths
+    assert bool(taken.files) == expected.effective
+    named = taken.changes.not_held
+    for vain in expected.not_held:
+        assert any(_names(text, *vain) for text in named), (vain, named)
+    for text in named:
+        assert any(_names(text, *vain) for vain in expected.not_held), (text, expected.not_held)
+
+
+def _names(text: str, subject: str, topic: tuple[str, ...] | None, who: str) -> bool:
+    """Tell whether a subject is named for a requester, with this topic or with none."""
+    words = " ".join(("topic", *topic) if len(topic) == 1 else topic[:2]) if topic else ""
+    named = ": " not in text or f": {words} " in text
+    return named and f"'{subject}'" in text and text.endswith(f" for {who}")
+
+
+@examples(60)
 @given(chances, st.integers(1, 14))
-def test_bookkeeping_and_outcomes_are_the_models_after_every_request(
+def test_bookkeeping_files_and_outcomes_are_the_models_after_every_request(
     random: Random, length: int
 ) -> None:
-    repo, books = MemoryRepo(), Books(SKELETON)
-    for request in told(Maker(random).sequence(length)):
-        expected = books.take(request)
-        taken = repo.take(request)
-        assert outcome(taken) == expected.outcome, (expected, taken)
-        assert {demand_in(claim) for claim in repo.state.ledger} == books.demands()
-        assert repo.view() == books.view()
+    walk = Walk(random)
+    for request in told(walk.maker.sequence(length)):
+        walk.take(request)
+    walk.assert_rendered_from_the_files()
 
 
 @pytest.mark.parametrize("seed", range(2 * TIMES))
-def test_bookkeeping_stays_the_models_over_a_long_time(seed: int) -> None:
-    repo, books = MemoryRepo(), Books(SKELETON)
-    for place, request in enumerate(Maker(Random(seed)).sequence(150)):
-        expected = books.take(request)
-        taken = repo.take(request)
-        assert outcome(taken) == expected.outcome, (place, request, expected, taken)
-        assert repo.view() == books.view(), (place, request)
-
-
-@examples(45)
-@given(chances, st.integers(1, 14))
-def test_a_shutdown_names_what_was_not_held_and_nothing_else(random: Random, length: int) -> None:
-    repo, books = MemoryRepo(), Books(SKELETON)
-    for request in told(Maker(random).sequence(length)):
-        expected = books.take(request)
-        taken = repo.take(request)
-        if isinstance(taken, Refused) or expected.outcome == "refused":
-            continue
-        named = taken.changes.not_held
-        for subject, topic in expected.not_held:
-            about = [text for text in named if f"'{subject}'" in text]
-            assert any(_whole(text) or f" {topic}" in text for text in about), (subject, named)
-        for text in named:
-            assert any(
-                f"'{subject}'" in text and (_whole(text) or f" {topic}" in text)
-                for subject, topic in expected.not_held
-            ), (text, expected.not_held)
-
-
-def _whole(text: str) -> bool:
-    """Tell whether a subject is named with no topic."""
-    return ": " not in text
+def test_they_stay_the_models_over_a_long_time(seed: int) -> None:
+    walk = Walk(Random(seed))
+    for request in walk.maker.sequence(120):
+        walk.take(request)
+    walk.assert_rendered_from_the_files()
 
 
 def test_a_subject_listed_twice_in_one_shutdown_costs_one_claim_only() -> None:
-    who = ["vehicle00", "station00"]
-    item = connection("station00/edge", who, ["/status"])
+    item = connection("station00/edge", who=["vehicle00", "station00"], topics=["/status"])
     repo = MemoryRepo()
-    repo.take_all([goal("first", connections=[item]), goal("second", connections=[item])])
+    repo.take_all([goal([], [item], id=id) for id in ("first", "second")])
     whole = {**item, "source_topics": [], "target_topics": []}
 
-    repo.take(goal("first", connections=[item, whole], shutdown=True))
+    repo.take(goal([], [item, whole], id="first", shutdown=True))
 
     (left,) = repo.state.ledger
     assert left.request == "second"
@@ -117,32 +136,17 @@ def test_a_subject_listed_twice_in_one_shutdown_costs_one_claim_only() -> None:
 
 def test_a_topic_that_a_shutdown_lists_twice_is_not_said_to_be_not_held() -> None:
     repo = MemoryRepo()
-    topics = [ego("vehicle00"), ego("vehicle01")]
-    repo.take(goal("one", [application("cloud/fusion", ["vehicle00"], topics)]))
-    twice = [
-        application("cloud/fusion", ["vehicle00"], topics[:1]),
-        application("cloud/fusion", ["vehicle00"], topics),
-    ]
+    both, first = (
+        application("cloud/fusion", node="cloud", ego=map(ego, vehicles), clouds=[])
+        for vehicles in (["vehicle00", "vehicle01"], ["vehicle00"])
+    )
+    repo.take(goal([both]))
 
-    taken = repo.take(goal("one", twice, shutdown=True))
+    taken = repo.take(goal([first, both], shutdown=True))
 
     assert isinstance(taken, Decision)
     assert taken.outcome == "released"
     assert taken.changes.not_held == ()
-
-
-def test_a_shutdown_may_leave_out_the_ends_of_a_connection() -> None:
-    repo = MemoryRepo()
-    joined = connection("station00/edge", ["station00"], ["/status"])
-    repo.take(goal("one", connections=[joined]))
-    bare = {**joined, "source_node_id": "", "target_node_id": ""}
-
-    taken = repo.take(goal("one", connections=[bare], shutdown=True))
-
-    assert outcome(taken) == "released", taken
-
-
-# Nothing stays behind
 
 
 @examples(20)
@@ -168,6 +172,8 @@ def test_a_released_demand_leaves_no_trace(random: Random, before: int, after: i
     left = outcome(with_guest.take(shutdown_of(guest)))
 
     assert (came, left) in (("booked", "released"), ("refused", "refused"))
+    with_guest.forget_shutdowns()
+    without.forget_shutdowns()
     assert with_guest.state == without.state
     assert with_guest.files == without.files
 
@@ -180,104 +186,9 @@ def test_when_all_have_left_the_repo_is_as_it_was_laid_down(random: Random, coun
     repo.take_all(requests)
 
     assert set(repo.take_all([shutdown_of(request) for request in requests])) == {"released"}
+    repo.forget_shutdowns()
     assert repo.state == MemoryRepo().state
     assert repo.files == MemoryRepo().files
-
-
-# Again
-
-
-@examples(28)
-@given(chances, st.integers(1, 8))
-def test_booking_again_changes_nothing(random: Random, length: int) -> None:
-    maker, repo = Maker(random), MemoryRepo()
-    for request in told(maker.sequence(length)):
-        taken = repo.take(request)
-        if outcome(taken) not in ("booked", "unchanged"):
-            continue
-        reworded = maker.again(request)
-        note(f"again: {json.dumps(summary(reworded))}")
-        for same in (request, reworded):
-            again = repo.decide(same, NOW + timedelta(days=1))
-            assert again.outcome == "unchanged"
-            assert again.state == repo.state
-            assert not again.files
-            assert not again.changes.claims
-            assert not again.releases
-
-
-@examples(28)
-@given(chances, st.integers(0, 6))
-def test_a_demand_still_counts_once_when_others_came_in_between(
-    random: Random, others: int
-) -> None:
-    maker, repo = Maker(random, calm=True), MemoryRepo()
-    request = maker.join("mine")
-    repo.take_all(told([request, *(maker.join() for _ in range(others))]))
-
-    assert repo.decide(maker.again(request)).outcome == "unchanged"
-
-
-# Together or not at all
-
-
-@examples(35)
-@given(chances, st.integers(0, 6))
-def test_what_a_request_asks_for_is_booked_together_or_not_at_all(
-    random: Random, before: int
-) -> None:
-    maker, repo = Maker(random), MemoryRepo()
-    repo.take_all(told(maker.sequence(before)))
-    request = told([maker.join()])[0]
-    parts = [goal(request["id"], [app]) for app in request["apps"]]
-    parts += [goal(request["id"], connections=[item]) for item in request["connections"]]
-    one_by_one = MemoryRepo()
-    one_by_one.state, one_by_one.files = repo.state, dict(repo.files)
-    outcomes = [outcome(one_by_one.take(part)) for part in parts]
-    standing, files = repo.state, dict(repo.files)
-
-    taken = repo.take(request)
-
-    if not parts or "refused" in outcomes:
-        assert isinstance(taken, Refused), outcomes
-        assert (repo.state, repo.files) == (standing, files)
-    else:
-        assert outcome(taken) == ("booked" if "booked" in outcomes else "unchanged")
-        assert repo.state == one_by_one.state
-        assert repo.files == one_by_one.files
-
-
-@examples(28)
-@given(chances, st.integers(1, 12))
-def test_a_request_writes_the_claims_it_changes_and_no_others(random: Random, length: int) -> None:
-    repo, books = MemoryRepo(), Books(SKELETON)
-    for request in told(Maker(random).sequence(length)):
-        expected = books.take(request)
-        taken = repo.take(request)
-        if isinstance(taken, Refused):
-            continue
-        changed = [change.after or change.before for change in taken.changes.claims]
-        assert {demand_in(claim) for claim in changed if claim} == expected.touched
-        paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
-        assert {path for path in taken.files if path.startswith("ledger/")} == paths
-        assert bool(taken.files) == expected.effective
-
-
-def test_a_contradiction_in_a_connection_keeps_the_application_from_being_booked() -> None:
-    repo = MemoryRepo()
-    mine = connection("vehicle00/edge", ["vehicle00"])
-    repo.take(goal("one", connections=[mine]))
-    standing = repo.state
-    other = {**mine, "target_node_id": "cloud", "requester_ids": ["station00"]}
-    app = application("edge/object_detection_fusion", ["station00"], clouds=[STATION_CLOUD])
-
-    taken = repo.take(goal("two", [app], [other]))
-
-    assert isinstance(taken, Refused)
-    assert repo.state == standing
-
-
-# Order
 
 
 @examples(14)
@@ -299,26 +210,10 @@ def test_the_order_of_independent_demands_does_not_matter(random: Random, count:
     assert "refused" not in {outcome(one.take(request)) for request in one_order}
     for request in other_order:  # nor does it matter in which order a request lists things
         assert outcome(other.take(maker.again(request))) != "refused"
+    one.forget_shutdowns()
+    other.forget_shutdowns()
     assert one.state == other.state
     assert one.files == other.files
-
-
-# Step by step
-
-
-@examples(28)
-@given(chances, st.integers(1, 12))
-def test_rendering_step_by_step_gives_what_rendering_at_once_gives(
-    random: Random, length: int
-) -> None:
-    repo = MemoryRepo()
-    for request in told(Maker(random).sequence(length)):
-        repo.take(request)
-        at_once = rendered_files(repo.state)
-        assert repo.below(*{path.split("/")[0] for path in at_once}) == at_once
-        fresh = State.of(repo.state.config, ledger_in(repo))
-        assert fresh.ledger == repo.state.ledger
-    assert rendered_files(fresh) == at_once
 
 
 @examples(28)
@@ -347,17 +242,3 @@ def test_a_further_requester_changes_no_release(random: Random, length: int) -> 
     assert isinstance(decision, Decision)
     assert not decision.releases
     assert not [path for path in decision.files if not path.startswith("ledger/")]
-
-
-def test_the_model_and_the_program_agree_on_the_papers_table() -> None:
-    repo, books = MemoryRepo(), Books(SKELETON)
-    joins = []
-    for vehicle in ("vehicle00", "vehicle01", "vehicle03", "vehicle02"):
-        who = [vehicle, "station00"]
-        clouds = [STATION_CLOUD, *([VEHICLE_CLOUD] if vehicle == "vehicle00" else [])]
-        app = application("edge/object_detection_fusion", who, [ego(vehicle)], clouds)
-        joins.append(goal("intersection", [app], [connection("station00/edge", who)]))
-    for request in [*joins, *map(shutdown_of, joins)]:
-        assert outcome(repo.take(request)) == books.take(request).outcome != "refused"
-        assert repo.view() == books.view()
-    assert not books.demands()

@@ -53,12 +53,6 @@ class TestFiles:
         )
         assert claim_file.read(text, claim_file.path_of(held.key)) == held
 
-    def test_a_file_of_before_there_were_options_is_read(self) -> None:
-        held = claim(Route("/a", "/b"))
-        text = claim_file.text_of(held)
-        assert yaml.safe_load(text)["topics"] == {"/a": "/b"}
-        assert claim_file.read(text, claim_file.path_of(held.key)) == held
-
     @pytest.mark.parametrize(
         ("written", "expected"),
         [

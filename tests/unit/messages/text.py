@@ -7,14 +7,17 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from demandops.decision import State
 from demandops.errors import Fault, Refused
 
-from tests.kit.config import edited
+from tests.kit.connections import routes
+from tests.kit.goals import perception
 from tests.kit.memory import MemoryRepo
 from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS
 from tests.unit.config import test_config_mistakes as of_config
+from tests.unit.connections import test_connection_types as of_connections
 from tests.unit.demand import test_refused as of_goals
-from tests.unit.demand import test_wrong_types as of_form
+from tests.unit.demand import wrong_types as of_form
 from tests.unit.overrides import test_override_mistakes as of_overrides
 
 FILE = Path(__file__).with_name("messages.txt")
@@ -23,16 +26,22 @@ _FOREIGN = re.compile(r"(not valid YAML: |input should be )(?!the key|a tag).*?(
 
 def text() -> str:
     """Return the text that ``messages.txt`` must have."""
+    standing = MemoryRepo().send(perception()).state
     sections = {
         "configuration": (
-            (name, of_config.refused(edited(path, old, new)))
-            for name, (path, old, new) in of_config.EDITS.items()
+            (name, of_config.refused(changed)) for name, changed in of_config.MISTAKES.items()
         ),
         "overrides": (
-            (name, of_overrides.refused(tested=of_overrides.text(**changed)))
-            for name, changed in of_overrides.MISTAKES.items()
+            (name, of_overrides.refused(changed)) for name, changed in of_overrides.MISTAKES.items()
         ),
         "goals": ((name, _refusal(goal)) for name, goal in of_goals.REFUSED.items()),
+        "goals that contradict the books": (
+            (name, _refusal(goal, before=standing)) for name, goal in of_goals.CONTRADICTING.items()
+        ),
+        "connections": (
+            (name, _refusal(routes(asked), before=before))
+            for name, (before, asked) in of_connections.REFUSED.items()
+        ),
         "the form of goals": ((name, _refusal(goal)) for name, goal in of_form.WRONG.items()),
     }
     lines = ["Written by `make golden`. Words of pydantic and libyaml are replaced by …", ""]
@@ -41,8 +50,8 @@ def text() -> str:
     return "\n".join([*lines, "# fields", "", *sorted(set(_fields())), ""])
 
 
-def _refusal(goal: object) -> tuple[Fault, ...]:
-    taken = MemoryRepo().take(goal)
+def _refusal(goal: object, *, before: State | None = None) -> tuple[Fault, ...]:
+    taken = MemoryRepo(state=before).take(goal)
     assert isinstance(taken, Refused)
     return taken.faults
 

@@ -31,14 +31,13 @@ def text(**changed: Any) -> str:
     return yaml.safe_dump(told, sort_keys=False)
 
 
-def refused(**overrides: str) -> tuple[Fault, ...]:
-    files = {f"overrides/{name}.yaml": written for name, written in overrides.items()}
+def refused(changed: dict[str, str]) -> tuple[Fault, ...]:
     with pytest.raises(InvalidInput) as invalid:
-        load(configuration(files))
+        load(configuration(changed))
     return invalid.value.faults
 
 
-MISTAKES: dict[str, dict[str, Any]] = {
+_FIELDS: dict[str, dict[str, Any]] = {
     "a reason of two lines": {"reason": "one\ntwo"},
     "an empty reason": {"reason": " "},
     "an empty list": {"select": []},
@@ -65,14 +64,26 @@ MISTAKES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("path", ["overrides/a.yml", "overrides/A.yaml", "overrides/b/c.yaml"])
-def test_a_file_that_is_no_override_is_told(path: str) -> None:
-    with pytest.raises(InvalidInput) as invalid:
-        load(configuration({path: text()}))
-    assert [str(found) for found in invalid.value.faults] == [
-        f"{path}: is not an override file; rename it to overrides/<name>.yaml, with lower-case "
-        f"letters, digits and '-', or remove it"
-    ]
+DOMAINS = """\
+apiVersion: demandops/v1
+kind: AccessDomains
+domains: [{name: perception, namespace: perception, nodes: [edge]}]
+"""
+MISTAKES: dict[str, dict[str, str]] = {
+    **{name: {"overrides/tested.yaml": text(**changed)} for name, changed in _FIELDS.items()},
+    **{
+        f"no override file: {path}": {path: text()}
+        for path in ("overrides/a.yml", "overrides/A.yaml", "overrides/b/c.yaml")
+    },
+    "a node in no access domain": {
+        "policy/access-domains.yaml": DOMAINS,
+        "overrides/a.yaml": text(node="cloud"),
+    },
+    "a tie": {
+        "overrides/one.yaml": text(),
+        "overrides/two.yaml": text(select=[{"nodes": ["e*"]}], replicas=3),
+    },
+}
 
 
 def test_notes_are_passed_over_and_a_sound_override_is_taken() -> None:
@@ -82,31 +93,6 @@ def test_notes_are_passed_over_and_a_sound_override_is_taken() -> None:
         )
     )
     assert [one.path for one in World(config, Ledger()).overrides] == ["overrides/a.yaml"]
-
-
-def test_a_node_in_no_access_domain_takes_nothing() -> None:
-    domains = (
-        "apiVersion: demandops/v1\nkind: AccessDomains\n"
-        "domains: [{name: perception, namespace: perception, nodes: [edge]}]\n"
-    )
-    with pytest.raises(InvalidInput) as invalid:
-        load(
-            configuration(
-                {"policy/access-domains.yaml": domains, "overrides/a.yaml": text(node="cloud")}
-            )
-        )
-    assert [str(found) for found in invalid.value.faults] == [
-        "overrides/a.yaml: node: 'cloud' is not in any access domain; add it to one in "
-        "policy/access-domains.yaml"
-    ]
-
-
-def test_a_tie_names_both_files_and_the_remedy() -> None:
-    other = text(select=[{"nodes": ["e*"]}], replicas=3)
-    assert [str(found) for found in refused(one=text(), two=other)] == [
-        "overrides/two.yaml: priority: is 0, as in overrides/one.yaml, and both may set replicas "
-        "of the same release; give one of them another priority, or select different releases"
-    ]
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,11 @@ TRAPS = [
     "2026-01-31", "2026-01-31T12:00:00Z", "<<", "=", "-", "?", ":", "- a", "? a", "a: b", "a #b",
     "#a", "&a", "*a", "!a", "%a", "@a", "`a", "|", ">", "[a", "]a", "{a", "}a", ",a", "'", '"',
     "'a'", '"a"', "---", "--- a", "\\", "\\n", "{{ a }}", "{% a %}", "{# a #}", "${a}", "$(a)",
-    "é", "车辆", "🚗", "a\u00a0b", "a\u200bb", "\u00ad", "a\ufeffb", "\ufffd",
+    "é", "车辆", "🚗", "a\u00a0b", "a\u200bb", "\u00ad", "a\ufeffb", "\ufffd", "e\u0301", "מכונית",
+    """it's "quoted" `so`""", "`touch /tmp/x`", "{% for i in range(9) %}x{% endfor %}",
+    '{{ .Values.image }}{{ fail "x" }}', "${HOME}${undefined}", "!!python/object/apply:os.system",
+    "[a, {b: c}]", "\\n\\u0041\\x41", "%s%n{0}", "[red]a[/red]", ":car:", "--upload-pack=touch",
+    "Operation: shutdown", "<script>alert(1)</script>", ".,:;<>\"\\'", "/", ".",
 ]  # fmt: skip
 
 UNSEEN = [
@@ -97,98 +101,60 @@ def inventory(lines: Iterable[str]) -> MemoryRepo:
     return MemoryRepo({NODES: skeleton()[NODES] + entries})
 
 
-@pytest.fixture(scope="module")
-def odd_nodes() -> MemoryRepo:
-    """Return a state repo in which each trap is a node's id."""
-    return inventory(f"    id: {quoted(text)}\n    selector: {{a: b}}\n" for text in TRAPS)
-
-
-@pytest.mark.parametrize("text", TRAPS)
-def test_an_id_is_read_back_as_it_was(odd_nodes: MemoryRepo, text: str) -> None:
-    books = odd_nodes.copy()
-    books.send(
-        goal(
-            [application(text, who=[text], clouds=[("/a", text)])],
-            [connection(text, who=[text], ends=(text, "edge"))],
-            id=text,
-        )
-    )
-    for path, content in books.files.items():
-        if path.startswith("ledger/") and path.endswith(".yaml"):
-            assert_unmistakable(content)
-            (claim,) = both(content)
-            assert claim["request"] == text
-            assert claim["requesters"] == [text]
-            assert text in (claim.get("application"), claim.get("connection"))
+def test_ids_are_read_back_as_they_were() -> None:
+    books = inventory(f"    id: {quoted(text)}\n    selector: {{a: b}}\n" for text in TRAPS)
+    for text in TRAPS:
+        app = application(text, who=[text], clouds=[("/a", text)])
+        books.send(goal([app], [connection(text, who=[text], ends=(text, "edge"))], id=text))
+    claimed = []
+    for content in books.below("ledger").values():
+        assert_unmistakable(content)
+        (claim,) = both(content)
+        (text,) = {
+            claim["request"],
+            *claim["requesters"],
+            claim.get("application", claim.get("connection")),
+        }
+        claimed.append(text)
+    assert sorted(claimed) == sorted(TRAPS * 2)
     for content in books.rendered().values():
         assert_unmistakable(content)
-    for deployment in books.objects("Deployment").values():
-        notes = deployment["metadata"]["annotations"]
-        assert notes["demandops/connection"] == text
-        assert {notes["demandops/node"], notes["demandops/peer"]} == {text, "edge"}
+    ends = [item["metadata"]["annotations"] for item in books.objects("Deployment").values()]
+    assert sorted(end["demandops/connection"] for end in ends) == sorted(TRAPS * 2)
+    for end in ends:
+        nodes = {end["demandops/node"], end["demandops/peer"]}
+        assert nodes == {end["demandops/connection"], "edge"}
     notes = [item["metadata"]["annotations"] for item in books.objects("HelmRelease").values()]
-    assert {note.get("demandops/application", note.get("demandops/source")) for note in notes} == {
-        text
-    }
-
-
-def there(books: MemoryRepo, node: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the values of a release and the pod of a connection's end that run on a node."""
-    books.send(goal([application(node=node)], [connection(ends=(node, "edge"))]))
-    for content in books.rendered().values():
-        both(content)
-    values = [release["spec"]["values"] for release in books.objects("HelmRelease").values()]
-    (pod,) = (
-        deployment["spec"]["template"]["spec"]
-        for deployment in books.objects("Deployment").values()
-        if deployment["metadata"]["annotations"]["demandops/node"] == node
-    )
-    return values[0], pod
+    named = [note.get("demandops/application", note.get("demandops/source")) for note in notes]
+    assert sorted(named) == sorted(TRAPS * 2)
 
 
 ANY_TEXT = [
     text for text in (*TRAPS, *UNSEEN) if not control_character(re.sub(r"[\n\t]", " ", text))
 ]
 """Whatever the configuration accepts; tests/unit/config holds that it refuses the others."""
+LABELS = ["yes", "y", "1e3", "0x1F", "010", "1_000", "2026-01-31", "null", "true", "12", "1.5"]
 
 
-@pytest.fixture(scope="module")
-def tainted_nodes() -> MemoryRepo:
-    """Return a state repo in which each text is a toleration of the node ``n<its index>``."""
-    return inventory(
-        f"    id: n{index}\n    tolerations: [{{key: {quoted(text)}, value: {quoted(text)}}}]\n"
-        for index, text in enumerate(ANY_TEXT)
-    )
-
-
-@pytest.mark.parametrize("index", range(len(ANY_TEXT)), ids=[repr(text) for text in ANY_TEXT])
-def test_a_toleration_is_read_back_as_it_was(tainted_nodes: MemoryRepo, index: int) -> None:
-    """People write them, in any text that YAML can hold."""
-    values, pod = there(tainted_nodes.copy(), f"n{index}")
-    wanted = [{"key": ANY_TEXT[index], "value": ANY_TEXT[index]}]
-    assert (values["tolerations"], pod["tolerations"]) == (wanted, wanted)
-
-
-LABELS = ["yes", "y", "1e3", "0x1F", "010", "1_000", "2026-01-31", "null", "true", "12", "1.5", ""]
-
-
-@pytest.fixture(scope="module")
-def labelled_nodes() -> MemoryRepo:
-    """Return a state repo in which each label selects the node ``n<its index>``."""
-    return inventory(
-        f'    id: n{index}\n    selector: {{"{label or "a"}": "{label}"}}\n'
-        for index, label in enumerate(LABELS)
-    )
-
-
-@pytest.mark.parametrize("index", range(len(LABELS)), ids=[repr(label) for label in LABELS])
-def test_a_selector_is_text_for_every_parser(labelled_nodes: MemoryRepo, index: int) -> None:
-    books = labelled_nodes.copy()
-    values, pod = there(books, f"n{index}")
-    wanted = {LABELS[index] or "a": LABELS[index]}
-    assert (values["nodeSelector"], pod["nodeSelector"]) == (wanted, wanted)
+def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
+    """Tolerations hold any text that YAML can hold, selectors are text for every parser."""
+    tolerations = [{"key": text, "value": text} for text in ANY_TEXT]
+    selector = {label: label for label in LABELS} | {"a": ""}
+    texts = ", ".join(f"{{key: {quoted(text)}, value: {quoted(text)}}}" for text in ANY_TEXT)
+    labels = ", ".join(f'"{label}": "{text}"' for label, text in selector.items())
+    books = inventory([f"    id: n\n    tolerations: [{texts}]\n    selector: {{{labels}}}\n"])
+    books.send(goal([application(node="n")], [connection(ends=("n", "edge"))]))
     for content in books.rendered().values():
-        assert_unmistakable(content)
+        both(content)
+    values = [release["spec"]["values"] for release in books.objects("HelmRelease").values()]
+    (pod,) = (
+        deployment["spec"]["template"]["spec"]
+        for deployment in books.objects("Deployment").values()
+        if deployment["metadata"]["annotations"]["demandops/node"] == "n"
+    )
+    for found in (*values, pod):
+        assert found["tolerations"] == tolerations
+        assert found["nodeSelector"] == selector
 
 
 @pytest.mark.parametrize("name", ["null", "y", "1e3", "12", "0x1f", "010", "true", "on"])

@@ -15,7 +15,8 @@ from demandops.ledger.ledger import Ledger
 from demandops.service.timing.expiry import LeaseExpiry
 
 from tests.kit.clock import Clock
-from tests.scenarios.running import START, rebuilt
+from tests.kit.memory import NOW as START
+from tests.kit.memory import rebuilt
 
 
 def leased(*terms: tuple[str, int, int]) -> Ledger:
@@ -45,27 +46,6 @@ def clock(clocks: Clock) -> LeaseExpiry:
 
 def ended(clock: LeaseExpiry, ledger: Ledger) -> list[str]:
     return [claim.demand for claim in clock.ended_claims(ledger)[1]]
-
-
-def test_nothing_ends_before_its_slack_has_passed(clocks: Clock, clock: LeaseExpiry) -> None:
-    ledger = leased(("b", 61, 0), ("a", 50, 10), ("c", 3600, 0))
-    clocks.pass_(60)
-    assert ended(clock, ledger) == []
-    clocks.pass_(0.5)
-    assert ended(clock, ledger) == ["a"]
-    clocks.pass_(0.5)
-    assert ended(clock, ledger) == ["a"]
-    clocks.pass_(0.5)
-    assert ended(clock, ledger) == ["a", "b"]
-    assert clock.ended_claims(ledger)[0] == clocks.now()
-
-
-def test_it_is_set_back_and_nothing_goes_early(clocks: Clock, clock: LeaseExpiry) -> None:
-    ledger = leased(("a", 60, 0))
-    clocks.set_by(-86_400)
-    clocks.pass_(3600)
-    assert ended(clock, ledger) == []
-    assert clock.seconds_until_due(ledger, 60.0) == 60.0
 
 
 @pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
@@ -100,12 +80,6 @@ def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: Lea
     assert ended(clock, ledger) == ["a"]
 
 
-def test_a_machine_that_slept_grants_a_full_term(clocks: Clock, clock: LeaseExpiry) -> None:
-    ledger = leased(("a", 60, 0))
-    clocks.set_by(8 * 3600)  # the steady clock stands still meanwhile
-    assert ended(clock, ledger) == []
-
-
 def test_a_clock_that_is_drawn_on_slowly_is_no_step(
     clocks: Clock, clock: LeaseExpiry, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -117,18 +91,6 @@ def test_a_clock_that_is_drawn_on_slowly_is_no_step(
         clock.seconds_until_due(ledger, 60.0)
     assert ended(clock, ledger) == ["a"]
     assert caplog.text == ""
-
-
-def test_none_of_a_demand_goes_while_a_part_is_granted_more(
-    clocks: Clock, clock: LeaseExpiry
-) -> None:
-    ledger = leased(("both", 60, 0), ("both", 600, 0), ("other", 60, 0))
-    clocks.set_by(3600)
-    assert ended(clock, ledger) == []
-    clocks.pass_(61)
-    assert ended(clock, ledger) == ["other"]
-    clocks.pass_(540)
-    assert ended(clock, ledger) == ["both", "other", "both"]
 
 
 def test_it_looks_again_when_the_first_lease_ends(clocks: Clock, clock: LeaseExpiry) -> None:

@@ -7,7 +7,7 @@ from datetime import datetime, timedelta, timezone
 from demandops.config.config import Config
 from demandops.config.load import load
 from demandops.demand.application import Application
-from demandops.demand.demand_request import Demanded, Join, Shutdown, place_in
+from demandops.demand.demand_request import Demanded, Join, place_in
 from demandops.service.timing.rate_limit import RateLimit
 
 from tests.kit.config import configuration, edited
@@ -43,26 +43,11 @@ class Sending:
         return not list(faults)
 
 
-def test_a_third_within_a_minute_is_too_much_and_one_after_it_is_not() -> None:
-    sending = Sending()
-    assert [sending.send("vehicle00", at) for at in (0, 20, 40)] == [True, True, False]
-    assert sending.send("vehicle01", 41)
-    assert sending.send("vehicle00", 101)
-
-
 def test_a_hand_in_that_is_judged_again_counts_once() -> None:
     sending = Sending()
     assert [sending.send("vehicle00", 0, "same") for _ in range(5)] == [True] * 5
     assert sending.send("vehicle00", 1)
     assert not sending.send("vehicle00", 2)
-
-
-def test_giving_up_is_not_limited() -> None:
-    sending = Sending()
-    for number in range(5):
-        release = Shutdown("one", request("vehicle00").demanded)
-        found = sending.throttle.faults(release, limited(1), f"op-{number}", START)
-        assert list(found) == []
 
 
 def test_who_sends_no_more_is_forgotten() -> None:

@@ -8,9 +8,9 @@ from random import Random
 import pygit2
 import pytest
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history import path_history
+from demandops.staterepo.history import commit_log
 
-from tests.kit.repo import git
+from tests.kit.repo import git, write_tree
 
 PATH = "clusters/c/d/n/r.yaml"
 
@@ -27,7 +27,7 @@ class History:
         number = len(self.made)
         who = pygit2.Signature("a", "a@example.org", 1_770_000_000 + 60 * number, 0)
         files = {"other": str(number)} | ({PATH: text} if text is not None else {})
-        tree = trees.write(self.repo, None, files)
+        tree = write_tree(self.repo, None, files)
         above = [self.made[parent] for parent in parents]
         made = self.repo.create_commit(None, who, who, f"{number}\n", tree, above)
         self.made.append(made)
@@ -39,7 +39,7 @@ class History:
         )
 
     def ours(self, path: str) -> list[str]:
-        return [t.entry.commit for t in path_history.changes_to(self.repo, self.made[-1], path)]
+        return [t.entry.commit for t in commit_log.changes_to(self.repo, self.made[-1], path)]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -70,26 +70,25 @@ def test_the_last_time_that_something_stood_there(tmp_path: Path) -> None:
     first = history.commit("c", 2)
     second = history.commit("d", 3)
     tip = history.commit("d", 4)
-    found = path_history.history_of(history.repo, tip, PATH, 1)
+    found = commit_log.history_of(history.repo, tip, PATH, 1)
     assert found.started and found.started.commit == str(started)
     assert ([one.commit for one in found.newest], found.more) == ([str(second)], 1)
     assert found.stopped is None
     stopped = history.commit(None, 5)
-    gone = path_history.history_of(history.repo, stopped, PATH, 9)
+    gone = commit_log.history_of(history.repo, stopped, PATH, 9)
     assert gone.stopped and gone.stopped.commit == str(stopped)
     assert [one.commit for one in gone.newest] == [str(second), str(first)]
     assert gone.started == found.started
-    never = path_history.history_of(history.repo, stopped, "nothing/there", 9)
-    assert never == path_history.PathHistory(None, (), 0, None)
+    never = commit_log.history_of(history.repo, stopped, "nothing/there", 9)
+    assert never == commit_log.PathHistory(None, (), 0, None)
 
 
 def test_where_a_release_is_or_once_was(tmp_path: Path) -> None:
     history = History(tmp_path / "r.git")
     there = history.commit("a")
     gone = history.commit(None, 0)
-    assert path_history.release_path(history.repo, there, "r") == PATH
-    assert path_history.release_path(history.repo, gone, "r") is None
-    assert path_history.stopped_release_path(history.repo, gone, "r") == PATH
-    assert path_history.stopped_release_path(history.repo, gone, "q") is None
-    assert path_history.stopped_release_path(history.repo, gone, "*") is None
-    assert path_history.stopped_release_names(history.repo, gone) == {"r"}
+    assert commit_log.release_path(history.repo, there, "r") == PATH
+    assert commit_log.release_path(history.repo, gone, "r") == PATH
+    assert commit_log.release_path(history.repo, gone, "q") is None
+    assert commit_log.release_path(history.repo, gone, "*") is None
+    assert commit_log.stopped_release_names(history.repo, gone) == {"r"}

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import pygit2
-import pytest
 from demandops.staterepo.git import tree as trees
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
+from tests.kit.repo import write_tree
 
 Files = dict[str, str]
 
@@ -97,18 +97,10 @@ def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.Da
     files = data.draw(file_trees(), "files")
     change = data.draw(changes(files), "change")
     with scratch() as repo:
-        made = trees.write(repo, lay(repo, files), change)
+        made = write_tree(repo, lay(repo, files) if files else None, change)
         wanted = changed(files, change)
         assert read(repo, made) == wanted
         assert made == lay(repo, wanted).id, "same files, other tree: an empty folder or a mode"
-
-
-@given(data=st.data())
-@examples(50)
-def test_writing_onto_nothing_gives_the_files_alone(data: st.DataObject) -> None:
-    change = data.draw(changes({}), "change")
-    with scratch() as repo:
-        assert read(repo, trees.write(repo, None, change)) == changed({}, change)
 
 
 @given(before=file_trees(), after=file_trees())
@@ -127,44 +119,9 @@ def test_differences_tell_just_what_differs_and_rebuild_the_one_from_the_other(
             assert (_text(repo, blob) if blob else None) == after.get(path)
 
 
-@pytest.mark.parametrize(
-    ("files", "change", "wanted"),
-    [
-        ({"a": "1"}, {"a/b": "2"}, {"a/b": "2"}),
-        ({"a": "1"}, {"a": None, "a/b": "2"}, {"a/b": "2"}),
-        ({"a": "1"}, {"a/b": "2", "a": None}, {"a/b": "2"}),
-        ({"a/b": "1", "a/c": "2"}, {"a": "3"}, {"a": "3"}),
-        ({"a/b": "1"}, {"a": "3", "a/b": None}, {"a": "3"}),
-        ({"a/b": "1"}, {"a/b": None, "a": "3"}, {"a": "3"}),
-        ({"a": "1", "c": "2"}, {"a/b": None}, {"a": "1", "c": "2"}),
-        ({"a/b/c/d": "1", "e": "2"}, {"a/b/c/d": None}, {"e": "2"}),
-        ({"a/b": "1"}, {"x/y/z": None}, {"a/b": "1"}),
-        ({"a": "1"}, {}, {"a": "1"}),
-    ],
-    ids=[
-        "a folder takes a file's place",
-        "a folder takes a removed file's place",
-        "in either order",
-        "a file takes a folder's place",
-        "a file takes the place of a folder whose files are removed",
-        "in either order, too",
-        "removing below a file removes nothing",
-        "empty folders go, all the way up",
-        "removing what is not there",
-        "no change",
-    ],
-)
-def test_files_and_folders_take_each_others_place(
-    repo: pygit2.Repository, files: Files, change: dict[str, str | None], wanted: Files
-) -> None:
-    made = trees.write(repo, lay(repo, files), change)
-    assert read(repo, made) == wanted
-    assert made == lay(repo, wanted).id
-
-
 def test_a_change_rewrites_only_the_folders_on_its_way(repo: pygit2.Repository) -> None:
     base = lay(repo, {f"{top}/{n}": "x" for top in "abc" for n in range(3)})
-    made = repo[trees.write(repo, base, {"b/1": "y"})].peel(pygit2.Tree)
+    made = repo[write_tree(repo, base, {"b/1": "y"})].peel(pygit2.Tree)
     assert [made[name].id == base[name].id for name in "abc"] == [True, False, True]
 
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 
-from demandops.cli.actions.ledger_change import show_consequences, started_generator
-from demandops.cli.json_output import claim_data, output_option, print_json
-from demandops.cli.output import console, progress, signing_option, state_repo_option
+from demandops.cli.actions.ledger_change import claim_text, print_consequences, started_generator
+from demandops.cli.json_output import claim_data, output_option, show
+from demandops.cli.output import progress, signing_option, state_repo_option
 from demandops.decision import decide
 from demandops.demand.demand_request import Decommission
 from demandops.errors import Refused
@@ -52,11 +52,8 @@ def decommission(
     chosen = frozenset([kinds] if kinds else ["node", "requester"])
     goal = Decommission(name, kinds=chosen, by=str(authorship.operator())).goal()
     done = _dry_run(goal, state_repo, output) if dry_run else _book(goal, state_repo, signing_key)
-    row = done or _row(name, "unchanged", None, ())
-    if output == "json":
-        print_json(row)
-    else:
-        _print(row, dry_run)
+    row = done or _row(goal, "unchanged", None, ())
+    show(output, row, _lines(row, dry_run))
 
 
 def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any] | None:
@@ -65,9 +62,9 @@ def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> di
         try:
             receipt = generator.submit(goal).future.result()
         except Refused as error:
-            _require_nothing_held(error, goal["name"], generator.snapshot)
+            _require_nothing_held(error, goal, generator.snapshot)
             return None
-    return _row(goal["name"], receipt.outcome, receipt.commit, receipt.changes)
+    return _row(goal, receipt.outcome, receipt.commit, receipt.changes)
 
 
 def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any] | None:
@@ -76,48 +73,42 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
         try:
             decision = decide(snapshot.state, goal, REAL.now(), repo.file_reader())
         except Refused as error:
-            _require_nothing_held(error, goal["name"], snapshot)
+            _require_nothing_held(error, goal, snapshot)
             return None
     if output == "text":
-        show_consequences(decision)
-    return _row(goal["name"], decision.outcome, None, decision.changes.claims)
+        print_consequences(decision)
+    return _row(goal, decision.outcome, None, decision.changes.claims)
 
 
-def _require_nothing_held(error: Refused, name: str, snapshot: Snapshot) -> None:
+def _require_nothing_held(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> None:
     """Raise the error unless it says that a known node holds nothing."""
     codes = {each.code for each in error.faults}
-    if codes != {"not-held"} or name not in snapshot.state.config.nodes:
+    if codes != {"not-held"} or goal["name"] not in snapshot.state.config.nodes:
         raise error
 
 
 def _row(
-    name: str, outcome: str, commit: str | None, changes: Iterable[ClaimChange]
+    goal: dict[str, Any], outcome: str, commit: str | None, changes: Iterable[ClaimChange]
 ) -> dict[str, Any]:
-    return {
-        "name": name,
-        "outcome": outcome,
-        "commit": commit,
-        "claims": [
-            claim_data(change.before)
-            | {"left": list(change.after.requesters) if change.after else None}
-            for change in changes
-            if change.before
-        ],
-    }
+    claims = [
+        claim_data(change.before)
+        | {"left": list(change.after.requesters) if change.after else None}
+        for change in changes
+        if change.before
+    ]
+    return {"name": goal["name"], "outcome": outcome, "commit": commit, "claims": claims}
 
 
-def _print(row: dict[str, Any], dry_run: bool) -> None:
-    out = console()
+def _lines(row: dict[str, Any], dry_run: bool) -> Iterator[str]:
     if row["outcome"] == "unchanged":
-        out.print(f"'{row['name']}' holds nothing")
+        yield f"'{row['name']}' holds nothing"
         return
     would = "would be " if dry_run else ""
     for claim in row["claims"]:
-        subject = claim["subject"]
-        text = f"{subject['kind']} '{subject['id']}' for {', '.join(claim['requesters'])}"
+        text = f"{claim_text(claim)} for {', '.join(claim['requesters'])}"
         if claim["left"] is None:
-            out.print(f"{would}released: {text}")
+            yield f"{would}released: {text}"
         else:
-            out.print(f"{would}reduced:  {text}; kept for {', '.join(claim['left'])}")
+            yield f"{would}reduced:  {text}; kept for {', '.join(claim['left'])}"
     if not dry_run:
-        out.print(f"'{row['name']}' is decommissioned in {row['commit']}")
+        yield f"'{row['name']}' is decommissioned in {row['commit']}"

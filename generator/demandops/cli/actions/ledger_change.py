@@ -11,6 +11,7 @@ from typing import Any
 from demandops.cli.output import console, errors, progress
 from demandops.cli.views.diff import release_lines
 from demandops.decision import Decision
+from demandops.errors import Fault
 from demandops.service import Generator
 from demandops.settings import QUEUE_LIMIT
 
@@ -44,17 +45,22 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
             signal.signal(signal.SIGTERM, before)
 
 
-def show_consequences(decision: Decision) -> None:
+def print_consequences(decision: Decision) -> None:
     """Print the releases that a decision changes and the files that it writes or removes."""
     out = console()
     for line in release_lines(decision.releases):
-        out.print(f"  {line}")
+        out.print(f"  {line}", soft_wrap=True)
     for path, text in sorted(decision.files.items()):
-        out.print(f"  {'remove' if text is None else 'write '} {path}")
+        out.print(f"  {'remove' if text is None else 'write '} {path}", soft_wrap=True)
 
 
-def fault_lines(faults: Iterable[dict[str, Any]]) -> Iterator[str]:
-    """Yield faults in the form of JSON as text."""
-    for fault in faults:
-        parts = (fault["file"], fault["field"], fault["message"])
-        yield f"  {': '.join(part for part in parts if part)}"
+def print_refusal(title: str, faults: Iterable[dict[str, Any]]) -> None:
+    """Print faults in the form of JSON as text, on stderr."""
+    errors.print(title)
+    for each in faults:
+        errors.print(f"  {Fault(**each)}")
+
+
+def claim_text(claim: dict[str, Any]) -> str:
+    """Return the subject of a claim in the form of JSON as text."""
+    return f"{claim['subject']['kind']} '{claim['subject']['id']}'"

@@ -11,11 +11,15 @@ from typing import Any
 import click
 
 from demandops import strict_yaml
-from demandops.cli.actions.ledger_change import fault_lines, show_consequences, started_generator
+from demandops.cli.actions.ledger_change import (
+    print_consequences,
+    print_refusal,
+    started_generator,
+)
 from demandops.cli.json_output import faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress, signing_option, state_repo_option
 from demandops.decision import admit, decide, form_faults
-from demandops.errors import DemandOpsError, Fault, InvalidInput, ShuttingDown, Unsound, fault
+from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, fault
 from demandops.input_file import read_input
 from demandops.runtime import REAL
 from demandops.service import Generator, Receipt
@@ -51,9 +55,7 @@ class _Answer(Future["Receipt | dict[str, str]"]):
 )
 @signing_option
 @output_option
-@click.pass_context
 def request(
-    ctx: click.Context,
     files: tuple[str, ...],
     state_repo: str,
     dry_run: bool,
@@ -71,9 +73,8 @@ def request(
     documents = [document for file in files for document in _documents(file)]
     if not documents:
         raise InvalidInput([fault("", "no request in " + ", ".join(files))])
-    faulty = [form_faults(document.goal) for document in documents]
-    if any(faulty):
-        rows = _unbooked(documents, faulty, state_repo)
+    if any(form_faults(document.goal) for document in documents):
+        rows = _unbooked(documents, state_repo)
     elif dry_run:
         rows = _dry_run(documents, state_repo, output)
     else:
@@ -87,7 +88,7 @@ def request(
         errors.print(f"{len(rows) - waiting} of {len(rows)} requests have an answer")
         raise click.Abort
     if any(row["outcome"] == "refused" for row in rows):
-        ctx.exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _documents(file: str) -> Iterable[_Document]:
@@ -107,17 +108,15 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
     } | more
 
 
-def _unbooked(
-    documents: list[_Document], faulty: list[list[Fault]], state_repo: str
-) -> list[dict[str, Any]]:
+def _unbooked(documents: list[_Document], state_repo: str) -> list[dict[str, Any]]:
     """Return a refusal for each document because at least one does not parse."""
     with reader.opened(state_repo) as repo:
         state = repo.snapshot().state
     rows = []
-    for index, (document, form) in enumerate(zip(documents, faulty, strict=True)):
+    for index, document in enumerate(documents):
         message = "not booked because another request of this call does not parse"
         refusal = InvalidInput([fault("", message)])
-        if form:
+        if form_faults(document.goal):
             try:
                 admit(state, document.goal)
             except InvalidInput as error:
@@ -186,9 +185,9 @@ def _submitted(generator: Generator, document: _Document, wait: bool) -> _Answer
             answer.set_result(parse_waiting_text(text))
 
     def finish(future: Future[Receipt]) -> None:
+        error = future.exception()
         if answer.done():
             return
-        error = future.exception()
         if error is not None:
             answer.set_exception(error)
         else:
@@ -222,17 +221,10 @@ def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[d
                 console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
                 for rule in decision.approval:
                     console().print(f"  needs approval: {rule} requires it")
-                show_consequences(decision)
-            rows.append(
-                _row(
-                    index,
-                    decision.request.id,
-                    outcome,
-                    warnings=list(decision.warnings),
-                    not_held=list(decision.changes.not_held),
-                    **({"approval": list(decision.approval)} if decision.approval else {}),
-                )
-            )
+                print_consequences(decision)
+            more = {"warnings": decision.warnings, "not_held": decision.changes.not_held}
+            more |= {"approval": decision.approval} if decision.approval else {}
+            rows.append(_row(index, decision.request.id, outcome, **more))
     return rows
 
 
@@ -243,16 +235,12 @@ def _print(rows: list[dict[str, Any]], documents: list[_Document], dry_run: bool
         if row["outcome"] == "waiting":
             errors.print(f"{title} has no answer yet")
         elif row["outcome"] == "refused":
-            errors.print(f"{title} refused")
-            for line in fault_lines(row["faults"]):
-                errors.print(line)
+            print_refusal(f"{title} refused", row["faults"])
         elif not dry_run:
-            proposal = row.get("proposal")
-            out.print(
-                f"{title} {row['outcome']} in {row['commit']}"
-                if proposal is None
-                else f"{title} awaiting approval {proposal['branch']} {proposal['link']}".rstrip()
-            )
+            told, proposal = f"{row['outcome']} in {row['commit']}", row.get("proposal")
+            if proposal is not None:
+                told = f"awaiting approval {proposal['branch']} {proposal['link']}".rstrip()
+            out.print(f"{title} {told}", soft_wrap=True)
         for warning in row["warnings"]:
             errors.print(f"  warning: {warning}")
         for item in row["not_held"]:

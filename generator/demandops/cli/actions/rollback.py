@@ -2,47 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
-from demandops.cli.actions.ledger_change import fault_lines, started_generator
-from demandops.cli.json_output import (
-    claim_data,
-    faults_of,
-    output_option,
-    print_json,
-    release_change_data,
-)
-from demandops.cli.output import (
-    SIGNS,
-    console,
-    errors,
-    progress,
-    signing_option,
-    state_repo_option,
-)
+from demandops.cli.actions.ledger_change import claim_text, print_refusal, started_generator
+from demandops.cli.json_output import claim_data, faults_of, output_option, show
+from demandops.cli.output import progress, signing_option, state_repo_option
+from demandops.cli.views.diff import release_lines
+from demandops.config.config import CONFIG_ROOTS
 from demandops.decision import Decision, decide
 from demandops.errors import InvalidInput
+from demandops.render.changes.changeset import ReleaseChange
 from demandops.runtime import REAL
-from demandops.service import rollback_goal as rollbacks
+from demandops.service import rollback_goal
 from demandops.staterepo import reader
-from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.reader import Reader
 
 _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
-
-
-@dataclass(frozen=True, slots=True)
-class _Target:
-    """The commit to roll back to, and the options."""
-
-    to: str
-    drop_newer: bool
-    reason: str
-    person: Person
 
 
 @click.command()
@@ -57,9 +37,7 @@ class _Target:
 @click.option("--dry-run", is_flag=True, help="Show the consequences and change nothing.")
 @signing_option
 @output_option
-@click.pass_context
-def rollback(  # noqa: PLR0913, PLR0917 - one for each option
-    ctx: click.Context,
+def rollback(
     revision: str,
     state_repo: str,
     reason: str | None,
@@ -76,30 +54,31 @@ def rollback(  # noqa: PLR0913, PLR0917 - one for each option
     if not (dry_run or (reason and reason.strip())):
         raise click.UsageError("give the reason: -m TEXT")
     with reader.opened(state_repo) as repo:
-        target = _Target(repo.commit(revision), drop_newer, reason or "", repo.operator())
-        base = repo.commit()
-        result: dict[str, Any] = {"to": target.to, "outcome": "refused", "commit": None}
-        result |= _consequences(None)
-        result |= {"configuration_since": repo.config_files_changed_since(target.to), "faults": []}
+        to, base = repo.commit(revision), repo.commit()
+        goal = rollback_goal.goal(
+            to, drop_newer=drop_newer, reason=reason or "", who=repo.operator()
+        )
+        result: dict[str, Any] = {"to": to, "outcome": "refused", "commit": None}
+        since = repo.changed_files(to, base, CONFIG_ROOTS)
+        result |= {**_consequences(None), "configuration_since": since, "faults": []}
         try:
-            result |= _dry_run(repo, target, base)
+            result |= _dry_run(repo, goal, base)
         except InvalidInput as error:
             result["faults"] = faults_of(error)
     if not dry_run and not result["faults"]:
-        result |= _roll_back(state_repo, target, signing_key, base)
-    if output == "json":
-        print_json(result)
-    else:
-        _print(result, dry_run)
+        result |= _roll_back(state_repo, goal, signing_key, base)
+    if result["faults"] and output == "text":
+        print_refusal(f"the rollback to {to[:10]} is refused:", result["faults"])
+    show(output, result, _lines(result, dry_run))
     if result["faults"]:
-        ctx.exit(1)
+        raise click.exceptions.Exit(1)
 
 
-def _dry_run(repo: Reader, target: _Target, base: str) -> dict[str, Any]:
+def _dry_run(repo: Reader, goal: dict[str, Any], base: str) -> dict[str, Any]:
     """Decide the rollback on a commit, in memory only."""
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(base, report).state
-    request = repo.restoration(target.to, drop_newer=target.drop_newer)
+    request = repo.restoration(goal["to"], drop_newer=goal["dropNewer"])
     decision = decide(state, request, REAL.now(), repo.file_reader(base))
     return {"outcome": decision.outcome, **_consequences(decision)}
 
@@ -112,16 +91,15 @@ def _consequences(decision: Decision | None) -> dict[str, Any]:
         assert claim is not None  # noqa: S101 - a change has at least one side
         claims[word if change.after else "dropped"].append(claim_data(claim))
     releases = decision.releases if decision else ()
-    return {**claims, "releases": [release_change_data(each) for each in releases]}
+    return {**claims, "releases": [asdict(each) for each in releases]}
 
 
-def _roll_back(state_repo: str, target: _Target, key: Path | None, base: str) -> dict[str, Any]:
-    """Roll back with a generator; return the result."""
-    goal = rollbacks.goal(
-        target.to, drop_newer=target.drop_newer, reason=target.reason, who=target.person
-    )
+def _roll_back(
+    state_repo: str, goal: dict[str, Any], signing_key: Path | None, base: str
+) -> dict[str, Any]:
+    """Roll back with a generator; return what differs from the dry run on ``base``."""
     try:
-        with started_generator(state_repo, key) as generator:
+        with started_generator(state_repo, signing_key) as generator:
             receipt = generator.submit(goal).future.result()
     except InvalidInput as error:
         return {"outcome": "refused", **_consequences(None), "faults": faults_of(error)}
@@ -131,33 +109,23 @@ def _roll_back(state_repo: str, target: _Target, key: Path | None, base: str) ->
     with reader.opened(state_repo) as repo:
         decided_on = repo.commit(f"{receipt.commit}~1")
         if decided_on != base:  # the tip moved in between
-            result |= _dry_run(repo, target, decided_on)
+            result |= _dry_run(repo, goal, decided_on)
     return result
 
 
-def _print(result: dict[str, Any], dry_run: bool) -> None:
-    to, out = result["to"][:10], console()
-    if result["faults"]:
-        errors.print(f"the rollback to {to} is refused:")
-        for line in fault_lines(result["faults"]):
-            errors.print(line)
-    elif result["outcome"] == "unchanged":
-        out.print(f"the ledger is the same as at {to}; there is nothing to roll back")
-    elif dry_run:
-        out.print(f"the rollback to {to} would change:")
-    else:
-        out.print(f"rolled back to {to} in {result['commit']}")
+def _lines(result: dict[str, Any], dry_run: bool) -> Iterator[str]:
+    to = result["to"][:10]
+    if result["outcome"] == "unchanged":
+        yield f"the ledger is the same as at {to}; there is nothing to roll back"
+    elif not result["faults"]:
+        done = f"rolled back to {to} in {result['commit']}"
+        yield f"the rollback to {to} would change:" if dry_run else done
     for word, sign in _SIGN.items():
         for claim in result[word]:
-            who = ", ".join(claim["requesters"])
-            subject = f"{claim['subject']['kind']} '{claim['subject']['id']}'"
-            out.print(f"  {sign} claim of {who} on {subject} ({word.replace('_', ' ')})")
-    for release in result["releases"]:
-        out.print(f"  {SIGNS[release['change']]} release {release['name']} ({release['what']})")
-        for detail in release["details"]:
-            out.print(f"      {detail}")
-    since = result["configuration_since"]
-    if since:
-        out.print(f"a rollback does not change configuration; changed since {to}:")
-        for path in since:
-            out.print(f"  {path}")
+            what = f"claim of {', '.join(claim['requesters'])} on {claim_text(claim)}"
+            yield f"  {sign} {what} ({word.replace('_', ' ')})"
+    releases = (ReleaseChange(**each) for each in result["releases"])
+    yield from (f"  {line}" for line in release_lines(releases, "release "))
+    if result["configuration_since"]:
+        yield f"a rollback does not change configuration; changed since {to}:"
+        yield from (f"  {path}" for path in result["configuration_since"])

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
-from demandops.cli.json_output import (
-    entry_change_data,
-    fault_data,
-    output_formats,
-    print_json,
-    release_change_data,
-)
+from demandops.cli.json_output import output_formats, print_json
 from demandops.cli.output import console, errors, printable
 from demandops.cli.repo import pull_request_comment
 from demandops.cli.views.diff import entry_lines, release_lines
@@ -39,12 +34,7 @@ _MOST_DIFF_LINES_JSON = 20_000
     help="The branch that the edits will be merged into. They are compared with the merge base. "
     "Default: origin/main, or main.",
 )
-@output_formats(
-    "text",
-    "json",
-    "markdown",
-    description="The output format; markdown is for a comment on a pull request.",
-)
+@output_formats("text", "json", "markdown")
 def check(directory: Path, base: str | None, output: str) -> None:
     """Check edits of a state repo and show their consequences.
 
@@ -61,7 +51,7 @@ def check(directory: Path, base: str | None, output: str) -> None:
     else:
         _print(directory, checked)
     if checked.faults:
-        click.get_current_context().exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _data(checked: CheckResult) -> dict[str, Any]:
@@ -72,24 +62,15 @@ def _data(checked: CheckResult) -> dict[str, Any]:
         {"file": each.path, "change": each.change, "diff": diffs.get(each.path)} for each in files
     ]
     return {
-        "faults": [fault_data(each) for each in checked.faults],
-        "warnings": [fault_data(each) for each in checked.warnings],
-        "suggestions": [
-            {
-                "instead_of": each.path,
-                "file": each.name,
-                "text": each.text,
-                "not_covered": list(each.not_covered),
-                "other_releases": list(each.other_releases),
-            }
-            for each in checked.suggestions
-        ],
+        "faults": [asdict(each) for each in checked.faults],
+        "warnings": [asdict(each) for each in checked.warnings],
+        "suggestions": [asdict(each) for each in checked.suggestions],
         "base": checked.base,
         "base_valid": checked.base_valid,
-        "releases": [release_change_data(each) for each in found.releases] if found else None,
+        "releases": [asdict(each) for each in found.releases] if found else None,
         "files": changes if found else None,
         "diff_lines_left_out": left,
-        "bookkeeping": None if entries is None else [entry_change_data(each) for each in entries],
+        "bookkeeping": None if entries is None else [asdict(each) for each in entries],
     }
 
 
@@ -121,15 +102,14 @@ def _print(directory: Path, checked: CheckResult) -> None:
 
 def _lines(checked: CheckResult) -> Iterator[str]:
     for each in checked.suggestions:
-        yield f"\ninstead of editing {each.path}, {each.name}:\n"
+        yield f"\ninstead of editing {each.instead_of}, {each.file}:\n"
         yield from each.text.splitlines()
         if each.other_releases:
             yield f"\n(it also applies to {', '.join(each.other_releases)})"
     consequence = checked.preview
     if consequence is None:
-        if not checked.suggestions:
-            return
-        yield "\nfix the errors to see what merging would do"
+        if checked.suggestions:
+            yield "\nfix the errors to see what merging would do"
         return
     if consequence.files or checked.bookkeeping:
         since = f" since {checked.base[:10]}" if checked.base else ""
@@ -151,9 +131,8 @@ def _file_lines(files: tuple[FileChange, ...]) -> Iterator[str]:
     count = "1 file" if len(files) == 1 else f"{len(files)} files"
     yield f"\nthe generator will write or remove {count}:"
     yield from (f"  {'remove' if each.after is None else 'write '} {each.path}" for each in files)
-    shown, left = _bounded(
-        tuple(each for each in files if each.after is not None), _MOST_DIFF_LINES
-    )
+    written = tuple(each for each in files if each.after is not None)
+    shown, left = _bounded(written, _MOST_DIFF_LINES)
     for text in shown.values():
         yield ""
         yield from text.splitlines()

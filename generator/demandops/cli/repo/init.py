@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from demandops.cli.json_output import output_option, print_json
-from demandops.cli.output import console, signing_option
+from demandops.cli.json_output import output_option, show
+from demandops.cli.output import signing_option
 from demandops.runtime import REAL
 from demandops.staterepo import new_repo
 from demandops.staterepo.git.signing import Signer
@@ -55,18 +55,20 @@ def init(
         url=url,
         signer=Signer(signing_key) if signing_key else None,
     )
-    if output == "json":
-        print_json({"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare})
-        return
-    out = console()
-    out.print(f"state repo in {directory}, first commit {commit[:10]} on main")
-    out.print(
+    data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
+    lines = [
+        f"state repo in {directory}, first commit {commit[:10]} on main",
         f"to make a cluster follow it: git -C {directory} show main:bootstrap/c-its.yaml | "
-        "kubectl apply -f -"
-    )
+        "kubectl apply -f -",
+    ]
     if bare:
-        out.print(f"next: demandops serve --state-repo {directory}")
-        out.print(f"to see or edit its files: git clone {directory}")
+        lines += [
+            f"next: demandops serve --state-repo {directory}",
+            f"to see or edit its files: git clone {directory}",
+        ]
     else:
-        out.print("next: edit inventory/ and policy/, commit, push it to your Git server, and run")
-        out.print("      demandops serve --state-repo URL")
+        lines += [
+            "next: edit inventory/ and policy/, commit, push it to your Git server, and run",
+            "      demandops serve --state-repo URL",
+        ]
+    show(output, data, lines)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import click
 
 from demandops import settings
-from demandops.cli.json_output import fault_data, output_option, print_json
-from demandops.cli.output import console, errors, state_repo_option
+from demandops.cli.json_output import output_option, show
+from demandops.cli.output import errors, state_repo_option
 from demandops.errors import fault
 from demandops.runtime import REAL
 from demandops.staterepo.write.slot import FoundJournal, find_journals
@@ -32,23 +33,18 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
     """
     now = REAL.now()
     found = list(find_journals(settings.data_home(state_repo), now, set_aside=set_aside))
-    if output == "json":
-        print_json([_row(each) for each in found])
-    else:
-        out = console()
-        for line in _lines(found):
-            out.print(line, soft_wrap=True)
+    show(output, [_row(each) for each in found], _lines(found))
     damages = [each.damage for each in found if each.damage and not each.set_aside]
     for damage in damages:
         errors.print(f"error: {damage}")
     if damages:
-        click.get_current_context().exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _row(found: FoundJournal) -> dict[str, Any]:
     return {
         "file": str(found.file),
-        "faults": [fault_data(fault("", found.damage))] if found.damage else [],
+        "faults": [asdict(fault("", found.damage))] if found.damage else [],
         "set_aside": str(found.set_aside) if found.set_aside else None,
         "demands": [
             {"operation_id": each.operation, "received": each.received, "goal": each.goal}

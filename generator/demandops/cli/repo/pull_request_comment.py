@@ -8,12 +8,11 @@ is limited, so the most important parts come first and the number of omitted par
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from demandops.cli.output import printable
 from demandops.plan.views.bookkeeping import EntryChange
-from demandops.render.changes.changeset import ReleaseChange
-from demandops.render.changes.merge_preview import FileChange
+from demandops.render.changes.changeset import CHANGE_ORDER, ReleaseChange
 from demandops.staterepo.pull_request.merge_check import CheckResult
 
 MARK = "<!-- demandops check -->"
@@ -24,18 +23,12 @@ LONGEST = 60_000
 
 _LONGEST_SPAN = 500
 _ROOM_FOR_NOTE = 200
-_VERBS = {"start": "starts", "change": "changes", "stop": "stops"}
-_ENTRY_VERBS = {"added": "new", "changed": "changed", "removed": "removed"}
 
 
 def report(checked: CheckResult, longest: int = LONGEST) -> str:
     """Return the report, of at most ``longest`` characters."""
-    parts = [f"{MARK}\n", *_head(checked)]
-    parts += _faults(checked)
-    parts += _warnings(checked)
-    parts += _suggestions(checked)
-    parts += _consequence(checked)
-    return _bounded(parts, longest)
+    parts = [f"{MARK}\n", *_head(checked), *_faults(checked), *_suggestions(checked)]
+    return _bounded([*parts, *_consequence(checked)], longest)
 
 
 def code(text: str) -> str:
@@ -63,43 +56,33 @@ def _longer_than_any(text: str, least: int) -> str:
 
 
 def _head(checked: CheckResult) -> Iterator[str]:
-    if checked.faults:
-        many = "1 error" if len(checked.faults) == 1 else f"{len(checked.faults)} errors"
-        yield f"## DemandOps: {many}\n"
+    found = len(checked.faults)
+    if found:
+        yield f"## DemandOps: {'1 error' if found == 1 else f'{found} errors'}\n"
     else:
         yield "## DemandOps: valid, and everything renders\n"
     if checked.base:
-        since = (
-            ""
-            if checked.base_valid
-            else ", with its last valid files because its own are not valid"
-        )
-        yield f"\nCompared with {code(checked.base[:10])}{since}.\n"
+        invalid = ", with its last valid files because its own are not valid"
+        yield f"\nCompared with {code(checked.base[:10])}{'' if checked.base_valid else invalid}.\n"
 
 
 def _faults(checked: CheckResult) -> Iterator[str]:
-    for fault in checked.faults:
-        places = [code(place) for place in (fault.file, fault.field) if place]
-        yield f"\n- {': '.join([*places, code(fault.message)])}"
-    if checked.faults:
-        yield "\n"
-
-
-def _warnings(checked: CheckResult) -> Iterator[str]:
-    for warning in checked.warnings:
-        yield f"\n- warning: {code(warning.file)}: {code(warning.message)}"
-    if checked.warnings:
-        yield "\n"
+    for kind, found in (("", checked.faults), ("warning: ", checked.warnings)):
+        for each in found:
+            places = [code(place) for place in (each.file, each.field) if place]
+            yield f"\n- {kind}{': '.join([*places, code(each.message)])}"
+        if found:
+            yield "\n"
 
 
 def _suggestions(checked: CheckResult) -> Iterator[str]:
     for suggestion in checked.suggestions:
-        body = f"Merge this as {code(suggestion.name)}:\n\n{fence(suggestion.text, 'yaml')}"
+        body = f"Merge this as {code(suggestion.file)}:\n\n{fence(suggestion.text, 'yaml')}"
         if suggestion.not_covered:
             body += f"\nNo override can change {', '.join(map(code, suggestion.not_covered))}.\n"
         if suggestion.other_releases:
             body += f"\nIt also applies to {', '.join(map(code, suggestion.other_releases))}.\n"
-        yield _folded(f"Instead of editing {_plain(suggestion.path)}", body)
+        yield _folded(f"Instead of editing {_plain(suggestion.instead_of)}", body)
 
 
 def _consequence(checked: CheckResult) -> Iterator[str]:
@@ -111,8 +94,10 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
         yield "\nMerging changes no release and no demand.\n"
         return
     yield "\n### Desired state\n"
-    if consequence.releases:
-        yield f"\n{_counted(consequence.releases)}\n"
+    kinds = [release.change for release in consequence.releases]
+    counts = [f"{kinds.count(kind)} to {kind}" for kind in CHANGE_ORDER if kind in kinds]
+    if counts:
+        yield f"\nReleases: {', '.join(counts)}.\n"
     else:
         yield "\nNo release starts, changes or stops.\n"
     yield from map(_release, consequence.releases)
@@ -130,36 +115,24 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
         if file.after is None:
             yield f"\n- removed: {code(file.path)}"
     yield "\n"
-    yield from (_file(file) for file in consequence.files if file.after is not None)
-
-
-def _counted(releases: Iterable[ReleaseChange]) -> str:
-    kinds = [release.change for release in releases]
-    counts = [
-        f"{kinds.count(kind)} {word}"
-        for kind, word in (("start", "to start"), ("change", "to change"), ("stop", "to stop"))
-        if kind in kinds
-    ]
-    return f"Releases: {', '.join(counts)}."
+    for file in consequence.files:
+        if file.after is not None:
+            yield _folded(_plain(file.path), fence("\n".join(file.diff()), "diff"))
 
 
 def _release(release: ReleaseChange) -> str:
-    lines = [f"\n- {_VERBS[release.change]} {code(release.name)}: {code(release.description)}"]
-    lines += [f"\n  - {code(detail)}" for detail in release.details]
-    return "".join(lines)
+    details = [f"\n  - {code(detail)}" for detail in release.details]
+    return f"\n- {release.change}s {code(release.name)}: {code(release.what)}{''.join(details)}"
 
 
 def _entry(entry: EntryChange) -> str:
-    line = f"\n- {_ENTRY_VERBS[entry.change]}: {entry.kind} {code(entry.name)}"
+    word = "new" if entry.change == "added" else entry.change
+    line = f"\n- {word}: {entry.kind} {code(entry.name)}"
     if entry.change != "changed":
         return f"{line} for {', '.join(map(code, entry.requesters))}"
     facts = [f"\n  - no longer {code(fact)}" for fact in entry.lost]
     facts += [f"\n  - now {code(fact)}" for fact in entry.gained]
     return line + "".join(facts)
-
-
-def _file(file: FileChange) -> str:
-    return _folded(_plain(file.path), fence("\n".join(file.diff()), "diff"))
 
 
 def _folded(summary: str, body: str) -> str:
@@ -169,9 +142,7 @@ def _folded(summary: str, body: str) -> str:
 def _plain(path: str) -> str:
     """Return a path as HTML, because a summary does not render Markdown."""
     safe = re.sub(r"[^A-Za-z0-9_./-]", lambda char: f"&#{ord(char[0])};", path)
-    return (
-        f"<code>{safe[:_LONGEST_SPAN]}</code>" if len(safe) <= _LONGEST_SPAN else "<code>…</code>"
-    )
+    return f"<code>{safe if len(safe) <= _LONGEST_SPAN else '…'}</code>"
 
 
 def _bounded(parts: list[str], longest: int) -> str:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 
-from demandops.cli.json_output import output_option, print_json
-from demandops.cli.output import console, progress, signing_option, state_repo_option
+from demandops.cli.json_output import output_option, show
+from demandops.cli.output import progress, signing_option, state_repo_option
 from demandops.render.gitops.controller_switch import Step
 from demandops.runtime import REAL
 from demandops.staterepo import upgrade as upgrading
@@ -63,15 +63,12 @@ def upgrade(
         if dry_run or asks:
             made = upgrading.plan(state_repo, request, now, report)
         if asks and not dry_run and made.handover.before:
-            _print_steps("before this, on the clusters:", made.handover.before)
+            show(output, None, _step_lines("before this, on the clusters:", made.handover.before))
             if not click.confirm("Is this done?"):
                 raise click.ClickException("nothing was changed; do this first, or give --yes")
         if not dry_run:
             made = upgrading.upgrade(state_repo, request, now, report, signer)
-    if output == "json":
-        print_json(_data(made, dry_run))
-    else:
-        _print(made, dry_run)
+    show(output, _data(made, dry_run), _lines(made, dry_run))
 
 
 def _data(made: Upgrade, dry_run: bool) -> dict[str, Any]:
@@ -93,28 +90,21 @@ def _step_data(step: Step) -> dict[str, Any]:
     return {"cluster": step.cluster, "what": step.description, "commands": list(step.commands)}
 
 
-def _print(made: Upgrade, dry_run: bool) -> None:
-    out = console()
+def _lines(made: Upgrade, dry_run: bool) -> Iterator[str]:
     new = made.new.repo_settings
     if not made.files:
-        out.print(
+        yield (
             f"nothing to do: everything is rendered for {new.gitops} by version "
             f"{new.render_version}, at {made.commit}"
         )
         return
-    for line in _summary(made, dry_run):
-        out.print(line, soft_wrap=True)
-    if made.handover.before:
-        title = (
-            "before this, on the clusters:"
-            if dry_run
-            else "this had to be done before, on the clusters:"
-        )
-        _print_steps(title, made.handover.before)
-    _print_steps("after it, on the clusters:", made.handover.after)
+    yield from _summary(made, dry_run)
+    title = "before this" if dry_run else "this had to be done before"
+    yield from _step_lines(f"{title}, on the clusters:", made.handover.before)
+    yield from _step_lines("after it, on the clusters:", made.handover.after)
 
 
-def _summary(made: Upgrade, dry_run: bool) -> Iterable[str]:
+def _summary(made: Upgrade, dry_run: bool) -> Iterator[str]:
     old, new = made.old.repo_settings, made.new.repo_settings
     written = sum(text is not None for text in made.files.values())
     done = f"would write {written} and remove" if dry_run else f"wrote {written} and removed"
@@ -134,11 +124,9 @@ def _summary(made: Upgrade, dry_run: bool) -> Iterable[str]:
         yield f"  and {len(made.files) - _MOST_PATHS} more (--output json lists all)"
 
 
-def _print_steps(title: str, steps: Iterable[Step]) -> None:
-    out, clusters = console(), list(steps)
-    if clusters:
-        out.print(f"\n{title}")
-    for step in clusters:
-        out.print(f"- {step.cluster}: {step.description}", soft_wrap=True)
-        for command in step.commands:
-            out.print(f"      {command}", soft_wrap=True)
+def _step_lines(title: str, steps: Iterable[Step]) -> Iterator[str]:
+    for place, step in enumerate(steps):
+        if place == 0:
+            yield f"\n{title}"
+        yield f"- {step.cluster}: {step.description}"
+        yield from (f"      {command}" for command in step.commands)

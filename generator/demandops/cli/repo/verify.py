@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from demandops.cli.json_output import fault_data, output_option, print_json
-from demandops.cli.output import console, progress, state_repo_option
+from demandops.cli.json_output import output_option, show
+from demandops.cli.output import progress, state_repo_option
 from demandops.errors import fault
 from demandops.staterepo import reader
 from demandops.staterepo.audit.verification import Verdict
@@ -32,26 +32,23 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     """
     with reader.opened(state_repo) as repo, progress("rendering again") as report:
         verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
-    if output == "json":
-        print_json([_row(verdict) for verdict in verdicts])
-    else:
-        out = console()
-        for line in _lines(verdicts):
-            out.print(line)
+    show(output, [_row(verdict) for verdict in verdicts], _lines(verdicts))
     if not all(verdict.holds for verdict in verdicts):
-        click.get_current_context().exit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _row(verdict: Verdict) -> dict[str, Any]:
     row = {name: None if value == "" else value for name, value in asdict(verdict).items()}
     message = row.pop("fault")
-    return row | {"faults": [fault_data(fault("", message))] if message else []}
+    return row | {"faults": [asdict(fault("", message))] if message else []}
 
 
 def _lines(verdicts: list[Verdict]) -> Iterator[str]:
     for verdict in verdicts:
         word = "skipped" if verdict.skipped else "holds"
-        word = word if verdict.holds else "DIFFERS" if _differs(verdict) else "UNSIGNED"
+        if not verdict.holds:
+            differs = verdict.fault or verdict.differing or verdict.touched
+            word = "DIFFERS" if differs else "UNSIGNED"
         note = f" ({verdict.skipped})" if verdict.skipped else ""
         yield f"{verdict.commit[:10]} {word}{note}  {verdict.summary}"
         if verdict.fault:
@@ -69,7 +66,3 @@ def _lines(verdicts: list[Verdict]) -> Iterator[str]:
         good = sum(bool(verdict.signer) for verdict in verdicts)
         listed = f", {good} by keys that policy/allowed-signers lists" if good else ""
         yield f"{signed} of {len(verdicts)} are signed{listed}"
-
-
-def _differs(verdict: Verdict) -> bool:
-    return bool(verdict.fault or verdict.differing or verdict.touched)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import click
 from rich.table import Table
 
-from demandops.cli.json_output import output_option, print_json
-from demandops.cli.output import at_option, console, progress, state_repo_option, warn_of
-from demandops.plan.views.bookkeeping import Bookkeeping, as_data
+from demandops.cli.json_output import output_option, show
+from demandops.cli.output import at_option, progress, state_repo_option, warn_of
+from demandops.plan.views.bookkeeping import as_data
 from demandops.plan.views.bookkeeping import bookkeeping as derive
 from demandops.staterepo import reader
-
-_NONE = "(nothing)"
 
 
 @click.command()
@@ -25,52 +25,43 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
             snapshot = repo.snapshot(at, report)
         warn_of(repo.problems() if at is None else ())
     books, commit = derive(snapshot.state), str(snapshot.commit)
-    if output == "json":
-        print_json(as_data(books, commit))
-        return
-    out = console()
-    out.print(services_table(books))
-    out.print(connections_table(books))
-    if books.suspended:
-        out.print(suspended_table(books))
-    out.print(f"at {commit}")
-
-
-def services_table(books: Bookkeeping) -> Table:
-    """Return the services as a table."""
-    table = Table("Service", "Kind", "Node", "For", "Takes in", "Requesters", title="Services")
-    for name, entry in books.services.items():
-        inputs = [topic for topics in entry.inputs.values() for topic in topics]
-        table.add_row(
+    services = [
+        (
             name,
             entry.service,
             entry.node,
             entry.source or ", ".join(entry.applications),
-            "\n".join(inputs),
+            "\n".join(topic for topics in entry.inputs.values() for topic in topics),
             "\n".join(entry.requesters),
         )
-    if not books.services:
-        table.add_row(_NONE, *[""] * 5)
-    return table
-
-
-def connections_table(books: Bookkeeping) -> Table:
-    """Return the connections as a table."""
-    table = Table("Connection", "From", "To", "Topics", "Requesters", title="Connections")
-    for id, entry in books.connections.items():
-        table.add_row(
-            id, entry.source, entry.target, "\n".join(entry.topics), "\n".join(entry.requesters)
+        for name, entry in books.services.items()
+    ]
+    connections = [
+        (id, entry.source, entry.target, "\n".join(entry.topics), "\n".join(entry.requesters))
+        for id, entry in books.connections.items()
+    ]
+    suspended = [
+        (
+            f"{entry.kind} {entry.id}",
+            entry.demand,
+            "\n".join(entry.requesters),
+            entry.override,
+            entry.reason,
         )
-    if not books.connections:
-        table.add_row(_NONE, *[""] * 4)
-    return table
+        for entry in books.suspended
+    ]
+    tables = [
+        _table("Services", ("Service", "Kind", "Node", "For", "Takes in", "Requesters"), services),
+        _table("Connections", ("Connection", "From", "To", "Topics", "Requesters"), connections),
+    ]
+    if suspended:
+        columns = ("Subject", "Demand", "Requesters", "By", "Reason")
+        tables.append(_table("Suspended", columns, suspended))
+    show(output, as_data(books, commit), [*tables, f"at {commit}"])
 
 
-def suspended_table(books: Bookkeeping) -> Table:
-    """Return the claims that overrides suspend, as a table."""
-    table = Table("Subject", "Demand", "Requesters", "By", "Reason", title="Suspended")
-    for entry in books.suspended:
-        subject = f"{entry.kind} {entry.id}"
-        requesters = "\n".join(entry.requesters)
-        table.add_row(subject, entry.demand, requesters, entry.override, entry.reason)
+def _table(title: str, columns: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:
+    table = Table(*columns, title=title)
+    for row in rows or [("(nothing)",)]:
+        table.add_row(*row)
     return table

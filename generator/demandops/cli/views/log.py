@@ -10,17 +10,14 @@ from typing import Any
 import click
 from rich.table import Table
 
-from demandops.cli.json_output import commit_data, output_option, print_json
-from demandops.cli.output import console, state_repo_option
+from demandops.cli.json_output import commit_data, output_option, show
+from demandops.cli.output import state_repo_option
 from demandops.errors import StateRepoError
 from demandops.runtime import REAL
 from demandops.staterepo import reader
 from demandops.staterepo.history import revisions
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.reader import Reader
-
-_BY_HAND = "by-hand"
-
 
 _TRAILERS = {
     "requester": "Requester",
@@ -30,22 +27,14 @@ _TRAILERS = {
 }
 
 
-class _Time(click.ParamType):  # type: ignore[type-arg]
-    """A time, as :func:`demandops.staterepo.history.revisions.parse_time` parses it."""
-
-    name = "time"
-
-    def __init__(self, *, end: bool) -> None:
-        self._end = end
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> datetime:
-        """Parse a time."""
-        time = revisions.parse_time(str(value), REAL.now(), end=self._end)
-        if time is None:
-            self.fail(f"'{value}' is not a time; write it like {revisions.TIMES}", param, ctx)
-        return time
+def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
+    """Parse the time of --since or --until."""
+    if text is None:
+        return None
+    time = revisions.parse_time(text, REAL.now(), end=param.name == "until")
+    if time is None:
+        raise click.BadParameter(f"'{text}' is not a time; write it like {revisions.TIMES}")
+    return time
 
 
 @click.command()
@@ -71,13 +60,11 @@ class _Time(click.ParamType):  # type: ignore[type-arg]
 )
 @click.option(
     "--since",
-    type=_Time(end=False),
+    callback=_time,
     metavar="TIME",
     help=f"Commits at or after this time: {revisions.TIMES}.",
 )
-@click.option(
-    "--until", type=_Time(end=True), metavar="TIME", help="Commits at or before this time."
-)
+@click.option("--until", callback=_time, metavar="TIME", help="Commits at or before this time.")
 @click.option(
     "-n",
     "--max-count",
@@ -101,27 +88,20 @@ def log(
     with reader.opened(state_repo) as repo:
         commits = _walked(repo, commit_range, given.pop("release"))
         entries = list(islice(_matching(repo, commits, **given), max_count))
-    if output == "json":
-        print_json([commit_data(entry) for entry in entries])
-        return
-    if not entries:
-        console().print("no commit matches")
-        return
-    console().print(_table(entries))
+    text = [_table(entries) if entries else "no commit matches"]
+    show(output, [commit_data(entry) for entry in entries], text)
 
 
 def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iterable[LogEntry]:
     if release is None:
         return repo.log(commit_range)
-    tip = repo.commit(
-        (commit_range or "").partition("..")[2] or (commit_range or "").partition("..")[0]
-    )
+    tip = repo.commit((commit_range or "").rpartition("..")[2])
     path = release if "/" in release else repo.release_path(release, tip)
     if path is None:
         raise StateRepoError(
             f"there was never a release '{release}'; `demandops bookkeeping` lists what runs"
         )
-    return repo.commits_changing(path, commit_range)
+    return repo.log(commit_range, path)
 
 
 def _matching(
@@ -140,7 +120,7 @@ def _matching(
     def matches(entry: LogEntry) -> bool:
         return (
             all(value in entry.trailers.get(key, ()) for key, value in wanted)
-            and operation in (None, entry.first("Operation") or _BY_HAND)
+            and operation in (None, entry.first("Operation") or "by-hand")
             and (since is None or entry.time >= since)
             and (until is None or entry.time <= until)
             and (node is None or repo.changes_node(entry.commit, node))

@@ -9,11 +9,11 @@ from demandops.cli.json_output import (
     claim_data,
     output_option,
     override_data,
-    print_json,
     release_data,
+    show,
 )
-from demandops.cli.output import at_option, console, progress, state_repo_option
-from demandops.config.override import format_time
+from demandops.cli.output import at_option, progress, state_repo_option
+from demandops.config.override import Override, format_time
 from demandops.plan.views.override_report import Entry, override_report
 from demandops.runtime import REAL
 from demandops.staterepo import reader
@@ -31,44 +31,39 @@ def overrides(state_repo: str, at: str | None, output: str) -> None:
     """
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(at, report)
-    state = snapshot.state
-    entries = override_report(state, REAL.now())
-    if output == "json":
-        print_json(
-            [
-                {
-                    **override_data(entry.override),
-                    "state": entry.state,
-                    "releases": [release_data(release) for release in entry.releases],
-                    "claims": [claim_data(claim) for claim in entry.claims],
-                }
-                for entry in entries
-            ]
-        )
-        return
-    out = console()
-    if not entries:
-        out.print("no overrides; see docs/overrides.md")
-        return
+    entries = override_report(snapshot.state, REAL.now())
+    data = [
+        {
+            **override_data(entry.override),
+            "state": entry.state,
+            "releases": [release_data(release) for release in entry.releases],
+            "claims": [claim_data(claim) for claim in entry.claims],
+        }
+        for entry in entries
+    ]
+    text: list[str | Table] = [_table(entries), f"at {snapshot.commit}"]
+    show(output, data, text if entries else ["no overrides; see docs/overrides.md"])
+
+
+def _table(entries: list[Entry]) -> Table:
     table = Table("Override", "State", "Does", "To", "Priority", "Owner", "Until", "Reason")
     for entry in entries:
         override = entry.override
+        claims = [f"{claim.subject} of {claim.demand}" for claim in entry.claims]
         table.add_row(
             override.name,
             entry.state,
-            "\n".join(_effects(entry)),
-            "\n".join(_affected(entry)),
+            "\n".join(_effects(override)),
+            "\n".join([*(release.name for release in entry.releases), *claims]),
             str(override.priority),
             override.owner,
             format_time(override.end) if override.end else "",
             override.reason,
         )
-    out.print(table)
-    out.print(f"at {snapshot.commit}")
+    return table
 
 
-def _effects(entry: Entry) -> list[str]:
-    override = entry.override
+def _effects(override: Override) -> list[str]:
     values = {
         "version": override.version,
         "replicas": override.replicas,
@@ -77,8 +72,3 @@ def _effects(entry: Entry) -> list[str]:
         "values": ", ".join(override.values or ()),
     }
     return [f"{name} {values[name]}" if name in values else name for name in override.effects()]
-
-
-def _affected(entry: Entry) -> list[str]:
-    claims = [f"{claim.subject} of {claim.demand}" for claim in entry.claims]
-    return [*(release.name for release in entry.releases), *claims]

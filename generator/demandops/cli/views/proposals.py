@@ -9,14 +9,14 @@ import click
 from rich.table import Table
 
 from demandops import settings
-from demandops.cli.json_output import output_option, print_json, time_data, time_text
-from demandops.cli.output import console, errors, state_repo_option
+from demandops.cli.json_output import output_option, show, time_data, time_text
+from demandops.cli.output import errors, state_repo_option
 from demandops.config.repo_settings import Proposals
 from demandops.errors import InvalidInput
 from demandops.forge import Forge, ForgeError, forge_for
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo import reader
-from demandops.staterepo.write.proposal_branch import PendingProposal
+from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
 
 
 @click.command()
@@ -30,15 +30,13 @@ def proposals(state_repo: str, output: str) -> None:
     read from GitHub or Gitea.
     """
     with reader.opened(state_repo) as repo:
-        pending = repo.proposals()
-        forge = _forge(_configured(repo)) if pending else None
+        pending = list(pending_proposals(repo.repository))
+        forge = _forge(repo) if pending else None
     rows = [_row(each, forge) for each in pending]
-    if output == "json":
-        print_json(rows)
-        return
-    if not rows:
-        console().print("nothing awaits approval")
-        return
+    show(output, rows, [_table(rows) if rows else "nothing awaits approval"])
+
+
+def _table(rows: list[dict[str, Any]]) -> Table:
     table = Table()
     table.add_column("Branch", no_wrap=True)  # so that it can be copied
     for name in ("Demand", "Requesters", "Since (UTC)", "What"):
@@ -53,20 +51,17 @@ def proposals(state_repo: str, output: str) -> None:
             row["summary"],
             row["link"] or "",
         )
-    console().print(table)
+    return table
 
 
-def _configured(repo: reader.Reader) -> Proposals:
-    try:
-        return repo.config().repo_settings.proposals
-    except InvalidInput:
-        return Proposals()  # an invalid file elsewhere must not hide the proposals
-
-
-def _forge(configured: Proposals) -> Forge | None:
+def _forge(repo: reader.Reader) -> Forge | None:
     token_file = settings.forge_token_file()
     if token_file is None:
         return None
+    try:
+        configured = repo.config().repo_settings.proposals
+    except InvalidInput:
+        configured = Proposals()  # an invalid file elsewhere must not hide the proposals
     try:
         return forge_for(configured, token_file)
     except ForgeError as error:
@@ -75,13 +70,10 @@ def _forge(configured: Proposals) -> Forge | None:
 
 
 def _row(proposal: PendingProposal, forge: Forge | None) -> dict[str, Any]:
-    return asdict(proposal) | {"since": time_data(proposal.since), "link": _link(proposal, forge)}
-
-
-def _link(proposal: PendingProposal, forge: Forge | None) -> str | None:
     try:
         request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
     except ForgeError as error:
         errors.print(f"warning: {error}")
-        return None
-    return request.link if request else None
+        request = None
+    link = request.link if request else None
+    return asdict(proposal) | {"since": time_data(proposal.since), "link": link}

@@ -11,16 +11,15 @@ from typing import Any
 import click
 from rich.table import Table
 
-from demandops.cli.json_output import output_option, print_json, release_data
-from demandops.cli.output import console, errors, progress, state_repo_option
+from demandops.cli.json_output import output_option, release_data, show
+from demandops.cli.output import errors, progress, state_repo_option
 from demandops.cluster import access
 from demandops.cluster.health import health_reader
-from demandops.cluster.health.release_health import Health, ObjectSelector, Target
+from demandops.cluster.health.release_health import Health, History, ObjectSelector, Target
 from demandops.cluster.object_cache import ObjectCache
 from demandops.runtime import REAL
 from demandops.service import rollout_targets
 from demandops.staterepo import reader
-from demandops.staterepo.reader import Reader
 
 _SHORT = 10
 
@@ -50,21 +49,17 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
         stores = _read(clusters, [target for _, target in targets])
         commit = str(snapshot.commit)
         rows = [
-            release_data(release) | _state(target, commit, stores, repo)
+            release_data(release) | _state(target, commit, stores, repo.repository)
             for release, target in targets
         ]
-    if output == "json":
-        faults = [{"code": "invalid", **asdict(problem)} for problem in problems]
-        print_json({"commit": commit, "releases": rows, "faults": faults})
-        return
+    faults = [{"code": "invalid", **asdict(problem)} for problem in problems]
+    text: list[str | Table] = [f"  {problem}" for problem in problems]
     if problems:
         count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-        console().print(f"{count}; of each file the last valid version is in effect:")
-    for problem in problems:
-        console().print(f"  {problem}", soft_wrap=True)
-    console().print(_table(rows))
-    console().print(f"desired: {commit}")
-    if not clusters:
+        text.insert(0, f"{count}; of each file the last valid version is in effect:")
+    text += [_table(rows), f"desired: {commit}"]
+    show(output, {"commit": commit, "releases": rows, "faults": faults}, text)
+    if not clusters and output == "text":
         errors.print("the state of the clusters is unknown: give --clusters FILE")
 
 
@@ -91,9 +86,19 @@ def _read(
 
 
 def _state(
-    target: Target, commit: str, stores: Mapping[str, ObjectCache], repo: Reader
+    target: Target, commit: str, stores: Mapping[str, ObjectCache], history: History
 ) -> dict[str, Any]:
-    health, seen, when = _seen(target, commit, stores, repo)
+    store, seen, when = stores.get(target.domain.cluster), "", ""
+    unread = store.unread(target.domain) if store else None
+    if store is None:
+        health = Health("waiting", "no access to this cluster")
+    elif unread:
+        health = unread
+    else:
+        read, objects = health_reader(target.domain), store.objects()
+        health = read.health(target, commit, objects, history)
+        seen = read.applied_commit(target.domain, objects)
+        when = read.last_transition(target, objects)
     return {
         "seen": seen or None,
         "health": health.state if seen or health.object else "unknown",
@@ -102,23 +107,6 @@ def _state(
         "object": health.object or None,
         "reason": health.reason or None,
     }
-
-
-def _seen(
-    target: Target, commit: str, stores: Mapping[str, ObjectCache], repo: Reader
-) -> tuple[Health, str, str]:
-    store = stores.get(target.domain.cluster)
-    if store is None:
-        return Health("waiting", "no access to this cluster"), "", ""
-    unread = store.unread(target.domain)
-    if unread:
-        return unread, "", ""
-    read, objects = health_reader(target.domain), store.objects()
-    return (
-        read.health(target, commit, objects, repo),
-        read.applied_commit(target.domain, objects),
-        read.last_transition(target, objects),
-    )
 
 
 def _table(rows: Iterable[dict[str, Any]]) -> Table:

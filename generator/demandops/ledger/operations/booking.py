@@ -18,7 +18,7 @@ def book(
     current: Claim | None,
     now: datetime,
     *,
-    extend: bool = False,
+    joined: bool = False,
 ) -> Ledger:
     """Return the ledger with a claim on a demanded application or connection.
 
@@ -29,17 +29,17 @@ def book(
         key: the key of the claim.
         current: the demand's claim on the same subject before the request.
         now: when the request was received; a claim that only renews keeps its booking time.
-        extend: whether to keep what the current claim holds.
+        joined: whether a join books it, which keeps what the current claim holds.
     """
-    held = one.held
-    if extend and current:
-        held = current.held.extended(held)  # type: ignore[arg-type]  # it is of the same kind
     claim = Claim(
-        held=held.booked(),
+        held=one.held.booked(),
         demand=key.demand,
         request=request,
         requesters=tuple(sorted(set(one.requesters))),
         booked=now,
         lease=renewed(current.lease if current else None, one.term, now),
+        joined=joined,
     )
+    if joined and current:
+        claim = claim.extending(current)
     return ledger.replace(key, claim.after_booking(current))

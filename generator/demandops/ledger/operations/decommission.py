@@ -1,13 +1,12 @@
 """Decommissioning: a node or a requester leaves for good; its claims are released or reduced.
 
 Decommissioning a node releases its applications, the inputs from it and the connections that end at
-it, whoever requested them. Decommissioning a requester releases all its claims, like a shutdown.
-This includes shared claims, because the other requesters alone would not release them.
+it, whoever requested them. Decommissioning a requester releases all its claims, also those that it
+shares: the other requesters may never release them, because they were named by the one that left.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from datetime import datetime
 
 from demandops.demand.claim import Claim
@@ -30,7 +29,7 @@ def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[
         held = ledger.claims_of_requester(request.id)
         claims |= {f"{c.subject} {c.demand}": c for c in held}
     for claim in claims.values():
-        ledger = ledger.replace(claim.key, _reduced(claim, request, now))
+        ledger = ledger.replace(claim.key, _reduced(claim, request))
     changes = claim_changes(start, ledger, [claim.key for claim in claims.values()])
     if not changes:
         raise Refused([_nothing_held(start, request)])
@@ -49,13 +48,10 @@ def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
     ]
 
 
-def _reduced(claim: Claim, request: Decommission, now: datetime) -> Claim | None:
+def _reduced(claim: Claim, request: Decommission) -> Claim | None:
     if "requester" in request.kinds and request.id in claim.requesters:
         return None
-    if not claim.held.needs(request.id):
-        return claim
-    left = claim.held.without_node(request.id)
-    return replace(claim, held=left, booked=now) if left else None
+    return claim.without_node(request.id) if claim.held.needs(request.id) else claim
 
 
 def _nothing_held(ledger: Ledger, request: Decommission) -> Fault:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 
 from demandops.demand.claim import ClaimKey, demand_id
@@ -24,8 +25,12 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     for one in request.demanded:
         faults += conflicts(one, ledger)
         key = ClaimKey(one.held.subject, demand_id(request.id, one.requesters))
-        ledger = book(ledger, one, request.id, key, ledger.get(key), now, extend=True)
+        ledger = book(ledger, one, request.id, key, ledger.get(key), now, joined=True)
         keys.append(key)
     if faults:
         raise Refused(faults)
-    return ledger, Changes(claims=claim_changes(start, ledger, keys))
+    changes = claim_changes(start, ledger, keys)
+    if not changes:
+        return start, Changes()
+    shutdowns, forgotten = start.shutdowns.forget(now, request.requesters())
+    return replace(ledger, shutdowns=shutdowns), Changes(claims=changes, shutdowns=forgotten)

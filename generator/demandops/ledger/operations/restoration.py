@@ -56,7 +56,12 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
     start = ledger
     for change in changes:
         ledger = ledger.replace(change.key, _with_full_lease(change, now))
-    return ledger, Changes(claims=claim_changes(start, ledger, [change.key for change in changes]))
+    booked = {who for change in changes if change.after for who in change.after.requesters}
+    shutdowns, forgotten = start.shutdowns.forget(now, booked)
+    return replace(ledger, shutdowns=shutdowns), Changes(
+        claims=claim_changes(start, ledger, [change.key for change in changes]),
+        shutdowns=forgotten,
+    )
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:

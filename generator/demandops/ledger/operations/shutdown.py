@@ -1,8 +1,13 @@
-"""A shutdown releases the claims that it matches, or parts of them."""
+"""A shutdown takes holds: one of each requester that it names, on each topic that it lists.
+
+It takes a hold from the claim that the same request booked for the same requesters, else from the
+oldest claim in which the requester holds the topic; claims of the same request id come first. It
+never takes from claims that a demand with an id booked.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime
 
@@ -10,57 +15,78 @@ from demandops.demand.claim import Claim, ClaimKey, demand_id
 from demandops.demand.demand_request import Demanded, Shutdown
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.recent_shutdowns import RecentShutdown
+from demandops.subject import TopicKey
 
 
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Release the applications, connections and topics that a shutdown lists.
+    """Take the holds that a shutdown names; nothing, if the same one came in the last 15 minutes.
 
     Raises:
         Refused: if the requesters hold none of them.
     """
-    start = ledger
-    keys: list[ClaimKey] = []
-    not_held: list[str] = []
+    record = RecentShutdown.of(request, now)
+    repeats = ledger.shutdowns.earlier(record)
+    if repeats is not None:
+        return ledger, Changes(repeats=repeats)
+    start, not_held = ledger, list[str]()
+    taken: dict[tuple[ClaimKey, str], set[TopicKey]] = {}
     for one in request.demanded:
-        subject = one.held.subject
-        # look in ``start``: a subject that is listed twice means the same claim both times
-        claim = _matching_claim(start.claims_on(subject), request.id, one)
-        if claim is None:
-            not_held.append(f"{subject} for {', '.join(one.requesters)}")
-            continue
-        not_held += [f"{subject}: {name}" for name in _subtract(claim, one, now)[1]]
-        left = ledger.get(claim.key)
-        if left is not None:
-            ledger = ledger.replace(claim.key, _subtract(left, one, now)[0])
-        keys.append(claim.key)
-    changes = claim_changes(start, ledger, keys)
-    if not changes:
+        for requester in one.requesters:
+            # look in ``start``: what is listed twice is taken once
+            claims = _claims_meant(start, request, one, requester)
+            for words, claim, held in _holds(one, requester, claims):
+                if claim is None:
+                    not_held.append(words)
+                else:
+                    taken.setdefault((claim.key, requester), set()).update(held)
+    for (key, requester), topics in taken.items():
+        left = ledger.get(key)
+        assert left is not None  # noqa: S101 - this requester still holds something
+        ledger = ledger.replace(key, left.without_holds(requester, topics))
+    if not taken:
         raise Refused([_nothing_held(start, request)])
-    return ledger, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
-
-
-def _matching_claim(claims: Iterable[Claim], request: str, listed: Demanded) -> Claim | None:
-    """Return the claim that a shutdown matches, or ``None`` if none or several could match."""
-    claims = [claim for claim in claims if claim.held.is_meant_by(listed.held)]
-    requesters = set(listed.requesters)
-    own_id = demand_id(request, requesters)
-    exact = [claim for claim in claims if set(claim.requesters) == requesters]
-    meant = (
-        [claim for claim in exact if claim.demand == own_id]
-        or [claim for claim in exact if claim.request == request]
-        or exact
-        or [claim for claim in claims if set(claim.requesters) >= requesters]
+    shutdowns, forgotten = ledger.shutdowns.forget(now)
+    ledger = replace(ledger, shutdowns=shutdowns.replace(record.digest, record))
+    return ledger, Changes(
+        claims=claim_changes(start, ledger, [key for key, _ in taken]),
+        not_held=tuple(dict.fromkeys(not_held)),
+        shutdowns=(*forgotten, record.digest),
     )
-    return meant[0] if len(meant) == 1 else None
 
 
-def _subtract(claim: Claim, one: Demanded, now: datetime) -> tuple[Claim | None, list[str]]:
-    """Return the rest of a claim, ``None`` if nothing is left, and topics that it did not hold."""
-    held = claim.held
-    left, missing = held.without(one.held)  # type: ignore[arg-type]  # it is of the same kind
-    if left is None or left == held:
-        return (None if left is None else claim), missing
-    return replace(claim, held=left, booked=now), missing
+def _claims_meant(ledger: Ledger, request: Shutdown, one: Demanded, requester: str) -> list[Claim]:
+    """Return the claims to take a requester's holds from, in this order."""
+    own = demand_id(request.id, one.requesters)
+    claims = ledger.claims_held_by(requester, one.held.subject)
+    return sorted(
+        (claim for claim in claims if claim.joined and claim.held.is_meant_by(one.held)),
+        key=lambda c: (c.demand != own, c.request != request.id, c.booked, c.demand),
+    )
+
+
+def _holds(
+    one: Demanded, requester: str, claims: list[Claim]
+) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
+    """Yield each listed topic in words, the claim to take it from, and what the claim calls it.
+
+    If no topic is listed, all holds in the first claim are taken.
+    """
+    subject = one.held.subject
+    listed = [words for words, _ in one.held.listed_topics(one.held)]
+    if not claims or not listed:
+        first = next(iter(claims), None)
+        yield f"{subject} for {requester}", first, list(first.held.topic_keys()) if first else []
+        return
+    by_claim = [(claim, dict(claim.held.listed_topics(one.held))) for claim in claims]
+    for words in listed:
+        for claim, meant in by_claim:
+            held = [topic for topic in meant[words] if requester in claim.holders(topic)]
+            if held:
+                yield words, claim, held
+                break
+        else:
+            yield f"{subject}: {words} for {requester}", None, []
 
 
 def _nothing_held(ledger: Ledger, request: Shutdown) -> Fault:

@@ -11,7 +11,7 @@ bookkeeping and history show it like any other.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 
 from demandops.config.config import Config
@@ -117,7 +117,8 @@ def without_suspended(world: World) -> World:
     ledger = world.ledger
     if isinstance(ledger, UnsuspendedClaims) or not any(one.deny for one in world.overrides):
         return world
-    view = UnsuspendedClaims(ledger.claims, ledger.index, ledger.minutes, ledger.ended, world)
+    parts = (getattr(ledger, part.name) for part in fields(Ledger))
+    view = replace(UnsuspendedClaims(*parts), world=world)
     return replace(world, ledger=view)
 
 
@@ -212,7 +213,14 @@ def _needed(
     for override in keeping_overrides(last, world):
         name = OVERRIDE_PREFIX + override.name
         return replace(
-            last, demand=name, request=name, requesters=(override.owner,), booked=now, lease=None
+            last,
+            demand=name,
+            request=name,
+            requesters=(override.owner,),
+            booked=now,
+            lease=None,
+            joined=False,
+            partial={},
         )
     return None
 

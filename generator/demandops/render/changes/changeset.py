@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from demandops.errors import Refused
-from demandops.ledger import claim_file
-from demandops.ledger.ledger import ClaimChange
+from demandops.ledger import claim_file, recent_shutdowns
+from demandops.ledger.ledger import Changes
 from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
@@ -33,13 +33,13 @@ FileReader = Callable[[str], str | None]
 
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
-    """A release that starts, changes or stops, the facts that change, and its file."""
+    """A release that starts, changes or stops, its file, and the facts that change."""
 
     name: str
+    what: str
+    file: str
     change: Change
-    description: str
-    details: tuple[str, ...]
-    path: str = ""
+    details: tuple[str, ...] = ()
 
     @property
     def order(self) -> tuple[int, str]:
@@ -62,7 +62,7 @@ class Changeset:
 def build_changeset(
     before: World,
     after: World,
-    claims: Iterable[ClaimChange],
+    changes: Changes,
     keys: Iterable[ReleaseKey],
     engine: Engine,
     read: FileReader,
@@ -71,18 +71,21 @@ def build_changeset(
 
     Args:
         before, after: the world before and after; the configuration is the same.
-        claims: the claims that differ.
+        changes: what differs in the ledger.
         keys: the releases that may differ (:func:`demandops.plan.release_keys.affected`).
-        engine: the engine of the configuration.
-        read: returns a current file.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.
     """
     files: dict[str, str | None] = {
         claim_file.path_of(change.key): claim_file.text_of(change.after) if change.after else None
-        for change in claims
+        for change in changes.claims
     }
+    for digest in changes.shutdowns:
+        shutdown = after.ledger.shutdowns.by_digest.get(digest)
+        files[recent_shutdowns.path_of(digest)] = (
+            recent_shutdowns.text_of(shutdown) if shutdown else None
+        )
     releases = []
     shaped: set[str] = set()
     blocked: list[str] = []
@@ -113,8 +116,6 @@ def render_all(
     """Return all generated files, by path.
 
     Args:
-        world: the configuration and the claims.
-        engine: the configuration's engine.
         keys: all releases (:func:`demandops.plan.release_keys.all_keys`).
         current: the generated files in the state repo; overrides may hold some of them.
 
@@ -140,26 +141,19 @@ def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:
 
 
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
-    """Return a description of how a release changes.
-
-    Args:
-        old, new: the release before and after; one of them is not ``None``.
-        existed: whether the release had a file before.
-    """
+    """Return how a release changes; ``existed`` is whether it had a file before."""
     release = new or old
-    assert release is not None  # noqa: S101 - see above
-    kind: Change = "stop" if not new else "start"
-    if new and existed:
-        kind = "change"
-    details = _differences(old, new) if kind == "change" else ()
-    return ReleaseChange(release.name, kind, release.description, details, path_of(release))
+    assert release is not None  # noqa: S101 - it has at least one side
+    kind: Change = "stop" if not new else "change" if existed else "start"
+    details = _differences(old, new) if new and existed else ()
+    return ReleaseChange(release.name, release.description, path_of(release), kind, details)
 
 
-def _differences(old: Release | None, new: Release | None) -> tuple[str, ...]:
+def _differences(old: Release | None, new: Release) -> tuple[str, ...]:
     before, after = _overrides(old), _overrides(new)
-    if new is None or not new.shaping.held:  # of a held file, only the comments change
+    if not new.shaping.held:  # of a held file, only the comments change
         before = (old.facts() if old else []) + before
-        after = (new.facts() if new else []) + after
+        after = new.facts() + after
     old_facts, new_facts = frozenset(before), frozenset(after)
     removed = [f"- {fact}" for fact in before if fact not in new_facts]
     added = [f"+ {fact}" for fact in after if fact not in old_facts]

@@ -8,11 +8,10 @@ because the clusters follow the files. The plans of both sides describe the diff
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
-from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.world import World
@@ -20,13 +19,15 @@ from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of
 from demandops.render.changes.changeset import ReleaseChange, describe_change
-from demandops.render.changes.data_diff import leaf_differences, short_value
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
-from demandops.subject import Subject, SubjectKind
+from demandops.strict_yaml import load_all, short_repr
 
 _MOST_FACTS = 20
+
+ABSENT = object()
+"""Marks a missing value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,43 +86,31 @@ def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) ->
 
     A fault's file is the first that exists: a claim of the release that is in ``edited``, the
     fault's own file, any claim of the release.
-
-    Args:
-        world: the configuration and the claims.
-        engine: the configuration's engine.
-        edited: the files that a person changed.
     """
     faults: list[Fault] = []
-    claim_files: dict[ReleaseKey, list[str]] = {}
+    files: dict[ReleaseKey, list[str]] = {}
     for key in all_keys(world):
         try:
             release = plan(world, key)
             if release is not None:
                 manifests.render(release, world.config, engine)
         except InvalidInput as error:
-            claim_files = claim_files or _claim_files(world)
-            faults += _located(error.faults, claim_files.get(key, []), edited)
+            files = files or _claim_files(world)
+            claims = files.get(key, [])
+            edited_claim = next((path for path in claims if path in edited), "")
+            for fault in error.faults:
+                faults.append(fault.within(edited_claim or fault.file or (claims or [""])[0]))
     return list(dict.fromkeys(faults))
 
 
 def _claim_files(world: World) -> dict[ReleaseKey, list[str]]:
     """Return the files of the claims that need a release, by release."""
     by_release: dict[ReleaseKey, list[str]] = {}
-    for subject in (
-        Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)
-    ):
-        files = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
+    for subject in sorted(world.ledger.claims, key=str):
+        paths = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
         for key in keys_of(world, subject):
-            by_release.setdefault(key, []).extend(files)
+            by_release.setdefault(key, []).extend(paths)
     return by_release
-
-
-def _located(
-    faults: Iterable[Fault], claims: list[str], edited: Collection[str]
-) -> Iterator[Fault]:
-    edited_claim = next((path for path in claims if path in edited), "")
-    for fault in faults:
-        yield replace(fault, file=edited_claim or fault.file or (claims or [""])[0])
 
 
 def preview(
@@ -130,12 +119,7 @@ def preview(
     current: Mapping[str, str],
     files: Mapping[str, str],
 ) -> MergePreview:
-    """Return the releases and files that change.
-
-    Args:
-        old, new: the releases before and after.
-        current, files: the generated files before and after.
-    """
+    """Return what changes from ``old`` to ``new`` releases, and ``current`` to ``files``."""
     file_changes = tuple(
         FileChange(path, current.get(path), files.get(path))
         for path in sorted({*current, *files})
@@ -176,12 +160,27 @@ def _pairs(
 def _facts(before: str, after: str) -> Iterator[str]:
     """Yield the differences between two manifests, if no fact of the plan describes them."""
     try:
-        differing = list(
-            leaf_differences(list(strict_yaml.load_all(before)), list(strict_yaml.load_all(after)))
-        )
+        differing = list(leaf_differences(list(load_all(before)), list(load_all(after))))
     except InvalidInput:
         return
     for path, old, new in differing[:_MOST_FACTS]:
-        yield f"{path.removeprefix('[0].')}: {short_value(old)} → {short_value(new)}"
+        was, now = ("none" if one is ABSENT else short_repr(one) for one in (old, new))
+        yield f"{path.removeprefix('[0].')}: {was} → {now}"
     if len(differing) > _MOST_FACTS:
         yield f"and {len(differing) - _MOST_FACTS} more"
+
+
+def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
+    """Yield (path, old, new) of the smallest parts that differ.
+
+    A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`.
+    """
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in dict.fromkeys([*old, *new]):
+            inner = f"{path}.{key}" if path else str(key)
+            yield from leaf_differences(old.get(key, ABSENT), new.get(key, ABSENT), inner)
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for index, (left, right) in enumerate(zip(old, new, strict=True)):
+            yield from leaf_differences(left, right, f"{path}[{index}]")
+    elif type(old) is not type(new) or old != new:
+        yield path, old, new

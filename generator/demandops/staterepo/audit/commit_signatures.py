@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import git
-from pygit2 import Commit, Repository
+from pygit2 import Repository
 
 from demandops.staterepo.audit.verification import Verdict
 from demandops.staterepo.git import tree as trees
@@ -22,44 +22,39 @@ from demandops.staterepo.history.commit_log import entry_of
 ALLOWED_SIGNERS = "policy/allowed-signers"
 
 _SSH = "-----BEGIN SSH SIGNATURE-----"
-_GOOD = "G"
 _CONFIG = ("-c", "gpg.ssh.program=ssh-keygen", "-c", "gpg.minTrustLevel=undefined")
 
 
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
     """Return the verdicts with the check of each commit's signature added."""
-    verdicts = list(verdicts)
+    verdicts, signatures = list(verdicts), dict[str, str]()
     lists: dict[str, list[str]] = {}
-    signatures = {}
     for verdict in verdicts:
         commit = trees.commit_of(repo, verdict.commit)
         signatures[verdict.commit] = (commit.gpg_signature[0] or b"").decode("utf-8", "replace")
-        allowed = _allowed(commit)
+        allowed = trees.read_text(trees.parent_tree(commit), ALLOWED_SIGNERS)
         if allowed is not None and entry_of(commit).by_generator:
             lists.setdefault(allowed, []).append(verdict.commit)
     checked: dict[str, tuple[str, str]] = {}
     for allowed, commits in lists.items():
         checked |= _check_with_git(repo, allowed, commits)
-    return [_with_signature(verdict, signatures[verdict.commit], checked) for verdict in verdicts]
+    return [
+        _with_signature(verdict, signatures[verdict.commit], checked.get(verdict.commit))
+        for verdict in verdicts
+    ]
 
 
-def _allowed(commit: Commit) -> str | None:
-    return trees.read_text(commit.parents[0].tree, ALLOWED_SIGNERS) if commit.parents else None
-
-
-def _with_signature(
-    verdict: Verdict, signature: str, checked: dict[str, tuple[str, str]]
-) -> Verdict:
+def _with_signature(verdict: Verdict, signature: str, checked: tuple[str, str] | None) -> Verdict:
     verdict = replace(verdict, signed=bool(signature))
-    if verdict.commit not in checked:
+    if checked is None:
         return verdict
-    state, signer = checked[verdict.commit]
+    state, signer = checked
     if not signature:
         fault = f"is not signed, but {ALLOWED_SIGNERS} requires it"
-    elif state != _GOOD or not signature.lstrip().startswith(_SSH):
+    elif state == "B":
+        fault = "has a signature of another commit"
+    elif state != "G" or not signature.lstrip().startswith(_SSH):
         fault = f"is signed, but not by a key that {ALLOWED_SIGNERS} lists"
-        if state == "B":
-            fault = "has a signature of another commit"
     else:
         return replace(verdict, signer=signer)
     return replace(verdict, holds=False, signature=fault)
@@ -79,13 +74,8 @@ def _check_with_git(
                 [
                     *(opened.git.GIT_PYTHON_GIT_EXECUTABLE, *_CONFIG),
                     *("-c", f"gpg.ssh.allowedSignersFile={file}"),
-                    *(
-                        "log",
-                        "--no-show-signature",
-                        "--no-walk=unsorted",
-                        "--stdin",
-                        "--format=%H %G? %GS",
-                    ),
+                    *("log", "--no-show-signature", "--no-walk=unsorted", "--stdin"),
+                    "--format=%H %G? %GS",
                 ],
                 istream=lines,
             )

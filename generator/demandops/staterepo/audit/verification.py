@@ -5,6 +5,8 @@ proven before it. The second way relies on object ids, and on plans and files th
 input only. It does not trust which releases the generator considered affected: it plans and renders
 every release again if any input of its plan changed (:mod:`demandops.plan.traced_plan`), and
 compares every file that differs in Git. The first and the last commit are proven whole.
+
+A commit may change generated files and the claims that its message names, and no others.
 """
 
 from __future__ import annotations
@@ -16,9 +18,11 @@ import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.config.config import CONFIG_ROOTS
+from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, rendered_files
+from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.errors import InvalidInput
-from demandops.ledger import ended_override_file
+from demandops.ledger import claim_file, ended_override_file, recent_shutdowns
 from demandops.ledger.ledger import ClaimChange
 from demandops.ledger.world import World
 from demandops.plan.release import Release
@@ -28,12 +32,18 @@ from demandops.render import release_file
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
-from demandops.staterepo.audit import allowed_changes
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import PROPOSAL, LogEntry, entry_of
 from demandops.staterepo.load import ledger_files, state_in_effect
 
 _CHARTS = "/_charts/"
+_OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
+_RECORDING = ("shutdown", "join", "rollback")
+"""Operations that may record or forget recent shutdowns."""
+_REWRITING = ("follow", "upgrade")
+"""Operations that may write a claim anew: its lease starts, or its schema changes."""
+_ENDING = ("follow", "upgrade", "expire-override")
+"""Operations that may add or remove the marker of an ended override."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +71,6 @@ class _Proof:
     """A commit that was rendered again; the proof of the next commit reuses its results."""
 
     def __init__(self, state: State, commit: Commit) -> None:
-        """Render a commit whole."""
         self.state, self._commit = state, commit
         self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
@@ -78,11 +87,7 @@ class _Proof:
         return trees.differ(self._commit.tree, commit.tree, roots)
 
     def advance(self, commit: Commit) -> None:
-        """Render the releases that a later commit affects, and record the files that it changed.
-
-        Raises:
-            _Unreadable: a claim file is not valid.
-        """
+        """Render the releases that a later commit affects, and record the files that it changed."""
         before, after = self._commit.tree, commit.tree
         try:
             changes = [
@@ -134,12 +139,8 @@ class _Proof:
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
-    """Yield a verdict on each commit, oldest first.
-
-    Args:
-        whole: load and render every commit whole.
-    """
-    proofs = _Proofs(repo)
+    """Yield a verdict on each commit, oldest first; with ``whole``, load and render each whole."""
+    proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):
         commit = trees.commit_of(repo, revision)
         entry = entry_of(commit)
@@ -147,60 +148,45 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         if verdict.skipped:
             yield verdict
             continue
-        touched = allowed_changes.disallowed_files(commit, entry)
-        whole_commit = whole or place == len(commits) or bool(entry.first("In-Force"))
+        verdict = replace(verdict, touched=tuple(sorted(_disallowed_files(commit, entry))))
+        before, proof = proof, None  # it stays None if the commit cannot be read
         try:
-            differing = proofs.differing(commit, entry, whole=whole_commit)
+            if whole or place == len(commits) or entry.first("In-Force"):
+                differing = _differing_whole(commit, _loaded(repo, entry))
+            else:
+                if before is None or before.is_reconfigured(commit):
+                    proof = _Proof(_loaded(repo, entry), commit)
+                else:
+                    before.advance(commit)
+                    proof = before
+                differing = proof.differing()
         except _Unreadable as error:
             why = f"a file was not valid then: {error}"
-            yield replace(verdict, skipped=why, touched=touched, holds=not touched)
+            yield replace(verdict, skipped=why, holds=not verdict.touched)
         except InvalidInput as error:  # the generator did render it then, so it must now
-            yield replace(verdict, holds=False, fault=str(error.faults[0]), touched=touched)
+            yield replace(verdict, holds=False, fault=str(error.faults[0]))
         else:
-            holds = not (differing or touched)
-            yield replace(verdict, holds=holds, differing=differing, touched=touched)
+            holds = not (differing or verdict.touched)
+            yield replace(verdict, holds=holds, differing=differing)
 
 
 class _Unreadable(Exception):
     """Raised when a commit cannot be proven because one of its files is not valid."""
 
 
-class _Proofs:
-    """Proves commits one after the other."""
+def _loaded(repo: Repository, entry: LogEntry) -> State:
+    try:
+        return state_in_effect.recorded_state(repo, entry).state
+    except InvalidInput as error:
+        raise _Unreadable(error.faults[0]) from None
 
-    def __init__(self, repo: Repository) -> None:
-        self._repo = repo
-        self._proof: _Proof | None = None
 
-    def differing(self, commit: Commit, entry: LogEntry, *, whole: bool) -> tuple[str, ...]:
-        """Return the files of a commit that differ from the rendered ones.
-
-        Args:
-            whole: do not reuse results of another commit.
-
-        Raises:
-            _Unreadable, InvalidInput: the commit cannot be read or rendered.
-        """
-        proof, self._proof = self._proof, None
-        if whole:
-            state = self._loaded(entry)
-            before = trees.parent_tree(commit) if _holds(state) else None
-            held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
-            files = rendered_files(state, held)
-            wanted = {path: _blob(text) for path, text in files.items()}
-            return _differing(wanted, _generated_files(commit.tree))
-        if proof is None or proof.is_reconfigured(commit):
-            proof = _Proof(self._loaded(entry), commit)
-        else:
-            proof.advance(commit)
-        self._proof = proof  # not reached, and so None, if the commit could not be read
-        return proof.differing()
-
-    def _loaded(self, entry: LogEntry) -> State:
-        try:
-            return state_in_effect.recorded_state(self._repo, entry).state
-        except InvalidInput as error:
-            raise _Unreadable(error.faults[0]) from None
+def _differing_whole(commit: Commit, state: State) -> tuple[str, ...]:
+    """Render a commit whole, without the results of another one."""
+    before = trees.parent_tree(commit) if _holds(state) else None
+    held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
+    wanted = {path: _blob(text) for path, text in rendered_files(state, held).items()}
+    return _differing(wanted, _generated_files(commit.tree))
 
 
 def _differing(wanted: Mapping[str, Oid], committed: Mapping[str, Oid]) -> tuple[str, ...]:
@@ -230,3 +216,57 @@ def _generated_files(tree: Tree) -> dict[str, Oid]:
 
 def _blob(text: str) -> Oid:
     return pygit2.hash(text.encode())
+
+
+def _disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
+    """Yield the files that a commit changed although its message does not account for them.
+
+    These are files that people write, claims of demands that the message does not name, and claims
+    that are not formatted as the generator writes them.
+    """
+    if not commit.parents:
+        return
+    before, operation = commit.parents[0].tree, entry.first("Operation")
+    named = _named(entry)
+    for path, blob in trees.differences(before, commit.tree):
+        root = path.split("/", 1)[0]
+        if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
+            continue
+        if root != claim_file.LEDGER_ROOT:
+            yield path
+        elif path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
+            text = trees.read_text(commit.tree, path) or ""
+            if operation not in _ENDING or (blob and not ended_override_file.read({path: text})):
+                yield path
+        elif path.startswith(f"{recent_shutdowns.SHUTDOWNS_ROOT}/"):
+            if operation not in _RECORDING:
+                yield path
+        elif path.rsplit("/", 1)[-1] in named:
+            if blob and not _is_canonical(commit, path):
+                yield path
+        elif operation not in _REWRITING or not _only_rewrites(commit, path):
+            yield path
+
+
+def _named(entry: LogEntry) -> set[str]:
+    demands = {*entry.trailers.get("Demand-Id", ())}
+    for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
+        demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
+    return {f"{claim_file.segment(demand)}.yaml" for demand in demands}
+
+
+def _only_rewrites(commit: Commit, path: str) -> bool:
+    """Return whether a claim changed only its schema, or its lease started after approval."""
+    before, after = (
+        ledger_files.valid_claim_at(one.tree, path) for one in (commit.parents[0], commit)
+    )
+    if before is None or after is None:
+        return False
+    if before.lease and after.lease and after.lease.has_started > before.lease.has_started:
+        before = replace(before, lease=replace(before.lease, until=after.lease.until))
+    return before == after and _is_canonical(commit, path)
+
+
+def _is_canonical(commit: Commit, path: str) -> bool:
+    claim = ledger_files.valid_claim_at(commit.tree, path)
+    return claim is not None and claim_file.text_of(claim) == trees.read_text(commit.tree, path)

@@ -1,4 +1,4 @@
-"""The address of a state repo: a folder or a URL, and which URLs are allowed."""
+"""The address of a state repo: a folder or a URL that Git can clone, and opening it."""
 
 from __future__ import annotations
 
@@ -6,17 +6,13 @@ import re
 from pathlib import Path
 
 from demandops.errors import StateRepoError
+from demandops.staterepo.git.local_repository import LocalRepository
+from demandops.staterepo.git.remote_repository import HAS_PASSWORD, Notify, RemoteRepository
+from demandops.staterepo.git.repository import StateRepository
 
 _SCHEME = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]*)(://|::)")
 _SCP = re.compile(r"^([^/\s:]+:(?!:)|[^/\s:]+@\[[^\]/]+\]:)")
 _ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
-_HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
-_USER = re.compile(r"(://)[^/@\s]*@")
-
-
-def without_secrets(text: str) -> str:
-    """Return ``text`` without the user part of its URLs, which may hold a password."""
-    return _USER.sub(r"\1", _HAS_PASSWORD.sub(r"\1", text))
 
 
 def is_url(address: str) -> bool:
@@ -24,18 +20,37 @@ def is_url(address: str) -> bool:
     return not Path(address).exists() and bool(_SCHEME.match(address) or _SCP.match(address))
 
 
-def check_url(url: str) -> None:
-    """Refuse a URL that git accepts but a generator should not use.
+def connect(
+    address: str, folder: Path, notify: Notify = lambda text: None, *, allow_offline: bool = False
+) -> StateRepository:
+    """Open the state repo at a bare repository's folder, or at a URL that git clones to ``folder``.
+
+    Args:
+        notify: called with a text before work that takes a while.
+        allow_offline: use an existing clone if its remote cannot be reached.
 
     Raises:
-        StateRepoError: the URL has another scheme or holds a password.
+        StateRepoError: the address is not usable, or the remote cannot be reached.
     """
+    if is_url(address):
+        _check_url(address)
+        return RemoteRepository(address, folder / "clone.git", notify, allow_offline)
+    path = Path(address).expanduser()
+    if not path.is_dir():
+        raise StateRepoError(
+            f"{address} does not exist; make a state repo with `demandops init {address} --bare`"
+        )
+    return LocalRepository(path)
+
+
+def _check_url(url: str) -> None:
+    """Refuse a URL that git accepts but a generator should not use."""
     scheme = _SCHEME.match(url)
     if scheme and (scheme[2] == "::" or scheme[1] not in _ALLOWED):
         raise StateRepoError(
             f"a state repo's address cannot start with '{scheme[0]}'; use https, ssh, git or file"
         )
-    if _HAS_PASSWORD.search(url):
+    if HAS_PASSWORD.search(url):
         raise StateRepoError(
             "the state repo's address holds a password, which process lists would show; remove "
             "it and use a credential helper, ~/.netrc or an SSH key"

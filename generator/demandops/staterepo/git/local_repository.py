@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
-import git
 import pygit2
 from pygit2 import Oid, Repository
 
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.repository import MAIN, StateRepository, Unavailable, disk_error
 
 _STALE_LOCK_S = 5.0
@@ -33,15 +34,19 @@ class LocalRepository(StateRepository):
             raise StateRepoError(
                 f"{path} is not a Git repository; make one with `demandops init {path} --bare`"
             ) from None
-        if not self.objects.is_bare:
-            _refuse_checked_out(path)
+        self.new = NewObjects(self.objects)
         if MAIN not in self.objects.references:
             raise StateRepoError(
                 f"{path} has no branch '{MAIN_BRANCH}'; make a state repo with "
                 "`demandops init DIR --bare`"
             )
+        if self.objects.branches.local[MAIN_BRANCH].is_checked_out():
+            raise StateRepoError(
+                f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
+                f"use a bare clone: git clone --bare {path} {path}.git"
+            )
 
-    def refresh(self) -> Oid:
+    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         """Return the tip, which is always current."""
         return self.tip()
 
@@ -51,7 +56,8 @@ class LocalRepository(StateRepository):
         if reference.target != expected:
             return False
         try:
-            reference.set_target(commit, "demandops")
+            with self.new.packed(commit):
+                reference.set_target(commit, "demandops")
         except (pygit2.GitError, OSError) as error:
             reason = disk_error(error, self.address)
             if reason is not None:
@@ -85,17 +91,3 @@ class LocalRepository(StateRepository):
                     f"{self.address} cannot be written: {lock} cannot be removed "
                     f"({error.strerror}); remove it"
                 ) from None
-
-
-def _refuse_checked_out(path: Path) -> None:
-    with git.Repo(path) as repo:
-        heads = [
-            line.removeprefix("branch ")
-            for line in repo.git.worktree("list", "--porcelain").splitlines()
-            if line.startswith("branch ")
-        ]
-    if MAIN in heads:
-        raise StateRepoError(
-            f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
-            f"use a bare clone: git clone --bare {path} {path}.git"
-        )

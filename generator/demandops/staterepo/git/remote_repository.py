@@ -1,8 +1,4 @@
-"""The state repo behind a URL: a bare clone, fetched and pushed by git.
-
-Explains why a fetch or a push failed: remote unreachable, or push rejected. What follows from it
-is decided in :mod:`demandops.service.worker`.
-"""
+"""The state repo behind a URL: a bare clone, fetched and pushed by git, and why that failed."""
 
 from __future__ import annotations
 
@@ -23,7 +19,7 @@ from pygit2 import Oid, Repository
 from demandops.errors import StateRepoError
 from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
-from demandops.staterepo.git.address import without_secrets
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.repository import (
     ENVIRONMENT,
     MAIN,
@@ -48,9 +44,17 @@ _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
 )
 
+_USER = re.compile(r"(://)[^/@\s]*@")
+
+HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
 Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")
+
+
+def without_secrets(text: str) -> str:
+    """Return ``text`` without the user part of its URLs, which may hold a password."""
+    return _USER.sub(r"\1", HAS_PASSWORD.sub(r"\1", text))
 
 
 class RemoteRepository(StateRepository):
@@ -69,8 +73,7 @@ class RemoteRepository(StateRepository):
             lock.unlink(missing_ok=True)
         if not self._is_usable():
             self._clone(notify)
-        self._git = git.Repo(folder)
-        self.objects = Repository(str(folder))
+        self._open()
         try:
             self.refresh()
         except RemoteAway as error:
@@ -78,8 +81,11 @@ class RemoteRepository(StateRepository):
                 raise
             log.warning("%s; continuing with the commits of the last fetch", error)
 
+    def _open(self) -> None:
+        self._git, self.objects = git.Repo(self._folder), Repository(str(self._folder))
+        self.new = NewObjects(self.objects)
+
     def _is_usable(self) -> bool:
-        """Return whether an earlier run left a complete clone."""
         try:
             repo = Repository(str(self._folder))
             commit = repo[repo.references[_REMOTE_MAIN].target]
@@ -100,7 +106,7 @@ class RemoteRepository(StateRepository):
         except Exception as error:
             log.warning("the clone %s is damaged (%s); making it anew", self._folder, error)
         self._clone(log.info)
-        self._git, self.objects = git.Repo(self._folder), Repository(str(self._folder))
+        self._open()
         return True
 
     def _clone(self, notify: Notify) -> None:
@@ -127,32 +133,25 @@ class RemoteRepository(StateRepository):
         spec = f"+{MAIN}:{_REMOTE_MAIN}"
         self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
-    def refresh(self) -> Oid:
-        """Fetch and return the remote's commit."""
-        self._fetch(self._git)
-        return self.tip()
-
-    def refresh_unless_urgent(self, urgent: Callable[[], bool]) -> Oid:
+    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         """Fetch, but stop if something is urgent: a demand must not wait for a slow remote."""
         self._fetch(self._git, urgent)
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Push ``commit``; the remote accepts it only on top of its own tip."""
-        try:
-            lease = f"--force-with-lease={MAIN}:{expected}"  # forces nothing: commit is on top
-            spec = f"{commit}:{MAIN}"
-            self._run_git(self._git, "push", "--porcelain", "--quiet", lease, "origin", spec)
+        try:  # the lease forces nothing: commit is on top
+            with self.new.packed(commit):
+                self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except git.GitCommandError as error:
-            text = without_secrets(f"{error.stdout}\n{error.stderr}")
-            if _REMOTE_MOVED.search(text):  # git compared with the remote first: nothing was sent
+            if _REMOTE_MOVED.search(str(error)):  # git compared first: nothing was sent
                 return False
             tip = self.refresh()
             if tip == commit or self.objects.descendant_of(tip, commit):
                 return True  # the push succeeded, but the answer was lost
             if tip != expected:
                 return False
-            raise self._push_error(text) from None
+            raise self.push_error(error) from None
         try:
             self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         except (pygit2.GitError, OSError) as error:  # the next fetch does it
@@ -160,34 +159,23 @@ class RemoteRepository(StateRepository):
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
-        """Return name → commit of the remote's references that match.
-
-        Raises:
-            RemoteAway: the remote cannot be reached.
-        """
+        """Return name → commit of the remote's references that match, or raise RemoteAway."""
         out = self._read(self._git, ("ls-remote",), *patterns)
         pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
     def fetch_branches(self, prefix: str) -> None:
-        """Fetch the branches whose names start with ``prefix``; drop those that were deleted.
-
-        Raises:
-            RemoteAway: the remote cannot be reached.
-        """
+        """Fetch branches by prefix and drop those that were deleted, or raise RemoteAway."""
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
         self._read(self._git, ("fetch", "--no-tags", "--prune"), spec)
 
     def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
-        """Push one reference and return git's output.
+        """Push one reference and return git's output, or raise GitCommandError.
 
         Args:
             spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
             lease: ``<reference>:<commit>``, which commit the remote must have; empty for none.
             options: options for the server (``git push --push-option``).
-
-        Raises:
-            git.GitCommandError: the push failed.
         """
         push_options = [f"--push-option={option}" for option in options]
         expects = f"--force-with-lease={lease}"
@@ -197,8 +185,19 @@ class RemoteRepository(StateRepository):
         return f"{out}\n{err}"
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return the error for a failed push: unreachable (try again) or denied."""
-        return self._push_error(without_secrets(f"{error.stdout}\n{error.stderr}"))
+        """Return ``PushDenied`` if the remote rejected a push, else why it failed."""
+        text = without_secrets(f"{error.stdout}\n{error.stderr}")
+        if _NO_ROOM.search(text):
+            return self._disk_full()
+        rejected = _REMOTE_REJECTED.search(text)
+        if rejected and not _TEMPORARY.search(rejected[1]):
+            message = " ".join(line.strip(" '") for line in _REMOTE_MESSAGE.findall(text)).strip()
+            reason = f"{rejected[1]}: {message}" if message else rejected[1]
+            return PushDenied(f"{self.address} rejects the push: {reason}")
+        if _NO_PERMISSION.search(text):
+            return PushDenied(f"{self.address} rejects the push: {_last_line(text)}")
+        reason = rejected[1] if rejected else _last_line(text)
+        return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
 
     def _read(
         self,
@@ -208,12 +207,7 @@ class RemoteRepository(StateRepository):
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = TIMEOUT_S,
     ) -> str:
-        """Return the output of a git command that reads from the remote.
-
-        Raises:
-            RemoteAway: the remote cannot be reached.
-            StateRepoError: it has no main branch.
-        """
+        """Return the output of a git command that reads from the remote, or raise RemoteAway."""
         command = (*command, "--quiet", "origin", *references)
         try:
             return self._run_git(repo, *command, urgent=urgent, timeout=timeout)[0]
@@ -270,20 +264,6 @@ class RemoteRepository(StateRepository):
         if process is not None:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGTERM)
-
-    def _push_error(self, text: str) -> StateRepoError:
-        """Return ``PushDenied`` if the remote rejected the push, else why it failed."""
-        if _NO_ROOM.search(text):
-            return self._disk_full()
-        rejected = _REMOTE_REJECTED.search(text)
-        if rejected and not _TEMPORARY.search(rejected[1]):
-            message = " ".join(line.strip(" '") for line in _REMOTE_MESSAGE.findall(text)).strip()
-            reason = f"{rejected[1]}: {message}" if message else rejected[1]
-            return PushDenied(f"{self.address} rejects the push: {reason}")
-        if _NO_PERMISSION.search(text):
-            return PushDenied(f"{self.address} rejects the push: {_last_line(text)}")
-        reason = rejected[1] if rejected else _last_line(text)
-        return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
 
 
 def _wait_for(

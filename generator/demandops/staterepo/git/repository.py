@@ -1,18 +1,16 @@
 """The state repo that a writer uses: Git objects, and a tip that only moves forward.
 
-There are two kinds, on this disk and behind a URL;
-:mod:`demandops.staterepo.git.repository_choice` chooses.
+There are two kinds, on this disk and behind a URL; :mod:`demandops.staterepo.git.address` chooses.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import subprocess
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import suppress
 
-import git
 import pygit2
 from pygit2 import Oid, Repository, Tree
 
@@ -20,10 +18,12 @@ from demandops.errors import StateRepoError, Unsound
 from demandops.runtime import REAL, Runtime
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.signing import Signer
 
 MAIN = f"refs/heads/{MAIN_BRANCH}"
 TIMEOUT_S = 120
+_REPACK = ("repack", "--geometric=2", "-d", "-l", "--quiet")
 ENVIRONMENT = {
     "GIT_TERMINAL_PROMPT": "0",
     "LC_ALL": "C",
@@ -88,6 +88,8 @@ class StateRepository(ABC):
     """A state repo: Git objects to read and write, and a tip that only moves forward."""
 
     objects: Repository
+    new: NewObjects
+    """What was written since the last publication."""
     address: str
     signer: Signer | None = None
     """Signs the commits made here; None: they are not signed."""
@@ -95,46 +97,33 @@ class StateRepository(ABC):
     """The clock, chance and threads of whoever writes to it."""
     always_current: bool
     """Whether :meth:`tip` is never out of date (a repository on this disk)."""
+    _tidying: subprocess.Popen[bytes] | None = None
     main_reference = MAIN
     """The branch, or its remote-tracking branch of the last fetch."""
 
     def tip(self) -> Oid:
-        """Return the newest published commit that is known here; does not ask the remote.
-
-        It is read each time because other processes may move it.
-        """
+        """Return the newest published commit that is known here; does not ask the remote."""
         target = self.objects.references[self.main_reference].target
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target
 
     @abstractmethod
-    def refresh(self) -> Oid:
-        """Fetch and return the newest published commit.
+    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
+        """Fetch and return the newest published commit, or raise RemoteAway.
 
-        Raises:
-            RemoteAway: the remote cannot be reached.
+        Raises FetchInterrupted as soon as ``urgent`` returns true.
         """
-
-    def refresh_unless_urgent(self, urgent: Callable[[], bool]) -> Oid:
-        """Fetch like :meth:`refresh`, but stop as soon as ``urgent`` returns true.
-
-        Raises:
-            RemoteAway: the remote cannot be reached.
-            FetchInterrupted: it was stopped.
-        """
-        return self.refresh()
 
     @abstractmethod
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Make ``commit`` the tip, durably, if the tip is ``expected``; else return false.
 
-        Raises:
-            Unavailable, PushDenied: it could not be published for another reason.
-            Unsound: nobody knows whether it was published.
+        Raises Unavailable or PushDenied if it could not be published for another reason, and
+        Unsound if nobody knows whether it was.
         """
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or a descendant; false if one is not known here.
+        """Return whether ``commit`` is ``other`` or a descendant; false if one is not here.
 
         May be called from any thread: it opens the repository again.
         """
@@ -146,10 +135,7 @@ class StateRepository(ABC):
             return False
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` is equal in two commits; false if one is not known here.
-
-        May be called from any thread.
-        """
+        """Return whether ``path`` is equal in two commits; false if one is not known here."""
         found = self._trees(commit, other)
         if found is None:
             return False
@@ -158,15 +144,12 @@ class StateRepository(ABC):
         return trees.entry(found[0], path) is not None and not trees.differ(*found, (path,))
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
-        """Return the paths in which two commits differ; None if one is not known here.
-
-        May be called from any thread.
-        """
+        """Return the paths in which two commits differ; None if one is not known here."""
         found = self._trees(since, commit)
         return None if found is None else sorted(path for path, _ in trees.differences(*found))
 
     def _trees(self, one: str, other: str) -> tuple[Tree, Tree] | None:
-        objects = Repository(self.objects.path)
+        objects = Repository(self.objects.path)  # opened again, so any thread may ask
         try:
             return trees.commit_of(objects, one).tree, trees.commit_of(objects, other).tree
         except StateRepoError:
@@ -184,16 +167,14 @@ class StateRepository(ABC):
         """End the running transfer with a remote, if any."""
 
     def tidy(self) -> None:
-        """Have git pack loose objects if there are many."""
-        with suppress(git.GitCommandError), git.Repo(self.objects.path) as repo:
-            _git(repo, "gc", "--auto", "--quiet")
-
-
-def _git(repo: git.Repo, *command: str) -> None:
-    """Run a git command in a session of its own, so that Ctrl-C does not end it."""
-    with repo.git.custom_environment(**ENVIRONMENT):
-        repo.git.execute(
-            [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
-            kill_after_timeout=TIMEOUT_S,
-            start_new_session=True,
+        """Have git join the packs, beside what else happens, unless it still does."""
+        if self._tidying is not None and self._tidying.poll() is None:
+            return
+        self._tidying = subprocess.Popen(
+            ["git", *_REPACK],
+            cwd=self.objects.path,
+            env=os.environ | ENVIRONMENT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # so that Ctrl-C does not end it
         )

@@ -12,9 +12,11 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-from pygit2 import Oid, Repository, Signature
+from pygit2 import Oid, Signature
+from pygit2.enums import ObjectType
 
 from demandops.errors import StateRepoError
+from demandops.staterepo.git.new_objects import NewObjects
 
 _TIMEOUT_S = 20
 _FIELD = "gpgsig"
@@ -29,11 +31,7 @@ class Signer:
     """Signs with one key: a private key file, or the public file of a key that an agent holds."""
 
     def __init__(self, key: Path) -> None:
-        """Try the key at once, so that a key that cannot sign fails before any demand is accepted.
-
-        Raises:
-            SigningFailed: the key cannot sign; says why and the remedy.
-        """
+        """Try the key, so that one that cannot sign fails before any demand is accepted."""
         self.key = key.expanduser()
         if not self.key.is_file():
             raise SigningFailed(
@@ -43,11 +41,7 @@ class Signer:
         self.sign(_PROBE)
 
     def sign(self, data: bytes) -> str:
-        """Return the armored signature of ``data``.
-
-        Raises:
-            SigningFailed: ``ssh-keygen`` did not sign.
-        """
+        """Return the armored signature of ``data``, or raise SigningFailed."""
         command = ["ssh-keygen", "-Y", "sign", "-n", "git", "-f", str(self.key)]
         environment = dict(os.environ) | {"SSH_ASKPASS_REQUIRE": "never", "LC_ALL": "C"}
         try:
@@ -96,16 +90,17 @@ def _key_fault(key: Path, output: str) -> str:
 
 
 def create_commit(
-    repo: Repository,
+    objects: NewObjects,
     signer: Signer | None,
     people: tuple[Signature, Signature],
     text: str,
     tree: Oid,
     parents: Sequence[Oid],
 ) -> Oid:
-    """Write a commit by ``people`` (author, committer), signed if there is a signer."""
-    author, committer = people
-    if signer is None:
-        return repo.create_commit(None, author, committer, text, tree, list(parents))
-    content = str(repo.create_commit_string(author, committer, text, tree, list(parents)))
-    return repo.create_commit_with_signature(content, signer.sign(content.encode()), _FIELD)
+    """Add a commit by ``people`` (author, committer), signed if there is a signer."""
+    content = str(objects.repo.create_commit_string(*people, text, tree, list(parents)))
+    if signer is not None:
+        head, end, message = content.partition("\n\n")
+        signature = signer.sign(content.encode()).replace("\n", "\n ")
+        content = f"{head}\n{_FIELD} {signature}{end}{message}"
+    return objects.add(ObjectType.COMMIT, content.encode())

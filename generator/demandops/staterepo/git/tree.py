@@ -6,21 +6,21 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import pygit2
 from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
-from pygit2.enums import FileMode
+from pygit2.enums import ObjectType
 
 from demandops.errors import StateRepoError
+from demandops.staterepo.git.new_objects import Entries, NewObjects, entries_of
 
 pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)  # a reported commit is on the disk
 # By default libgit2 does not cache trees over 4 KiB and parses them at every look-up.
 pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
 
-def commit_of(repo: Repository, revision: str | Oid) -> Commit:
-    """Return the commit of a revision, in any form that Git knows.
+_FOLDER, _FILE = b"40000", b"100644"
 
-    Raises:
-        StateRepoError: there is no such commit.
-    """
+
+def commit_of(repo: Repository, revision: str | Oid) -> Commit:
+    """Return the commit of a revision that Git knows, or raise StateRepoError."""
     try:
         found = repo[revision] if isinstance(revision, Oid) else repo.revparse_single(revision)
         return found.peel(Commit)
@@ -130,43 +130,48 @@ def is_readme(path: str) -> bool:
     return path.rsplit("/", 1)[-1] == "README.md"
 
 
-def write(repo: Repository, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
-    """Write ``base`` with ``files`` changed (``None`` removes) and return the new tree's id.
+def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
+    """Add ``base`` with ``files`` changed (``None`` removes) and return the new tree's id.
 
     Only the folders above a changed file are written again. A folder that becomes empty is
     removed, because Git has no empty folders.
     """
-    return _builder(repo, base, files).write()
+    return _write(objects, base, files) or objects.add(ObjectType.TREE, b"")
 
 
-def _writes(files: Mapping[str, str | None]) -> bool:
-    return any(text is not None for text in files.values())
-
-
-def _builder(
-    repo: Repository, base: Tree | None, files: Mapping[str, str | None]
-) -> pygit2.TreeBuilder:
-    builder = repo.TreeBuilder(base) if base is not None else repo.TreeBuilder()
-    below: dict[str, dict[str, str | None]] = {}
-    here: dict[str, str | None] = {}
+def _write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid | None:
+    """Add a folder and return its id; ``None`` if it is empty."""
+    entries = entries_of(base.read_raw()) if base is not None else {}
+    below: dict[bytes, dict[str, str | None]] = {}
+    here: dict[bytes, str | None] = {}
     for path, text in files.items():
         name, _, rest = path.partition("/")
         if rest:
-            below.setdefault(name, {})[rest] = text
+            below.setdefault(name.encode(), {})[rest] = text
         else:
-            here[name] = text
-    for name, inner in below.items():
-        entry = builder.get(name)
-        replaced = name in here and here[name] is None
-        folder = entry if isinstance(entry, Tree) and not replaced else None
-        subtree = _builder(repo, folder, inner)
-        if len(subtree):
-            builder.insert(name, subtree.write(), FileMode.TREE)
-        elif folder is not None:
-            builder.remove(name)
-    for name, text in here.items():  # last, so that a file can replace a folder
+            here[name.encode()] = text
+    for folder, inner in below.items():
+        mode, raw = entries.get(folder, (b"", b""))
+        kept = mode == _FOLDER and here.get(folder, "") is not None
+        subtree = _write(objects, objects.repo[Oid(raw=raw)].peel(Tree) if kept else None, inner)
+        if subtree is not None:
+            entries[folder] = (_FOLDER, subtree.raw)
+        elif kept:
+            del entries[folder]
+    for file, text in here.items():  # last, so that a file can replace a folder
         if text is not None:
-            builder.insert(name, repo.create_blob(text.encode()), FileMode.BLOB)
-        elif builder.get(name) is not None and not _writes(below.get(name, {})):
-            builder.remove(name)
-    return builder
+            entries[file] = (_FILE, objects.add(ObjectType.BLOB, text.encode()).raw)
+        elif not any(inner is not None for inner in below.get(file, {}).values()):
+            entries.pop(file, None)
+    if not entries:
+        return None
+    return objects.add(ObjectType.TREE, _content(entries))
+
+
+def _content(entries: Entries) -> bytes:
+    """Return a tree object: Git sorts a folder as if its name ended in a slash."""
+    ordered = sorted(
+        (name + b"/" if mode == _FOLDER else name, mode, name, raw)
+        for name, (mode, raw) in entries.items()
+    )
+    return b"".join(b"%s %s\0%s" % (mode, name, raw) for _, mode, name, raw in ordered)

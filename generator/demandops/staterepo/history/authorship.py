@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import getpass
 import os
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
+from functools import cache
 from typing import NamedTuple
 
 import git
@@ -25,9 +25,6 @@ from demandops.staterepo.history import commit_log, commit_message
 
 _ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _MOST_NAMED = 20
-_MOST_AUTHOR = 200
-_UNFIT = re.compile(r"[<>\x00-\x1f\x7f]")
-_EMAIL = re.compile(r"[^\s<>\x00-\x1f\x7f]+")
 
 
 class Person(NamedTuple):
@@ -37,35 +34,30 @@ class Person(NamedTuple):
     email: str
 
     def __str__(self) -> str:
-        """Return ``name <email>``."""
         return f"{self.name} <{self.email}>"
 
 
 def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
-    """Return the commits by people up to ``to`` that ``known`` does not include, newest first.
-
-    Leaves out commits that change nothing the generator reads (a README).
-    """
+    """Return people's commits since ``known`` that change what the generator reads."""
     commits = commit_log.person_commits(repo, to, known)
     return [commit for commit in commits if _touches(commit, _ROOTS)]
 
 
-class FaultOrigins:
-    """Finds the commit by a person since ``known`` that last changed a path."""
+def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
+    """Return what finds commit and author of people's last change to a path, else to any."""
 
-    def __init__(self, repo: Repository, known: Oid, to: Oid) -> None:
-        self._range = (repo, to, known)
-        self._commits: list[Commit] | None = None
+    @cache  # read late: most reports exist already and need no commits
+    def commits() -> list[Commit]:
+        return list(commit_log.person_commits(repo, to, known))
 
-    def __call__(self, path: str) -> tuple[str, str] | None:
-        """Return commit and author of the last change to ``path``, else of any change."""
-        if self._commits is None:  # read late: most reports exist already and need no commits
-            self._commits = list(commit_log.person_commits(*self._range))
+    def origin(path: str) -> tuple[str, str] | None:
         for paths in ((path,) if path else (), _ROOTS):
-            for commit in self._commits:
+            for commit in commits():
                 if _touches(commit, paths):
                     return str(commit.id), str(author_of(commit))
         return None
+
+    return origin
 
 
 def _touches(commit: Commit, paths: Iterable[str]) -> bool:
@@ -74,41 +66,30 @@ def _touches(commit: Commit, paths: Iterable[str]) -> bool:
 
 def author_of(commit: Commit) -> Person:
     """Return the author of a commit, without characters that trailers and signatures forbid."""
-    name = _UNFIT.sub("", commit.author.name).strip(" .,:;\"'\\") or "unnamed"
-    email = commit.author.email if _EMAIL.fullmatch(commit.author.email or "") else ""
-    return Person(name[:_MOST_AUTHOR], email or commit_message.GENERATOR_EMAIL)
+    plain = commit_message.signature(*commit_log.author_of(commit), commit_log.time_of(commit))
+    return Person(plain.name, plain.email)
 
 
 def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
-    """Return ``Caused-By: <commit> <name> <email>`` for each commit, oldest first.
-
-    Only the newest are named if there are many; the trailer ``Since`` bounds the others.
-    """
+    """Return ``Caused-By: <commit> <name> <email>`` for the newest commits, oldest first."""
     return [("Caused-By", f"{one.id} {author_of(one)}") for one in reversed(causes[:_MOST_NAMED])]
 
 
 def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
     """Return the author of a follow commit: the people whose commits it renders.
 
-    One person keeps name and address, so that ``git log --author`` finds both commits. Several
-    people are named with the generator's address, because a commit has only one.
+    One person keeps name and address, so that ``git log --author`` finds both commits.
     """
     if not causes:
         return commit_message.generator_signature(now)
     people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))
-    name = ", ".join(dict.fromkeys(one.name for one in people))
-    if len(name) > _MOST_AUTHOR:
-        name = name[: _MOST_AUTHOR - 1].rstrip(" ,") + "…"
+    names = ", ".join(dict.fromkeys(one.name for one in people))
     email = people[0].email if len(people) == 1 else commit_message.GENERATOR_EMAIL
-    return pygit2.Signature(name, email, causes[0].commit_time, 0)
+    return commit_message.signature(names, email, commit_log.time_of(causes[0]))
 
 
 def operator(folder: str | None = None) -> Person:
-    """Return the person who runs this program, from git or else the login.
-
-    Args:
-        folder: a repository whose configuration counts too; by default that of this directory.
-    """
+    """Return the person who runs this program, from git's configuration or else the login."""
     try:
         login = getpass.getuser()
     except (KeyError, OSError):  # a container's user has no passwd entry

@@ -1,25 +1,33 @@
-"""The state repo's history: commits with their trailers, and which commits the generator made.
+"""The state repo's history: commits with their trailers, and which commits changed a path.
 
-Everything comes from commit messages and trailers, so plain git shows the same.
+Everything comes from commit messages, trailers and ``git log -- <path>``, so plain git shows the
+same.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Literal
 
+import git
 import pygit2
 from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
+from demandops.render.gitops.paths import CLUSTERS_ROOT
+from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.tree import commit_of
 
 PROPOSAL = "Proposal"
 """The trailer of a commit that needs approval: the branch that it was proposed on."""
 
 _WHY = "Why: "
+_LAST_SECOND = 253402300799
+"""The last second of the year 9999."""
+_NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,22 +69,34 @@ def trailers_of(message: str) -> dict[str, list[str]]:
     return trailers
 
 
+def time_of(commit: Commit) -> datetime:
+    """Return the committer's time; beyond the calendar it is the calendar's end."""
+    seconds = min(max(commit.commit_time, 0), _LAST_SECOND)
+    return datetime.fromtimestamp(seconds, tz=timezone.utc)
+
+
+def author_of(commit: Commit) -> tuple[str, str]:
+    """Return name and address of the author."""
+    return _text(commit.author.raw_name), _text(commit.author.raw_email)
+
+
+def _text(raw: bytes) -> str:
+    """Return a text of a commit, whatever encoding the commit names."""
+    return raw.decode("utf-8", "replace")
+
+
 def entry_of(commit: Commit) -> LogEntry:
     """Return the log entry of a commit."""
+    message = _text(commit.raw_message)
+    whys = (line for line in message.split("\n") if line.startswith(_WHY))
     return LogEntry(
         commit=str(commit.id),
-        time=datetime.fromtimestamp(commit.commit_time, tz=timezone.utc),
-        author=commit.author.name,
-        summary=commit.message.split("\n", 1)[0],
-        trailers=trailers_of(commit.message),
-        why=_why(commit.message),
+        time=time_of(commit),
+        author=author_of(commit)[0],
+        summary=message.split("\n", 1)[0],
+        trailers=trailers_of(message),
+        why=next(whys, "").removeprefix(_WHY),
     )
-
-
-def _why(message: str) -> str:
-    """Return the sentence after ``Why:`` in a generator's commit."""
-    lines = (line for line in message.split("\n") if line.startswith(_WHY))
-    return next(lines, "").removeprefix(_WHY)
 
 
 def commits(
@@ -89,11 +109,6 @@ def commits(
     return ((commit, entry_of(commit)) for commit in walker)
 
 
-def walk(repo: Repository, tip: str | Oid, until: str | Oid | None = None) -> Iterator[LogEntry]:
-    """Yield the log entries of :func:`commits`."""
-    return (entry for _, entry in commits(repo, tip, until))
-
-
 def person_commits(
     repo: Repository, tip: str | Oid, until: str | Oid | None = None
 ) -> Iterator[Commit]:
@@ -103,14 +118,13 @@ def person_commits(
 
 def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
     """Yield a commit, its first parent, that one's first parent and so on."""
-    commit = commit_of(repo, tip)
-    yield commit
-    while commit.parents:
-        commit = commit.parents[0]
-        yield commit
+    walker = repo.walk(commit_of(repo, tip).id)
+    walker.simplify_first_parent()
+    return iter(walker)
 
 
-_OUTCOMES: dict[str, Literal["changed", "unchanged", "refused"]] = {
+_Outcome = Literal["changed", "unchanged", "refused"]
+_OUTCOMES: dict[str, _Outcome] = {
     "Operation-Id": "changed",
     "Unchanged-Operation-Id": "unchanged",
     "Refused-Operation-Id": "refused",
@@ -122,7 +136,7 @@ class RecordedOutcome:
     """The commit that records a demand, and the demand's outcome."""
 
     commit: str
-    outcome: Literal["changed", "unchanged", "refused"]
+    outcome: _Outcome
 
 
 def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, RecordedOutcome]:
@@ -130,15 +144,14 @@ def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Recorde
 
     Reads all of history if ``base`` is not known here (a remote that was made again).
     """
+    if str(tip) == base:
+        return {}
     try:
         known = bool(base) and repo.descendant_of(tip, base)
     except (pygit2.GitError, KeyError, ValueError):
         known = False
-    until = base if known else None
-    if str(tip) == base:
-        return {}
     outcomes = {}
-    for entry in walk(repo, tip, until):
+    for _, entry in commits(repo, tip, base if known else None):
         for key, outcome in _OUTCOMES.items():
             for operation in entry.trailers.get(key, ()):
                 outcomes[operation] = RecordedOutcome(entry.commit, outcome)
@@ -149,3 +162,84 @@ def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
     """Return the newest commit of the generator along the first parents, or None."""
     entries = (entry_of(commit) for commit in first_parents(repo, tip))
     return next((Oid(hex=entry.commit) for entry in entries if entry.by_generator), None)
+
+
+@dataclass(frozen=True, slots=True)
+class PathChange:
+    """A commit that changed a path, and whether the path existed before and exists after it."""
+
+    entry: LogEntry
+    existed_before: bool
+    exists_after: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PathHistory:
+    """The commits that last added a path, changed it since, and removed it.
+
+    ``newest`` are the commits that changed it since it was added, newest first; ``more`` is how
+    many are left out. ``stopped`` is the commit that removed it, or None if it exists.
+    """
+
+    started: LogEntry | None
+    newest: tuple[LogEntry, ...]
+    more: int
+    stopped: LogEntry | None
+
+
+def changes_to(
+    repo: Repository, tip: str | Oid, path: str, until: str | None = None
+) -> Iterator[PathChange]:
+    """Yield the commits after ``until`` that changed a file or folder, newest first, like Git."""
+    for revision in _git_log(repo, tip, until, "--format=%H", f":(literal){path}"):
+        commit = commit_of(repo, revision)
+        before = any(trees.entry(parent.tree, path) is not None for parent in commit.parents)
+        yield PathChange(entry_of(commit), before, trees.entry(commit.tree, path) is not None)
+
+
+def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHistory:
+    """Return the history of a path up to ``tip``, with at most ``most`` of its changes."""
+    started = stopped = None
+    changes: list[LogEntry] = []
+    more = 0
+    for change in changes_to(repo, tip, path):
+        if not change.exists_after:
+            stopped = change.entry
+        elif not change.existed_before:
+            started = change.entry
+            break
+        elif len(changes) < most:
+            changes.append(change.entry)
+        else:
+            more += 1
+    return PathHistory(started, tuple(changes), more, stopped)
+
+
+def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
+    """Return the path of a release, or of the last stopped release with this name, or None."""
+    if not _NAME.fullmatch(name):
+        return None
+    files = trees.blobs(commit_of(repo, tip).tree, (CLUSTERS_ROOT,))
+    current = (path for path, _ in files if path.endswith(f"/{name}.yaml"))
+    return next(current, None) or next(iter(_removed(repo, tip, f"{name}.yaml", "-1")), None)
+
+
+def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
+    """Return the names of all releases that ever stopped; reads the whole history."""
+    removed = _removed(repo, tip, "*.yaml")
+    return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
+
+
+def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[str]:
+    """Return the paths of releases that commits removed, newest first."""
+    options = ("--diff-filter=D", "--no-renames", *more, "--format=", "--name-only")
+    return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
+
+
+def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -> list[str]:
+    """Return the output of ``git log`` for the path that ``query`` ends with."""
+    *options, path = query
+    commits = [str(commit_of(repo, tip).id), *([f"^{until}"] if until else [])]
+    with git.Repo(repo.path) as opened:
+        output = opened.git.log("--no-show-signature", "-z", *options, *commits, "--", path)
+    return [found for found in output.split("\0") if found]

@@ -8,6 +8,7 @@ trailer. :mod:`demandops.staterepo.load.state_in_effect` adds those about quaran
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable
 from datetime import datetime
 
@@ -16,7 +17,7 @@ import pygit2
 from demandops.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.decision import Decision
 from demandops.demand.claim import OVERRIDE_PREFIX, ClaimKey
-from demandops.demand.demand_request import Decommission, DemandRequest, Expire
+from demandops.demand.demand_request import Decommission, Expire
 from demandops.errors import Fault
 from demandops.ledger import claim_file
 from demandops.ledger.operations.restoration import Restoration
@@ -39,7 +40,9 @@ _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
     """Return a person and a time, without the characters that Git does not accept."""
     email = _UNFIT.sub("", email) or GENERATOR_EMAIL
-    return pygit2.Signature(_name(name), email, int(time.timestamp()), 0)
+    plain = _CONTROL.sub("", name.replace("<", "(").replace(">", ")"))
+    plain = _clipped(plain, _MAX_AUTHOR).strip(" .,:;\"'\\") or "unnamed"
+    return pygit2.Signature(plain, email, int(time.timestamp()), 0)
 
 
 def generator_signature(time: datetime) -> pygit2.Signature:
@@ -71,38 +74,32 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
     return signature(names, f"{local}@demandops.invalid", received)
 
 
-def _name(names: str) -> str:
-    """Return a name without angle brackets, control characters and punctuation at its ends."""
-    plain = _CONTROL.sub("", names.replace("<", "(").replace(">", ")"))
-    return _clipped(plain, _MAX_AUTHOR).strip(" .,:;\"'\\") or "unnamed"
-
-
 def of_decision(
     decision: Decision, operation: str, received: datetime, settled: Iterable[tuple[str, str]] = ()
 ) -> str:
     """Return the message of a demand's commit; ``settled`` are trailers of demands before it."""
-    request = decision.request
+    request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
+    title, why = _title_and_why(decision, received)
     paragraphs = [
-        [_clipped(_title(decision), _MAX_SUBJECT)],
-        [_why(decision, received)],
+        [_clipped(title, _MAX_SUBJECT)],
+        [f"Why: {why}"],
         _desired_state(decision.releases),
         _list("Listed, but not held by the requester:", decision.changes.not_held),
         _list("Warnings:", decision.warnings),
     ]
-    claims = decision.changes.claims
+    keys = [change.key for change in claims]
     trailers = [
         ("Operation", request.operation),
         ("Operation-Id", operation),
         *settled,
-        *_of_rollback(request),
-        *_leaving(decision),
-        *(("Demand-Id", demand) for demand in dict.fromkeys(c.key.demand for c in claims)),
+        *_of_request(decision),
+        *(("Demand-Id", demand) for demand in dict.fromkeys(key.demand for key in keys)),
         *(("Requester", requester) for requester in _requesters(decision)),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
         *(("Connection", s.id) for s in subjects if s.kind is SubjectKind.CONNECTION),
         ("Request-Id", request.id),
-        *_overrides(decision),
+        *override_trailers([*decision.overrides, *keep_override_paths(keys)]),
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return compose(paragraphs, trailers)
@@ -133,72 +130,53 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
     return decision.request.requesters() or tuple(found)
 
 
-def _leaving(decision: Decision) -> list[tuple[str, str]]:
-    """Return the trailer of a decommissioned node; a requester has its own trailer."""
-    request, befores = decision.request, [change.before for change in decision.changes.claims]
-    if not isinstance(request, Decommission) or "node" not in request.kinds:
-        return []
-    needed = any(before.held.needs(request.id) for before in befores if before)
-    return [("Node", request.id)] if needed else []
-
-
-def _title(decision: Decision) -> str:
+def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
+    request, changes = decision.request, decision.changes.claims
+    kinds = Counter(subject.kind for subject in decision.changes.subjects())
+    counts = [(kinds[kind], kind.value[:-1]) for kind in SubjectKind if kinds[kind]]
+    what = " and ".join(f"{count} {kind}{'s' if count > 1 else ''}" for count, kind in counts)
+    what_of_whom = f"{what} in the name of {', '.join(_requesters(decision))}"
     subjects = ", ".join(subject.id for subject in decision.changes.subjects())
-    request = decision.request
-    if isinstance(request, Decommission):
-        return f"Decommission {request.id}"
-    if isinstance(request, Expire):
-        return f"Expire {subjects}"
-    if isinstance(request, Restoration):
-        return f"Roll back to {request.to[:12]}"
-    renewed = request.adds_claims and _only_leases(decision)
-    return f"{_VERBS['renew' if renewed else request.operation][0]} {subjects}"
-
-
-def _why(decision: Decision, received: datetime) -> str:
-    request = decision.request
-    who, what = ", ".join(_requesters(decision)), _counted(decision)
-    if isinstance(request, Restoration):
-        return (
-            f"Why: {request.by} rolled the ledger back to commit {request.to[:12]}, which changes "
-            f"{what}: {request.reason}"
-        )
-    if isinstance(request, Expire):
-        befores = [change.before for change in decision.changes.claims]
-        last = max(one.lease.expires_at for one in befores if one and one.lease)
-        return (
-            f"Why: the lease of demand '{request.demand}' on {what} in the name of {who} ended "
-            f"at {revisions.format_time(last)} and was not renewed."
-        )
     time = revisions.format_time(received)
+    if isinstance(request, Restoration):
+        to = request.to[:12]
+        return f"Roll back to {to}", (
+            f"{request.by} rolled the ledger back to commit {to}, which changes {what}: "
+            f"{request.reason}"
+        )
+    if isinstance(request, Expire):
+        befores = [change.before for change in changes]
+        last = max(one.lease.expires_at for one in befores if one and one.lease)
+        return f"Expire {subjects}", (
+            f"the lease of demand '{request.demand}' on {what_of_whom} ended at "
+            f"{revisions.format_time(last)} and was not renewed."
+        )
     if isinstance(request, Decommission):
         by = f" by {request.by}" if request.by else ""
-        return (
-            f"Why: '{request.id}' was decommissioned{by} on {time}; it held a part of {what} in "
-            f"the name of {who}."
+        return f"Decommission {request.id}", (
+            f"'{request.id}' was decommissioned{by} on {time}; it held a part of {what_of_whom}."
         )
-    verb = _VERBS[request.operation][1]
-    if request.adds_claims and _only_leases(decision):
-        verb = _VERBS["renew"][1]
-    named = "" if request.is_reference else f" of demand '{request.demand}'"
-    return (
-        f"Why: request '{request.id}'{named}, received {time}, {verb} {what} in the name of {who}."
-    )
-
-
-def _of_rollback(request: DemandRequest) -> list[tuple[str, str]]:
-    """Return the trailers that only a rollback has: the commit it returned to, and the reason."""
-    if not isinstance(request, Restoration):
-        return []
-    return [("Restores", request.to), ("Reason", request.reason)]
-
-
-def _only_leases(decision: Decision) -> bool:
-    """Return whether a demand changed only the leases of its claims."""
-    return all(
+    only_leases = all(
         change.before and change.after and change.before.booked == change.after.booked
-        for change in decision.changes.claims
+        for change in changes
     )
+    renewed = request.adds_claims and only_leases
+    title, verb = _VERBS["renew" if renewed else request.operation]
+    named = "" if request.is_reference else f" of demand '{request.demand}'"
+    why = f"request '{request.id}'{named}, received {time}, {verb} {what_of_whom}."
+    return f"{title} {subjects}", why
+
+
+def _of_request(decision: Decision) -> list[tuple[str, str]]:
+    """Return the trailers of a rollback, and that of a decommissioned node."""
+    request = decision.request
+    if isinstance(request, Restoration):
+        return [("Restores", request.to), ("Reason", request.reason)]
+    if not isinstance(request, Decommission) or "node" not in request.kinds:
+        return []
+    befores = [change.before for change in decision.changes.claims]
+    needed = any(before.held.needs(request.id) for before in befores if before)
+    return [("Node", request.id)] if needed else []
 
 
 def of_follow(
@@ -212,13 +190,15 @@ def of_follow(
 ) -> str:
     """Return the message of a commit that renders people's changes of the state repo."""
     problems, releases = list(problems), tuple(releases)
-    why = f"Why: commits up to {cause[:12]} changed configuration, ledger or generated files."
-    title = _follow_title(releases, cause)
-    if not releases and reports:
+    names, after = ", ".join(release.name for release in releases), f" after commit {cause[:12]}"
+    title = f"Update ledger{after}"
+    if names:
+        title = f"Update {_clipped(names, _MAX_SUBJECT - len(after) - len('Update '))}{after}"
+    elif reports:
         title = "Report invalid files" if problems else "Report that all files are valid"
     paragraphs = [
         [title],
-        [why],
+        [f"Why: commits up to {cause[:12]} changed configuration, ledger or generated files."],
         _desired_state(releases) if releases else [],
         _list("Not applied, because not valid:", problems),
     ]
@@ -230,14 +210,6 @@ def of_follow(
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return compose(paragraphs, trailers)
-
-
-def _follow_title(releases: tuple[ReleaseChange, ...], cause: str) -> str:
-    names = ", ".join(release.name for release in releases)
-    after = f" after commit {cause[:12]}"
-    if not names:
-        return f"Update ledger{after}"
-    return f"Update {_clipped(names, _MAX_SUBJECT - len(after) - len('Update '))}{after}"
 
 
 def of_override_end(
@@ -273,26 +245,10 @@ def override_trailers(paths: Iterable[str]) -> list[tuple[str, str]]:
     return [("Override", path) for path in sorted(set(paths))]
 
 
-def _overrides(decision: Decision) -> list[tuple[str, str]]:
-    """Return the trailers of the overrides that affect a demand's commit."""
-    keys = (change.key for change in decision.changes.claims)
-    return override_trailers([*decision.overrides, *keep_override_paths(keys)])
-
-
 def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
     """Return the files of the ``keep`` overrides that add these claims."""
     demands = (key.demand for key in keys if key.demand.startswith(OVERRIDE_PREFIX))
     return [f"{OVERRIDES_ROOT}/{demand.removeprefix(OVERRIDE_PREFIX)}.yaml" for demand in demands]
-
-
-def _counted(decision: Decision) -> str:
-    kinds = [subject.kind for subject in decision.changes.subjects()]
-    parts = []
-    for kind in SubjectKind:
-        count = kinds.count(kind)
-        if count:
-            parts.append(f"{count} {kind.value[:-1]}{'s' if count > 1 else ''}")
-    return " and ".join(parts)
 
 
 def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
@@ -300,7 +256,7 @@ def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
         return ["Desired state: unchanged; it runs already, or still for other requesters."]
     lines = ["Desired state:"]
     for release in releases:
-        lines.append(f"  {_SIGNS[release.change]} {release.name} ({release.description})")
+        lines.append(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
         lines += [f"      {detail}" for detail in release.details]
     return lines
 

@@ -59,7 +59,6 @@ def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | Non
 
 
 def _precision(text: str) -> timedelta:
-    """Return the precision of a time: a day, a minute or a second."""
     if _DATE.fullmatch(text):
         return _DAY
     clock = re.split(r"[T ]", text)[-1]
@@ -67,12 +66,9 @@ def _precision(text: str) -> timedelta:
 
 
 def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
-    """Return the commit that a revision or a time names.
+    """Return the commit that a revision or a time names, or raise StateRepoError.
 
     Tries the name of a branch or tag first, then a time, then any other revision.
-
-    Raises:
-        StateRepoError: it is neither, or a time before the first commit.
     """
     named = _found(repo.lookup_reference_dwim, text)
     if named is not None:
@@ -90,16 +86,12 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
 
 
 def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
-    """Return the newest commit along the first parents that was made at ``at`` or before.
-
-    Raises:
-        StateRepoError: there was no commit yet.
-    """
+    """Return the newest commit along the first parents at ``at`` or before, or raise."""
     latest = int(at.timestamp())
     for commit in commit_log.first_parents(repo, tip):
         if commit.commit_time <= latest:
             return commit
-    first = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
+    first = commit_log.time_of(commit)
     raise StateRepoError(
         f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
         f"{format_time(first)}"

@@ -18,6 +18,7 @@ from demandops.config.load import load as load_config
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import ended_override_file
+from demandops.ledger.claim_file import RESERVED_FOLDERS
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
@@ -41,16 +42,12 @@ class ConfigSource:
         """Return path → blob of every file in effect."""
         tree = trees.commit_of(repo, self.commit).tree
         files = {path: blob.id for path, blob in trees.blobs(tree, CONFIG_ROOTS)}
-        return _replaced(files, self.replacements)
+        wanted = {**files, **self.replacements}
+        return {path: blob for path, blob in wanted.items() if blob is not None}
 
     def texts(self, repo: Repository) -> dict[str, str]:
         """Return path → text of every file in effect."""
         return {path: trees.text_of(repo[blob]) for path, blob in self.files(repo).items()}
-
-
-def _replaced(files: Mapping[str, Oid], replacements: Replacements) -> dict[str, Oid]:
-    wanted = {**files, **replacements}
-    return {path: blob for path, blob in wanted.items() if blob is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +60,7 @@ class LastValidConfig:
 
 
 def config_at(tree: Tree) -> Config:
-    """Return the configuration of one tree.
-
-    Raises:
-        StateRepoError: the tree is not a state repo.
-        InvalidInput: every fault of every file.
-    """
+    """Return the configuration of one tree; raise every fault of every file."""
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
@@ -86,11 +78,12 @@ def ended_overrides_at(tree: Tree) -> dict[str, str]:
 
 
 def refuse_other_render_version(tree: Tree) -> None:
-    """Raise if the repo has another render version, because two versions undo each other's work.
-
-    Raises:
-        StateRepoError: names the version and the remedy.
-    """
+    """Raise if another version renders this repo, because two versions undo each other's work."""
+    for folder in RESERVED_FOLDERS:
+        if trees.entry_id(tree, folder) is not None:
+            raise StateRepoError(
+                f"{folder}: only a newer generator writes this folder; update the generator"
+            )
     try:
         data = strict_yaml.load(trees.read_text(tree, ROOT_FILE) or "")
     except InvalidInput:
@@ -119,7 +112,6 @@ def load_last_valid_config(
     Args:
         before: the source of the configuration that was in effect.
         last_valid_commit: the newest commit where all files were valid.
-        to: the commit.
         load: makes a configuration from texts, or raises ``InvalidInput``.
     """
     known, source = before.files(repo), ConfigSource(to)

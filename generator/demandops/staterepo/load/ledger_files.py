@@ -12,6 +12,7 @@ from demandops.demand.claim import Claim, ClaimKey
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.operations.restoration import Restoration
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
@@ -47,11 +48,7 @@ def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
 
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
-    """Return the claim at a path, or None if there is no file.
-
-    Raises:
-        InvalidInput: the file is not valid.
-    """
+    """Return the claim at a path, or None if there is no file; raise the faults of a file."""
     text = trees.read_text(tree, path)
     return claim_file.read(text, path) if text is not None else None
 
@@ -68,8 +65,7 @@ def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
     """Return the key of the claim in effect whose file is at a path; reads the whole ledger."""
     if claim_file.kind_of(path) is None:
         return None
-    keys = (claim.key for claim in ledger)
-    return next((key for key in keys if claim_file.path_of(key) == path), None)
+    return next((one.key for one in ledger if claim_file.path_of(one.key) == path), None)
 
 
 def last_valid_claims(
@@ -90,6 +86,21 @@ def last_valid_claims(
             claims[path] = claim_at(commit.tree, path)
             left.remove(path)
     return claims
+
+
+def restoration(repo: Repository, to: str, **more: object) -> Restoration:
+    """Return the request to roll back to a commit, or raise every fault of its claim files."""
+    commit = trees.commit_of(repo, to)
+    found = read(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())
+    if found.faults:
+        raise InvalidInput(found.faults)
+    return Restoration(
+        id="",
+        to=str(commit.id),
+        made=commit_log.time_of(commit),
+        claims=found.claims,
+        **more,  # type: ignore[arg-type]
+    )
 
 
 def changed_subjects(before: Ledger, after: Ledger) -> list[Subject]:

@@ -7,7 +7,7 @@ the same bytes, so an unchanged report causes no commit. Pure: texts and faults 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 
 from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput
@@ -32,7 +32,6 @@ class Problem:
     author: str = ""
 
     def __str__(self) -> str:
-        """Return the fault, and the commit that caused it if known."""
         text = ": ".join(part for part in (self.file, self.field, self.message) if part)
         if not self.since:
             return text
@@ -65,38 +64,31 @@ def write(problems: tuple[Problem, ...]) -> str | None:
     data: dict[str, object] = {
         "apiVersion": API_VERSION,
         "kind": "ProblemReport",
-        "problems": [_entry(problem) for problem in problems[:_MOST]],
+        "problems": [
+            {name: value for name, value in asdict(problem).items() if value}
+            for problem in problems[:_MOST]
+        ],
     }
     if len(problems) > _MOST:
         data["more"] = len(problems) - _MOST
     return _HEAD + strict_yaml.dump(data)
 
 
-def _entry(problem: Problem) -> dict[str, str]:
-    entry = {
-        "file": problem.file,
-        "field": problem.field,
-        "message": problem.message,
-        "since": problem.since,
-        "author": problem.author,
-    }
-    return {name: value for name, value in entry.items() if value}
-
-
 def read(text: str | None) -> tuple[Problem, ...]:
-    """Return the problems of a report; none if the text is missing or not a report."""
+    """Return the problems of a report; none if it is missing. A person may have edited it."""
     try:
         data = strict_yaml.load(text or "")
     except InvalidInput:
         return ()
+
+    def printable(value: object) -> str:
+        return value if isinstance(value, str) and value.isprintable() else ""
+
     entries = data.get("problems") if isinstance(data, dict) else None
     return tuple(
-        Problem(**{name: _text(entry.get(name)) for name in Problem.__dataclass_fields__})
+        Problem(
+            **{name: printable(entry.get(name)) for name in (each.name for each in fields(Problem))}
+        )
         for entry in (entries if isinstance(entries, list) else ())
         if isinstance(entry, dict)
     )
-
-
-def _text(value: object) -> str:
-    """Return a printable text, or an empty one: a person may have edited the report."""
-    return value if isinstance(value, str) and value.isprintable() else ""

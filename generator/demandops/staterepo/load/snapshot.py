@@ -17,13 +17,18 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, try_configuration
 from demandops.demand.claim import Claim
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file
+from demandops.ledger import claim_file, recent_shutdowns
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.load import last_valid_config, ledger_files
-from demandops.staterepo.load.last_valid_config import ConfigSource, LastValidConfig
+from demandops.staterepo.load.last_valid_config import (
+    ConfigSource,
+    LastValidConfig,
+    load_last_valid_config,
+)
 from demandops.subject import Subject
 
 Progress = Callable[[int, int], None]
@@ -65,26 +70,14 @@ class Advance:
     subjects: tuple[Subject, ...]
     config_changed: bool
 
-    def followed_by(self, further: Advance) -> Advance:
-        """Return one advance for this one and ``further``, which follows it."""
-        return Advance(
-            further.snapshot,
-            tuple(dict.fromkeys((*self.subjects, *further.subjects))),
-            self.config_changed or further.config_changed,
-        )
-
 
 def load(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Load a commit whole.
-
-    Args:
-        progress: called with (files read, all files) while the ledger is read.
+    """Load a commit whole; ``progress`` is called with (files read, all files) of the ledger.
 
     Raises:
-        InvalidInput: every fault of every file.
-        StateRepoError: the commit is not a state repo.
+        InvalidInput, StateRepoError: with every fault of every file.
     """
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
@@ -92,7 +85,10 @@ def load(
     if found.faults:
         raise InvalidInput(found.faults)
     ended = last_valid_config.ended_overrides_at(commit.tree)
-    ledger = replace(found.ledger(), ended=ended)
+    shutdowns = recent_shutdowns.read_all(
+        trees.texts(commit.tree, (recent_shutdowns.SHUTDOWNS_ROOT,))
+    )
+    ledger = replace(found.ledger(), ended=ended, shutdowns=shutdowns)
     return Snapshot(commit.id, State.of(config, ledger), commit.id)
 
 
@@ -124,11 +120,17 @@ def advance(
     if recorded is not None:
         known = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
     elif before.problems or trees.differ(old, new, CONFIG_ROOTS):
-        known = _last_valid_config(repo, before, to)
+        known = load_last_valid_config(
+            repo,
+            before.config_source,
+            before.last_valid_commit,
+            to,
+            lambda files: _load_and_rehearse(files, before.state),
+        )
     config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
     world_changed = config != state.config or ended != state.ledger.ended
     config_changed = world_changed or _has_manual_edit(repo, before.commit, to)
-    ledger = replace(state.ledger, ended=ended)
+    ledger = replace(state.ledger, ended=ended, shutdowns=_shutdowns(old, new, state.ledger))
     state = State.of(config, ledger) if known.config else replace(state, ledger=ledger)
     problems, claims, invalid = list(known.faults), dict[str, Claim | None](), list[str]()
     for path in sorted({*ledger_files.changed_files(old, new), *before.quarantined_files}):
@@ -157,18 +159,16 @@ def advance(
     return Advance(snapshot, tuple(dict.fromkeys(subjects)), config_changed)
 
 
-def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValidConfig:
-    return last_valid_config.load_last_valid_config(
-        repo,
-        before.config_source,
-        before.last_valid_commit,
-        to,
-        lambda files: _load_and_rehearse(files, before.state),
-    )
+def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
+    shutdowns = ledger.shutdowns
+    for path, _ in trees.differences(old, new, (recent_shutdowns.SHUTDOWNS_ROOT,)):
+        text = trees.read_text(new, path)
+        shutdown = recent_shutdowns.read(text, path) if text is not None else None
+        shutdowns = shutdowns.replace(recent_shutdowns.digest_in(path), shutdown)
+    return shutdowns
 
 
 def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Return whether a person changed generated files between two commits."""
     return any(
         trees.differ(commit.parents[0].tree, commit.tree, GENERATED_ROOTS)
         for commit in commit_log.person_commits(repo, to, before)
@@ -198,16 +198,17 @@ class ReadAhead:
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        """Return the advance from ``before`` to ``tip``.
-
-        Raises:
-            StateRepoError: ``tip`` has another render version.
-        """
+        """Return the advance to ``tip``; raise if that has another render version."""
         last_valid_config.refuse_other_render_version(trees.commit_of(repo, tip).tree)
         known = self._known
         if known is None or self._start != before.commit:
             known = Advance(before, (), False)
         if known.snapshot.commit != tip or known.snapshot.problems:
-            known = known.followed_by(advance(repo, known.snapshot, tip))
+            more = advance(repo, known.snapshot, tip)
+            known = Advance(
+                more.snapshot,
+                tuple(dict.fromkeys((*known.subjects, *more.subjects))),
+                known.config_changed or more.config_changed,
+            )
         self._known, self._start = known, before.commit
         return known

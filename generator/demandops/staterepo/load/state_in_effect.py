@@ -5,17 +5,22 @@ were valid. ``Configuration`` names the commit whose configuration is in effect.
 names a file that is in effect in another version, as path and blob. A restart and
 ``demandops verify`` start from these trailers. They then apply people's later changes with the same
 code as a running generator.
+
+People's changes that cannot be planned are not applied (quarantine). A claim that cannot be
+planned, for example because it names an unknown node, stays in its file, and its last valid version
+is in effect. If the new configuration is the reason, the old configuration stays in effect.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from urllib.parse import quote, unquote
 
-from pygit2 import Oid, Repository
+from pygit2 import Oid, Repository, Tree
 
 from demandops.config.config import CONFIG_ROOTS
-from demandops.decision import rendered_files
+from demandops.decision import State, changeset_of_edit, rendered_files
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
 from demandops.settings import GENERATED_ROOTS
@@ -23,10 +28,11 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.history.commit_log import LogEntry
-from demandops.staterepo.load import last_valid_config, quarantine
+from demandops.staterepo.load import last_valid_config, ledger_files
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.last_valid_config import ConfigSource
-from demandops.staterepo.load.snapshot import Progress, Snapshot
+from demandops.staterepo.load.snapshot import Advance, Progress, Snapshot
+from demandops.subject import Subject
 
 _NONE = "none"
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
@@ -51,9 +57,6 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
     """Return the state to start from: :func:`start_at` of the newest commit.
 
     :func:`demandops.staterepo.load.snapshot.advance` then applies what people changed since.
-
-    Raises:
-        InvalidInput, StateRepoError: there never was a valid state.
     """
     objects, tip = repository.objects, repository.tip()
     last_valid_config.refuse_other_render_version(trees.commit_of(objects, tip).tree)
@@ -65,15 +68,14 @@ def state_at(
 ) -> Snapshot:
     """Return the state in effect at any commit: the recorded state with people's later changes.
 
-    Raises:
-        InvalidInput, StateRepoError: there never was a valid state.
+    Raises InvalidInput or StateRepoError if there never was a valid state.
     """
     commit = trees.commit_of(repo, revision)
     start = start_at(repo, commit.id, progress)
     if start.commit == commit.id:
         return start
     advance = snapshots.advance(repo, start, commit.id)
-    judgement = quarantine.judge(repo, advance, start, commit.tree)
+    judgement = judge(repo, advance, start, commit.tree)
     accepted = judgement.with_new_config().snapshot
     try:
         if advance.config_changed:
@@ -88,8 +90,7 @@ def start_at(
 ) -> Snapshot:
     """Return the newest known state up to a commit: a recorded one, or one without invalid files.
 
-    Raises:
-        InvalidInput, StateRepoError: there never was a valid state.
+    Raises InvalidInput or StateRepoError if there never was a valid state.
     """
     record = record_at(repo, commit)
     if record.first("In-Force"):
@@ -116,18 +117,14 @@ def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
 def recorded_state(
     repo: Repository, record: LogEntry, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state that was in effect at a commit of the generator.
-
-    Raises:
-        InvalidInput, StateRepoError: the recorded state is not valid.
-    """
+    """Return the state in effect at a commit of the generator; raise if the record is not valid."""
     commit = trees.commit_of(repo, record.commit)
     if not record.first("In-Force"):
         return snapshots.load(repo, commit.id, progress)
     last_valid = snapshots.load(repo, record.first("In-Force"), progress)
     source = _source(record)
     advance = snapshots.advance(repo, last_valid, commit.id, source)
-    snapshot = quarantine.judge(repo, advance, last_valid, commit.tree).with_new_config().snapshot
+    snapshot = judge(repo, advance, last_valid, commit.tree).with_new_config().snapshot
     # placeholder: advancing to later commits finds the real problems again
     problems = snapshot.problems or (Fault("invalid", "", "must be checked again"),)
     return replace(snapshot, last_valid_commit=last_valid.commit, problems=problems)
@@ -140,3 +137,99 @@ def _source(record: LogEntry) -> ConfigSource:
         path, _, blob = line.rpartition(" ")
         replacements[unquote(path)] = None if blob == _NONE else Oid(hex=blob)
     return ConfigSource(Oid(hex=commit), replacements)
+
+
+Faults = Mapping[Subject, tuple[Fault, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """People's changes, and the faults of subjects with the new and with the old configuration.
+
+    If a subject cannot be planned with either configuration, its claims are at fault. If it cannot
+    be planned with the new one only, the new configuration is at fault.
+    """
+
+    repo: Repository
+    before: Snapshot
+    advance: Advance
+    with_new: Faults
+    with_old: Faults
+    old: State
+    """The new ledger with the configuration that was in effect before."""
+
+    def with_new_config(self) -> Advance:
+        """Return the state in effect, and what changed, if the new configuration is accepted."""
+        faults = {
+            subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
+        }
+        return self._without(self.advance, faults)
+
+    def with_old_config(self, faults: Iterable[Fault]) -> Advance:
+        """Return the state in effect, and what changed, if the new configuration has ``faults``."""
+        accepted = self.with_new_config()
+        ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
+        snapshot = replace(
+            accepted.snapshot,
+            state=replace(self.old, ledger=ledger),
+            problems=(*problems, *faults),
+            last_valid_commit=self.before.last_valid_commit,
+            other_config_source=self.before.config_source,
+        )
+        return self._without(replace(accepted, snapshot=snapshot), self.with_old)
+
+    def _without(self, accepted: Advance, faults: Faults) -> Advance:
+        """Put the last valid claims of faulty subjects in effect."""
+        snapshot, before = accepted.snapshot, self.before
+        problems, ledger = list(snapshot.problems), snapshot.state.ledger
+        quarantined = dict.fromkeys(snapshot.quarantined_files)
+        for subject in (subject for subject in accepted.subjects if subject in faults):
+            claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
+            keys = {claim_file.path_of(claim.key): claim.key for claim in claims}
+            problems += _located_in_claim_files(faults[subject], snapshot, before, subject)
+            last_valid = ledger_files.last_valid_claims(
+                self.repo, before.last_valid_commit, snapshot.commit, keys
+            )
+            for path, key in keys.items():
+                ledger = ledger.replace(key, last_valid[path])
+            quarantined |= dict.fromkeys(keys)
+        snapshot = replace(
+            snapshot,
+            state=replace(snapshot.state, ledger=ledger),
+            problems=tuple(problems),
+            last_valid_commit=before.last_valid_commit if problems else snapshot.commit,
+            quarantined_files=tuple(quarantined),
+        )
+        good = tuple(subject for subject in accepted.subjects if subject not in faults)
+        return replace(accepted, snapshot=snapshot, subjects=good)
+
+
+def judge(repo: Repository, advance: Advance, before: Snapshot, tree: Tree) -> Judgement:
+    """Return the subjects that people changed since ``before`` and that cannot be planned."""
+    state, ledger = advance.snapshot.state, before.state.ledger
+    old = replace(before.state, ledger=state.ledger)
+
+    def faults_in(state: State) -> Faults:
+        found = {}
+        for subject in advance.subjects:
+            try:
+                changeset_of_edit(
+                    state, ledger, [subject], lambda path: trees.read_text(tree, path)
+                )
+            except InvalidInput as error:
+                found[subject] = error.faults
+        return found
+
+    with_new = faults_in(state)
+    with_old = faults_in(old) if state.config != old.config else with_new
+    return Judgement(repo, before, advance, with_new, with_old, old)
+
+
+def _located_in_claim_files(
+    faults: Iterable[Fault], snapshot: Snapshot, before: Snapshot, subject: Subject
+) -> list[Fault]:
+    """Return faults of a subject, located in the file of a claim that changed."""
+    claims = snapshot.state.ledger.claims_on(subject)
+    changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
+    paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]
+    return [fault.within(paths[0]) if paths else fault for fault in faults]

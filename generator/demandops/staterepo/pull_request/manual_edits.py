@@ -1,29 +1,57 @@
 """Manual edits to generated files, and overrides that would have the same effect.
 
-They are refused because the generator's next commit would silently undo them.
+They are refused because the generator's next commit would silently undo them, but an override in
+``overrides/`` stays. A person can use a suggested override unchanged, except for its reason.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass
+from typing import Any
 
+from demandops import strict_yaml
+from demandops.config.config import Config
 from demandops.config.override import OVERRIDES_ROOT
-from demandops.errors import Fault, fault
+from demandops.config.registry import Image
+from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file
-from demandops.plan.release import Release
-from demandops.render.changes.override_suggestion import (
-    Suggestion,
-    same_override_fits,
-    suggest_override,
-)
+from demandops.plan.release import Release, ServiceRelease
+from demandops.render.changes.merge_preview import ABSENT, leaf_differences
+from demandops.render.gitops.flux import chart_object
 from demandops.render.gitops.paths import BOOTSTRAP_ROOT, path_of
-from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
+from demandops.settings import API_VERSION, GENERATED_ROOTS, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.pull_request.worktree import Base
 
 _LOST = "is generated, so a manual edit is lost; revert it"
 _MOST_LEFT = 5
+_VALUES = {
+    "HelmRelease": ("spec", "values"),
+    "Application": ("spec", "source", "helm", "valuesObject"),
+}
+_EFFECTS = ("values", "version", "images", "hold", "deny", "replicas")
+_IMAGE_KEYS = ("repository", "tag", "digest")
+_REFERENCE = re.compile(
+    r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:[0-9a-f]{64}))?"
+)
+_REASON = "Say here why; this replaces a manual edit of a generated file"
+
+
+@dataclass(frozen=True, slots=True)
+class Suggestion:
+    """An override, to be merged as ``file``, that replaces a manual edit of ``instead_of``.
+
+    ``not_covered`` lists the parts of the edit that the override does not make.
+    ``other_releases`` lists other releases that need the same override.
+    """
+
+    instead_of: str
+    file: str
+    text: str
+    not_covered: tuple[str, ...] = ()
+    other_releases: tuple[str, ...] = ()
 
 
 def is_written_by_generator(path: str) -> bool:
@@ -39,47 +67,31 @@ def is_written_by_generator(path: str) -> bool:
 def faults_and_suggestions(
     files: Mapping[str, str], base: Base, paths: Collection[str], owner: str
 ) -> tuple[list[Fault], tuple[Suggestion, ...]]:
-    """Return a fault for each manual edit, and an override with the same effect if there is one.
-
-    Args:
-        files: the files after the edit.
-        base: the files before it.
-        paths: the generated files that were edited.
-        owner: who edited them.
-    """
+    """Return a fault for each edited path, and an override with the same effect if there is one."""
     releases = {path_of(release): release for release in base.releases().values()}
     used = {path for path in files if path.startswith(f"{OVERRIDES_ROOT}/")}
+    who = owner.strip()[:100] if owner.isprintable() and owner.strip() else "unknown"
     faults, suggestions = list[Fault](), list[Suggestion]()
     for path in paths:
         before, after = base.files.get(path), files.get(path)
         release, suggestion = releases.get(path), None
         if release is not None and before is not None and base.state is not None:
-            who = owner if owner.isprintable() and owner.strip() else "unknown"
-            texts = (before, after)
-            suggestion = suggest_override(
-                path, texts, release, base.state.config, who.strip()[:100]
-            )
-        if suggestion is not None:
-            also = sorted(one.name for one in releases.values() if _fits(release, one))
-            suggestion = replace(
-                suggestion, name=_unused_path(suggestion.name, used), other_releases=tuple(also)
-            )
-            suggestions.append(suggestion)
+            effects, not_covered = _effects(before, after, release, base.state.config)
+            if effects:
+                others = [one.name for one in releases.values() if _fits(release, one)]
+                text = _override_text(effects, release, who)
+                file = _unused_path(release.name, used)
+                suggestion = Suggestion(path, file, text, tuple(not_covered), tuple(sorted(others)))
+                suggestions.append(suggestion)
         message = _message(path, before is None, after is None, suggestion)
         faults.append(fault("", message).within(path))
     return faults, tuple(suggestions)
 
 
-def _fits(release: Release | None, other: Release) -> bool:
-    return release is not None and same_override_fits(release, other)
-
-
 def _unused_path(name: str, used: set[str]) -> str:
-    """Return an unused path for a new override."""
-    for number in range(1, len(used) + 2):
-        path = f"{OVERRIDES_ROOT}/{name}{f'-{number}' if number > 1 else ''}.yaml"
-        if path not in used:
-            break
+    endings = ("", *(f"-{number}" for number in range(2, len(used) + 2)))
+    paths = (f"{OVERRIDES_ROOT}/{name}{ending}.yaml" for ending in endings)
+    path = next(path for path in paths if path not in used)
     used.add(path)
     return path
 
@@ -87,17 +99,14 @@ def _unused_path(name: str, used: set[str]) -> str:
 def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | None) -> str:
     if suggestion is not None and deleted:
         return (
-            f"{_LOST}; to stop the release, merge {suggestion.name} as shown, or delete its "
+            f"{_LOST}; to stop the release, merge {suggestion.file} as shown, or delete its "
             "claims in ledger/"
         )
     if suggestion is not None:
-        unchanged = ""
-        if suggestion.not_covered:
-            more = ", …" if len(suggestion.not_covered) > _MOST_LEFT else ""
-            unchanged = (
-                f" (no override changes {', '.join(suggestion.not_covered[:_MOST_LEFT])}{more})"
-            )
-        return f"{_LOST}, and merge {suggestion.name} as shown{unchanged}"
+        left = suggestion.not_covered
+        listed = ", ".join(left[:_MOST_LEFT]) + (", …" if len(left) > _MOST_LEFT else "")
+        unchanged = f" (no override changes {listed})" if left else ""
+        return f"{_LOST}, and merge {suggestion.file} as shown{unchanged}"
     if path.startswith(f"{NOTES_ROOT}/"):
         return "is written by the generator, which undoes the edit; revert it"
     if path.startswith(f"{claim_file.LEDGER_ROOT}/") and added:
@@ -119,3 +128,160 @@ def _source_of(path: str) -> str:
     if path.endswith("/_domain.yaml"):
         return "policy/access-domains.yaml"
     return "the configuration"
+
+
+def _effects(
+    before: str, after: str | None, release: Release, config: Config
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the effects of an override for an edit, and the parts of the edit it leaves out."""
+    if after is None:
+        return {"deny": True}, []
+    try:
+        old, new = list(strict_yaml.load_all(before)), list(strict_yaml.load_all(after))
+    except InvalidInput:
+        return {}, []
+    if isinstance(release, ServiceRelease):
+        return _service_effects(old, new, release, config)
+    return _client_effects(old, new, config)
+
+
+def _override_text(effects: dict[str, Any], release: Release, owner: str) -> str:
+    head = {"apiVersion": API_VERSION, "kind": "Override", "reason": _REASON, "owner": owner}
+    select = {"select": [_selector(release, whole="deny" in effects)]}
+    return strict_yaml.dump(head | select | {name: effects[name] for name in _used(effects)})
+
+
+def _fits(release: Release, other: Release) -> bool:
+    """Return whether a suggested override for one release fits another release too."""
+    if not (isinstance(release, ServiceRelease) and isinstance(other, ServiceRelease)):
+        return False
+    same = (release.key.service, release.node.id) == (other.key.service, other.node.id)
+    shared = set(release.applications) & set(other.applications)
+    return release.name != other.name and same and bool(shared)
+
+
+def _used(effects: dict[str, Any]) -> list[str]:
+    return [name for name in _EFFECTS if name in effects]
+
+
+def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
+    """Return the selector of a release; with ``whole``, of both ends of its connection."""
+    if isinstance(release, ServiceRelease):
+        selected = {"applications": list(release.applications), "services": [release.key.service]}
+        return selected if release.key.application else selected | {"nodes": [release.node.id]}
+    ids = list(release.connections)
+    return {"connections": ids} if whole else {"connections": ids, "nodes": [release.node.id]}
+
+
+def _service_effects(
+    old: list[Any], new: list[Any], release: ServiceRelease, config: Config
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the effects of an edit of a HelmRelease or an Application, and what they leave out."""
+    effects, not_covered = dict[str, Any](), list[str]()
+    place_of_values = _VALUES.get(old[0].get("kind"), ())
+    before, after = _at(old[0], place_of_values), _at(new[0] if new else None, place_of_values)
+    patched: tuple[str, ...] = ()
+    if isinstance(before, dict) and isinstance(after, dict):
+        values = _merge_patch(before, after)
+        images = dict[str, dict[str, str]]()
+        _move_images(values, before, release, config, images)
+        replicas = values.get("replicas")
+        if before.get("replicas") == release.replicas and type(replicas) is int and replicas >= 0:
+            effects["replicas"] = values.pop("replicas")
+        effects |= {
+            name: found for name, found in (("values", values), ("images", images)) if found
+        }
+        path = ".".join(place_of_values)
+        patched = (path, f"{path}.", f"{path}[")
+    for path, left, right in leaf_differences(old, new):
+        place, chart = path.removeprefix("[0]."), release.service.chart
+        is_version = str(right).startswith(f"{chart}-") and left == chart_object(
+            chart, release.chart
+        )
+        if place == "spec.chartRef.name" and is_version:
+            effects["version"] = str(right).removeprefix(f"{chart}-")
+        elif place == "spec.source.targetRevision" and not release.chart.folder:
+            effects["version"] = str(right)
+        elif place == "spec.suspend" and right is True:
+            effects["hold"] = True
+        elif not (patched and (place == patched[0] or place.startswith(patched[1:]))):
+            not_covered.append(place)
+    if "hold" in effects:  # a hold keeps the file as it was rendered, so it excludes other effects
+        not_covered += [name for name in _used(effects) if name != "hold"]
+        effects = {"hold": True}
+    return effects, not_covered
+
+
+def _at(document: Any, path: tuple[str, ...]) -> Any:  # noqa: ANN401
+    for key in path:
+        document = document.get(key) if isinstance(document, dict) else None
+    return document
+
+
+def _move_images(
+    patch: dict[str, Any],
+    values: dict[str, Any],
+    release: ServiceRelease,
+    config: Config,
+    moved: dict[str, dict[str, str]],
+) -> None:
+    """Move the changes of registry images from a patch of values to ``moved``."""
+    names: dict[str, list[str]] = {}
+    for name in release.service.images:
+        names.setdefault(config.images[name].repository, []).append(name)
+    for key in list(patch):
+        inner, old = patch[key], values.get(key)
+        if not isinstance(inner, dict) or not isinstance(old, dict):
+            continue
+        images = names.get(str(old.get("repository", "")), [])
+        pin = {part: inner[part] for part in _IMAGE_KEYS if inner.get(part)}
+        if len(images) == 1 and pin and set(inner) <= set(_IMAGE_KEYS):
+            moved[images[0]] = {part: str(text) for part, text in pin.items()}
+            del patch[key]
+        else:
+            _move_images(inner, old, release, config, moved)
+            if not inner:
+                del patch[key]
+
+
+def _client_effects(
+    old: list[Any], new: list[Any], config: Config
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the effects of an edit of plain manifests; an override changes only their image."""
+    images, not_covered = dict[str, dict[str, str]](), list[str]()
+    by_reference = {image.reference(): (name, image) for name, image in config.images.items()}
+    for path, left, right in leaf_differences(old, new):
+        known = by_reference.get(left) if path.endswith(".image") else None
+        pin = _pin(right, known[1]) if known else None
+        place = re.fullmatch(r"\[(\d+)\]\.(.*)", path, re.DOTALL)
+        if known and pin:
+            images[known[0]] = pin
+        elif place is None:
+            not_covered.append(path or "the number of documents")
+        else:
+            not_covered.append(f"{old[int(place[1])].get('kind')} {place[2]}")
+    return {"images": images} if images else {}, not_covered
+
+
+def _pin(reference: object, image: Image) -> dict[str, str] | None:
+    match = _REFERENCE.fullmatch(reference) if isinstance(reference, str) else None
+    if match is None:
+        return None
+    pin = {part: match[part] for part in ("tag", "digest") if match[part]}
+    if match["repository"] != image.repository:
+        pin["repository"] = match["repository"]
+    return pin if pin.keys() & {"tag", "digest"} else None
+
+
+def _merge_patch(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON merge patch (RFC 7386) that turns ``old`` into ``new``; null removes."""
+    patch: dict[str, Any] = {key: None for key in old if key not in new}
+    for key, value in new.items():
+        old_value = old.get(key, ABSENT)
+        if isinstance(old_value, dict) and isinstance(value, dict):
+            inner = _merge_patch(old_value, value)
+            if inner:
+                patch[key] = inner
+        elif next(leaf_differences(old_value, value), None) is not None:
+            patch[key] = value
+    return patch

@@ -27,12 +27,12 @@ from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeepi
 from demandops.plan.views.override_report import override_report, warnings
 from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview
-from demandops.render.changes.override_suggestion import Suggestion
 from demandops.runtime import REAL
 from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.load import ledger_files
 from demandops.staterepo.pull_request import manual_edits
+from demandops.staterepo.pull_request.manual_edits import Suggestion
 from demandops.staterepo.pull_request.worktree import Base, author_of, base_of, files_of
 
 
@@ -64,28 +64,17 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
         now: overrides that ended by then are left out; by default the current time.
 
     Raises:
-        StateRepoError: it is not a state repo, ``base`` is not a commit, or the clone is too
-            shallow.
+        StateRepoError: it is not a state repo, or ``base`` is not a commit with an ancestor here.
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
     edit = _Edit(files, start, now or REAL.now())
     claims = ledger_files.read(sorted(files.items()))
     faults += claims.faults
-    result = CheckResult((), base=start.commit if start else None)
-    result = replace(result, base_valid=start is None or start.valid)
     edited = [path for path in edit.changed if manual_edits.is_written_by_generator(path)]
-
-    def with_faults(edited: list[str]) -> CheckResult:
-        found, suggestions = faults, tuple[Suggestion, ...]()
-        if start is not None and edited:
-            manual, suggestions = manual_edits.faults_and_suggestions(
-                files, start, edited, author_of(folder)
-            )
-            found = [*faults, *manual]
-        ordered = tuple(sorted(dict.fromkeys(found), key=lambda fault: fault.file))
-        return replace(result, faults=ordered, suggestions=suggestions)
-
+    result = CheckResult(
+        (), base=start.commit if start else None, base_valid=start is None or start.valid
+    )
     try:
         config = edit.config()
         faults += edit.unversioned_charts(config)
@@ -93,20 +82,28 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
         wanted = edit.rendered(state)
     except InvalidInput as error:
         faults += error.faults
-        return with_faults(edited)
-    # a proposal or an upgrade contains exactly what the generator would write: not a manual edit
-    edited = [
-        path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
-    ]
-    new = merge_preview.planned_releases(state)
-    old = new if start is None else start.releases()
-    idle = warnings(override_report(state, edit.now))
-    return replace(
-        with_faults(edited),
-        preview=merge_preview.preview(old, new, edit.generated, wanted),
-        bookkeeping=_bookkeeping_changes(start, state),
-        warnings=tuple(fault("", text).within(path) for path, text in idle),
-    )
+    else:
+        # a proposal or an upgrade has exactly what the generator would write: no manual edit
+        edited = [
+            path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
+        ]
+        new = merge_preview.planned_releases(state)
+        idle = warnings(override_report(state, edit.now))
+        result = replace(
+            result,
+            preview=merge_preview.preview(
+                new if start is None else start.releases(), new, edit.generated, wanted
+            ),
+            bookkeeping=_bookkeeping_changes(start, state),
+            warnings=tuple(fault("", text).within(path) for path, text in idle),
+        )
+    if start is not None and edited:
+        manual, suggestions = manual_edits.faults_and_suggestions(
+            files, start, edited, author_of(folder)
+        )
+        faults, result = [*faults, *manual], replace(result, suggestions=suggestions)
+    ordered = sorted(dict.fromkeys(faults), key=lambda fault: fault.file)
+    return replace(result, faults=tuple(ordered))
 
 
 def _generated(path: str) -> bool:
@@ -155,13 +152,11 @@ class _Edit:
             raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
         return config
 
-    def _markers(self) -> dict[str, str]:
-        root = f"{ended_override_file.MARKERS_ROOT}/"
-        return {path: text for path, text in self.files.items() if path.startswith(root)}
-
     def merged_state(self, config: Config, ledger: Ledger) -> State:
         """Return the state after the generator has applied the edit."""
-        ended = ended_override_file.read(self._markers())
+        root = f"{ended_override_file.MARKERS_ROOT}/"
+        markers = {path: text for path, text in self.files.items() if path.startswith(root)}
+        ended = ended_override_file.read(markers)
         expired = expired_overrides(World(config, replace(ledger, ended=ended)), self.now)
         ended |= {one.name: format_time(one.end) for one in expired if one.end}
         state = State.of(config, replace(ledger, ended=ended))
@@ -170,7 +165,7 @@ class _Edit:
             return state
         old = self.start.state
         subjects = ledger_files.changed_subjects(old.ledger, ledger)
-        applied = update_ledger(old, state, subjects, self._markers(), self.now)
+        applied = update_ledger(old, state, subjects, markers, self.now)
         return replace(state, ledger=applied.ledger)
 
     def rendered(self, state: State) -> dict[str, str]:

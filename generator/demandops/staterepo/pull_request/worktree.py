@@ -40,17 +40,11 @@ class Base:
 
     def releases(self) -> dict[ReleaseKey, Release]:
         """Return the releases of ``state``."""
-        if self.state is None:
-            return {}
-        return merge_preview.planned_releases(self.state)
+        return merge_preview.planned_releases(self.state) if self.state else {}
 
 
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
-    """Return path → text of the state repo's files, and a fault for each symbolic link.
-
-    Raises:
-        StateRepoError: the folder is not a state repo, or a file cannot be read.
-    """
+    """Return path → text of the state repo's files, and a fault for each symbolic link."""
     if not (folder / "demandops.yaml").is_file():
         raise StateRepoError(
             f"{folder} is not a state repo, because it has no demandops.yaml; `demandops init` "
@@ -65,22 +59,17 @@ def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
                 message = "is a symbolic link, which is not followed; replace it by a file"
                 faults.append(fault("", message).within(name))
             elif path.is_file():
-                files[name] = _text(path)
+                try:
+                    files[name] = path.read_bytes().decode("utf-8", "replace")
+                except OSError as error:
+                    raise StateRepoError(f"{path} cannot be read: {error.strerror}") from None
     return files, faults
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_bytes().decode("utf-8", "replace")
-    except OSError as error:
-        raise StateRepoError(f"{path} cannot be read: {error.strerror}") from None
 
 
 def base_of(folder: Path, revision: str | None) -> Base | None:
     """Return the commit that an edit is compared with, or None if Git knows no commit.
 
     Args:
-        folder: a checked-out state repo.
         revision: the merge target, by default ``origin/main``, else ``main``.
 
     Raises:
@@ -104,7 +93,6 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
 
 
 def _started_from(repo: Repository, revision: str | None) -> Commit:
-    """Return the common ancestor of HEAD and the merge target."""
     head = repo.head.peel(Commit)
     known = [name for name in _DEFAULTS if name in repo.references]
     target = revision or next(iter(known), "")

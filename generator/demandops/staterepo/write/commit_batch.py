@@ -8,7 +8,7 @@ evaluated again on the new tip.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from types import MappingProxyType
 from typing import Literal
@@ -23,7 +23,6 @@ from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
 from demandops.plan.overrides import claim_overrides
 from demandops.plan.overrides.lifecycle import (
-    LedgerUpdate,
     changed_claim_files,
     changed_override_files,
     end_override,
@@ -38,23 +37,16 @@ from demandops.staterepo.history import authorship, commit_log, commit_message
 from demandops.staterepo.load import (
     last_valid_config,
     problem_report,
-    quarantine,
     state_in_effect,
 )
-from demandops.staterepo.load.quarantine import Accepted
 from demandops.staterepo.load.snapshot import Advance, Snapshot
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class _Followed:
-    """The effect of people's changes: the state in effect, the files and the kept claims."""
-
-    snapshot: Snapshot
-    change: Changeset
-    keys: tuple[ClaimKey, ...]
+_Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
+"""The effect of people's changes: the state in effect, the files and the kept claims."""
 
 
 class CommitBatch:
@@ -63,6 +55,7 @@ class CommitBatch:
     def __init__(self, repository: StateRepository, start: Snapshot) -> None:
         self._repository = repository
         self._objects = repository.objects
+        repository.new.forget()
         self._tree = trees.commit_of(self._objects, start.commit).tree
         self._settled: list[tuple[str, str]] = []
         self.start = start
@@ -87,17 +80,15 @@ class CommitBatch:
     ) -> str:
         """Commit one demand and return the commit's id.
 
-        Args:
-            proposal: the branch that it awaits approval on; empty if it needs no approval.
+        ``proposal`` is the branch that it awaits approval on; empty if it needs no approval.
         """
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
             more.append((commit_log.PROPOSAL, proposal))
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
-        made = self._write(decision.files, text, commit_message.author(decision, received), now)
-        self.head = self.head.with_commit(made, decision.state)
-        return str(made)
+        author = commit_message.author(decision, received)
+        return self.commit_files(decision.files, decision.state, text, author, now)
 
     def commit_files(
         self,
@@ -126,37 +117,36 @@ class CommitBatch:
         A claim or file that cannot be planned or rendered (its node left the inventory) stays
         unchanged and is listed in the head's problems.
         """
-        followed = self._followed(advance, before, now)
-        self.head = followed.snapshot
-        report = self._report(followed.snapshot.problems, before)
-        files = {**followed.change.files, **report}
+        self.head, change, keys = self._followed(advance, before, now)
+        state, tip, problems = self.head.state, self.head.commit, self.head.problems
+        report = self._report(problems, before)
+        files = {**change.files, **report}
         if not files:
             return
         overrides = [
-            *changed_override_files(before.state, followed.snapshot.state),
-            *followed.change.overrides,
-            *commit_message.keep_override_paths(followed.keys),
+            *changed_override_files(before.state, state),
+            *change.overrides,
+            *commit_message.keep_override_paths(keys),
         ]
-        tip = followed.snapshot.commit
         causes = authorship.person_commits_since(self._objects, before.last_valid_commit, tip)
         text = commit_message.of_follow(
-            followed.change.releases,
+            change.releases,
             str(tip),
             str(before.commit),
-            followed.snapshot.problems,
+            problems,
             [
                 *commit_message.override_trailers(overrides),
                 *authorship.caused_by_trailers(causes),
-                *state_in_effect.trailers_of(followed.snapshot),
+                *state_in_effect.trailers_of(self.head),
             ],
             reports=bool(report),
         )
         author = authorship.follow_author(causes, now)
-        self.commit_files(files, followed.snapshot.state, text, author, now)
+        self.commit_files(files, state, text, author, now)
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
         """Return the effect, with the old configuration if the new one cannot be planned."""
-        judgement = quarantine.judge(self._objects, advance, before, self._tree)
+        judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
         accepted = judgement.with_new_config()
         if advance.config_changed:
             try:
@@ -165,17 +155,16 @@ class CommitBatch:
                 accepted = judgement.with_old_config(error.faults)
         return self._rendered_subjects(accepted, before, now)
 
-    def _rendered_whole(self, accepted: Accepted, before: Snapshot, now: datetime) -> _Followed:
+    def _rendered_whole(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
         """Render everything, because the configuration changed."""
         marked = last_valid_config.end_markers_at(self._tree)
         state = accepted.snapshot.state
         applied = update_ledger(before.state, state, accepted.subjects, marked, now)
-        state = _updated(state, applied)
+        state = replace(state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
         return _with_started_leases(accepted.snapshot, state, change, applied.keys, now)
 
-    def _rendered_subjects(self, accepted: Accepted, before: Snapshot, now: datetime) -> _Followed:
-        """Render the subjects that people changed."""
+    def _rendered_subjects(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
         state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
         ledger, keys = claim_overrides.update_kept_claims(old, state, subjects, now)
         files = changed_claim_files(state.ledger, ledger, keys)
@@ -187,7 +176,7 @@ class CommitBatch:
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
         """Return the problem report, if it changed."""
         current = self.read(problem_report.PATH)
-        origin = authorship.FaultOrigins(self._objects, before.last_valid_commit, self.start.commit)
+        origin = authorship.fault_origin(self._objects, before.last_valid_commit, self.start.commit)
         wanted = problem_report.write(
             problem_report.with_origins(problems, problem_report.read(current), origin)
         )
@@ -196,12 +185,10 @@ class CommitBatch:
     def end_override(self, override: Override, now: datetime) -> None:
         """Commit the end of an expired override, with its effect on claims and releases.
 
-        Raises:
-            Refused, InvalidInput: the state without the override cannot be planned or rendered.
+        Raises Refused or InvalidInput if the state without it cannot be planned or rendered.
         """
-        state = self.head.state
-        applied = end_override(state, override, now)
-        state = _updated(state, applied)
+        applied = end_override(self.head.state, override, now)
+        state = replace(self.head.state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
         more = state_in_effect.trailers_of(self.head)
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
@@ -212,8 +199,7 @@ class CommitBatch:
     ) -> Changeset:
         """Return all generated files that differ from the current ones, and the files of ``more``.
 
-        Raises:
-            Refused, InvalidInput: a release cannot be planned or rendered.
+        Raises Refused or InvalidInput if a release cannot be planned or rendered.
         """
         generated = trees.texts(self._tree, GENERATED_ROOTS)
         files: dict[str, str | None] = dict(rendered_files(state, generated))
@@ -228,7 +214,7 @@ class CommitBatch:
                 continue
             kind: Change = "stop" if files[path] is None else "start" if old is None else "change"
             name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
-            changes.append(ReleaseChange(name, kind, path, ()))
+            changes.append(ReleaseChange(name, path, path, kind))
         return Changeset({**more, **files}, tuple(changes))
 
     def _write(
@@ -237,9 +223,9 @@ class CommitBatch:
         committer = commit_message.generator_signature(now)
         for attempt in range(1, _ATTEMPTS + 1):
             try:
-                tree = trees.write(self._objects, self._tree, files)
+                tree = trees.write(self._repository.new, self._tree, files)
                 made = signing.create_commit(
-                    self._objects,
+                    self._repository.new,
                     self._repository.signer,
                     (author, committer),
                     text,
@@ -259,11 +245,7 @@ class CommitBatch:
         return made
 
     def publish(self) -> bool:
-        """Publish the commits; return false if the state repo has moved.
-
-        Raises:
-            RemoteAway, PushDenied: they could not be published for another reason.
-        """
+        """Publish the commits; return false if the repo moved. Raises RemoteAway or PushDenied."""
         if self.is_empty:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)
@@ -283,8 +265,4 @@ def _with_started_leases(
         ledger = ledger.replace(claim.key, started)
         files[claim_file.path_of(claim.key)] = claim_file.text_of(started)
     snapshot = replace(snapshot, state=replace(state, ledger=ledger))
-    return _Followed(snapshot, replace(change, files=files), tuple(keys))
-
-
-def _updated(state: State, update: LedgerUpdate) -> State:
-    return replace(state, ledger=update.ledger)
+    return snapshot, replace(change, files=files), tuple(keys)

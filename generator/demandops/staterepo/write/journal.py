@@ -85,11 +85,9 @@ class Journal:
             raise self._unsound
 
     def append(self, entries: Iterable[JournalEntry]) -> None:
-        """Write and fsync ``entries``.
+        """Write and fsync all ``entries``, or raise StateRepoError and write none of them.
 
-        Raises:
-            StateRepoError: if they cannot be written; then none of them is in the journal.
-            Unsound: if they cannot be written, and nobody knows whether they are in the journal.
+        Raises Unsound if nobody knows whether they are written.
         """
         entries = list(entries)
         if entries:
@@ -101,12 +99,8 @@ class Journal:
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Remove demands that are published, refused or withdrawn.
 
-        If ``durably``, the removal is fsynced and a failure raised. Otherwise the next
-        :meth:`append` makes the removal durable. Until then, a replay of the demands is
-        harmless.
-
-        Raises:
-            StateRepoError: if ``durably``, and it cannot be written; then they stay.
+        If ``durably``, the removal is fsynced, and a failure raises StateRepoError and keeps them.
+        Otherwise the next :meth:`append` makes it durable. Until then, a replay is harmless.
         """
         done = [each for each in dict.fromkeys(operations) if each in self.pending]
         records = [{"done": operation} for operation in done]
@@ -194,12 +188,9 @@ def read(path: Path) -> dict[str, JournalEntry]:
 
 
 def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands of a journal's text, by operation id.
+    """Return the pending demands of a journal's text, by operation id, or raise DamagedJournal.
 
     An incomplete last line is dropped: it was being written at a crash and never acknowledged.
-
-    Raises:
-        DamagedJournal: if anything else is not what was written.
     """
     *lines, last = text.split(b"\n")
     chain = "" if _SEALED.fullmatch((lines or [last])[0]) else None
@@ -209,8 +200,9 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
             chain = _apply(line, chain, pending)
         except ValueError:
             raise DamagedJournal(path, number) from None
-    if _is_entry(last[:-1], chain):  # it was complete: only the end of its line was changed
-        raise DamagedJournal(path, len(lines) + 1)
+    with suppress(ValueError):
+        _apply(last[:-1], chain, {})
+        raise DamagedJournal(path, len(lines) + 1)  # complete: only the end of its line is changed
     with suppress(ValueError):
         _apply(last, chain, pending)
     return pending
@@ -250,12 +242,9 @@ def _digest(body: bytes, chain: str) -> str:
 
 
 def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> str | None:
-    """Apply a line to the pending demands and return its digest.
+    """Apply a line to the pending demands and return its digest; raise ValueError if it is damaged.
 
     ``chain`` is the digest before it; None in a journal of the first version.
-
-    Raises:
-        ValueError: if it is not an entry, or does not follow ``chain``.
     """
     if chain is not None:
         found = _SEALED.fullmatch(line)
@@ -264,14 +253,6 @@ def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> 
         line, chain = found[1] + b"}", found[2].decode()
     _replay(line, pending)
     return chain
-
-
-def _is_entry(line: bytes, chain: str | None) -> bool:
-    try:
-        _apply(line, chain, {})
-    except ValueError:
-        return False
-    return True
 
 
 def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:

@@ -61,11 +61,7 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        """Return the current commits of the branches.
-
-        Raises:
-            RemoteAway: the remote cannot be reached.
-        """
+        """Return the current commits of the branches, or raise RemoteAway."""
         if self._remote is None:
             repo = Repository(self._repository.objects.path)
             names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
@@ -88,7 +84,8 @@ class ProposalBranches:
             BranchMoved: the branch is not at ``expected``.
             RemoteAway, PushDenied: it could not be pushed for another reason.
         """
-        return self._set(branch, commit, expected, options)
+        with self._repository.new.packed(commit):
+            return self._set(branch, commit, expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
         """Delete a branch, if it exists.
@@ -158,12 +155,11 @@ class ProposalBranches:
         except StateRepoError:
             return False  # the clone was made again, or `git gc` removed the commit
         now = commit_of(objects, tip).tree
-        new = objects[trees.write(objects, now, files)].peel(pygit2.Tree)
+        new = objects[trees.write(self._repository.new, now, files)].peel(pygit2.Tree)
         proposed = dict(trees.differences(old, proposal))
         if proposed != dict(trees.differences(now, new)):
             return False
-        moved = dict(trees.differences(old, now))
-        return not set(moved) & set(proposed)
+        return proposed.keys().isdisjoint(path for path, _ in trees.differences(old, now))
 
 
 def _link(output: str) -> str:
@@ -187,11 +183,7 @@ class PendingProposal:
 
 
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
-    """Yield the proposals that are not merged, by branch.
-
-    Raises:
-        RemoteAway: the remote cannot be reached.
-    """
+    """Yield the proposals that are not merged, by branch, or raise RemoteAway."""
     space = f"{_HEADS}{PREFIX}"
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
@@ -203,8 +195,7 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
         proposed = [pair for pair in found if commit_log.PROPOSAL in pair[1].trailers]
         if not proposed:
             continue
-        entries = [entry for _, entry in proposed]
-        first = proposed[-1][0]
+        entries, first = [entry for _, entry in proposed], proposed[-1][0]
         yield PendingProposal(
             branch=f"{PREFIX}{name.removeprefix(space)}",
             commit=entries[0].commit,

@@ -1,0 +1,176 @@
+"""Recent shutdowns: those of the last 15 minutes, so that one that is sent again is recognized.
+
+A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
+record the repeat would release another demand of the same requesters. A join in the name of one
+of the requesters ends the record, because a later shutdown may mean what was joined.
+
+Each is one file: ``ledger/shutdowns/<hh>/<digest>.yaml``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta, timezone
+from itertools import islice
+from typing import Literal, TypeAlias
+
+from pydantic import Field
+from rpds import HashTrieMap, HashTrieSet
+
+from demandops import strict_yaml
+from demandops.config.base_model import FrozenModel, parse_file
+from demandops.demand.demand_request import Shutdown
+from demandops.errors import InvalidInput
+from demandops.ledger.claim_file import LEDGER_ROOT, Timestamp, format_timestamp, parse_timestamp
+from demandops.settings import LEDGER_API_VERSION
+
+SHUTDOWNS_ROOT = f"{LEDGER_ROOT}/shutdowns"
+
+REMEMBERED = timedelta(minutes=15)
+"""For how long a shutdown is remembered."""
+
+_FORGOTTEN = 10
+"""How many old shutdowns one booking forgets at most."""
+
+_Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
+
+
+@dataclass(frozen=True, slots=True)
+class RecentShutdown:
+    """A shutdown that released something; ``digest`` covers all that it lists."""
+
+    digest: str
+    request: str
+    requesters: tuple[str, ...]
+    at: datetime
+
+    @classmethod
+    def of(cls, request: Shutdown, at: datetime) -> RecentShutdown:
+        """Return the record of a shutdown that was received at a time."""
+        listed = {
+            (
+                one.held.subject.kind.value,
+                one.held.subject.id,
+                tuple(sorted(set(one.requesters))),
+                one.held.told_apart_by(),
+                tuple(sorted({words for words, _ in one.held.listed_topics(one.held)})),
+            )
+            for one in request.demanded
+        }
+        exact = json.dumps([request.id, sorted(listed)], ensure_ascii=True)
+        digest = hashlib.sha256(exact.encode()).hexdigest()[:20]
+        return cls(digest, request.id, tuple(sorted(request.requesters())), at)
+
+
+@dataclass(frozen=True, slots=True)
+class RecentShutdowns:
+    """The recent shutdowns by digest, and their digests by requester and by minute."""
+
+    by_digest: HashTrieMap[str, RecentShutdown] = field(default_factory=HashTrieMap)
+    by_requester: _Index = field(default_factory=HashTrieMap)
+    by_minute: _Index = field(default_factory=HashTrieMap)
+
+    def earlier(self, shutdown: RecentShutdown) -> RecentShutdown | None:
+        """Return the same shutdown if it was received in the last 15 minutes, or ``None``."""
+        known = self.by_digest.get(shutdown.digest)
+        return known if known and abs(shutdown.at - known.at) <= REMEMBERED else None
+
+    def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
+        """Return the shutdowns with one at ``digest``, or with none there if it is ``None``."""
+        known = self.by_digest.get(digest)
+        if known == shutdown:
+            return self
+        by_digest, by_requester, by_minute = self.by_digest, self.by_requester, self.by_minute
+        if known is not None:
+            by_digest = by_digest.remove(digest)
+            by_minute = _removed(by_minute, _minute(known.at), digest)
+            for who in known.requesters:
+                by_requester = _removed(by_requester, who, digest)
+        if shutdown is not None:
+            by_digest = by_digest.insert(digest, shutdown)
+            by_minute = _added(by_minute, _minute(shutdown.at), digest)
+            for who in shutdown.requesters:
+                by_requester = _added(by_requester, who, digest)
+        return RecentShutdowns(by_digest, by_requester, by_minute)
+
+    def forget(
+        self, now: datetime, requesters: Iterable[str] = ()
+    ) -> tuple[RecentShutdowns, tuple[str, ...]]:
+        """Return the shutdowns without those of the requesters and some old ones; their digests."""
+        first = _minute(now - REMEMBERED)
+        ended = sorted(one for one in self.by_minute if one < first)
+        old = (digest for minute in ended for digest in sorted(self.by_minute[minute]))
+        forgotten = {*islice(old, _FORGOTTEN)}
+        forgotten |= {digest for who in requesters for digest in self.by_requester.get(who, ())}
+        left = self
+        for digest in forgotten:
+            left = left.replace(digest, None)
+        return left, tuple(sorted(forgotten))
+
+
+def _minute(moment: datetime) -> str:
+    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
+
+
+def _added(index: _Index, key: str, digest: str) -> _Index:
+    return index.insert(key, index.get(key, HashTrieSet()).insert(digest))
+
+
+def _removed(index: _Index, key: str, digest: str) -> _Index:
+    left = index[key].remove(digest)
+    return index.insert(key, left) if left else index.remove(key)
+
+
+def path_of(digest: str) -> str:
+    """Return the path of a shutdown's file."""
+    return f"{SHUTDOWNS_ROOT}/{digest[:2]}/{digest}.yaml"
+
+
+def digest_in(path: str) -> str:
+    """Return the digest that the path of a shutdown's file names."""
+    return path.rsplit("/", 1)[-1].removesuffix(".yaml")
+
+
+def text_of(shutdown: RecentShutdown) -> str:
+    """Return the text of a shutdown's file."""
+    return strict_yaml.dump(
+        {
+            "apiVersion": LEDGER_API_VERSION,
+            "kind": "Shutdown",
+            "digest": shutdown.digest,
+            "request": shutdown.request,
+            "requesters": list(shutdown.requesters),
+            "at": format_timestamp(shutdown.at),
+        }
+    )
+
+
+class _ShutdownFile(FrozenModel):
+    apiVersion: Literal["demandops.ledger/v2"]
+    kind: Literal["Shutdown"]
+    digest: str
+    request: str
+    requesters: tuple[str, ...] = Field(min_length=1, strict=False)
+    at: Timestamp
+
+
+def read(text: str, path: str) -> RecentShutdown | None:
+    """Return the shutdown in a file, or ``None`` if the file is not valid."""
+    try:
+        file = parse_file(_ShutdownFile, text, path)
+    except InvalidInput:
+        return None
+    found = RecentShutdown(file.digest, file.request, file.requesters, parse_timestamp(file.at))
+    return found if path == path_of(file.digest) else None
+
+
+def read_all(files: Mapping[str, str]) -> RecentShutdowns:
+    """Return the shutdowns in these files, path → text."""
+    found = [one for path, text in files.items() if (one := read(text, path))]
+    shutdowns = RecentShutdowns()
+    for one in sorted(found, key=lambda one: one.at):
+        shutdowns = shutdowns.replace(one.digest, one)
+    return shutdowns

@@ -1,0 +1,150 @@
+"""New objects of a state repo: in memory until one pack makes them durable.
+
+A pack costs a few syncs, however many commits a batch has; loose objects cost some for each object.
+The pack holds every object that its commits need and their parent lacks, also those that the repo
+has already: a loose object may not be on the disk yet, or about to be pruned.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pygit2
+from pygit2 import Oid, PackBuilder, Repository
+from pygit2.enums import ObjectType
+
+_TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
+_LAST = 0
+"""The priority of the memory. It is asked last, because most objects that are read are not new."""
+
+UNFINISHED = "demandops-pack-"
+"""The prefix of the folders in which packs are built."""
+_REASON = "demandops moves a reference to these objects\n"
+
+Entries = dict[bytes, tuple[bytes, bytes]]
+"""A folder: name → mode and the raw id of the object."""
+
+
+class NewObjects(pygit2.OdbBackend):
+    """The objects that were written but not packed yet; the repository reads them like others."""
+
+    def __init__(self, repo: Repository) -> None:
+        super().__init__()
+        self.repo = repo
+        self._known: dict[Oid, tuple[ObjectType, bytes]] = {}
+        repo.odb.add_backend(self, _LAST)
+
+    def add(self, kind: ObjectType, data: bytes) -> Oid:
+        """Keep an object and return its id."""
+        header = b"%s %d\0" % (_TYPES[kind], len(data))
+        oid = Oid(raw=hashlib.sha1(header + data).digest())  # noqa: S324 - Git's object ids
+        self._known[oid] = (kind, data)
+        return oid
+
+    def forget(self) -> None:
+        """Drop what is not packed."""
+        self._known.clear()
+
+    @contextmanager
+    def packed(self, commit: Oid) -> Iterator[None]:
+        """Write the new objects that a commit needs as one pack, synced.
+
+        Within the block git's housekeeping keeps the pack, although no reference leads to it yet.
+        The pack is placed before its index, because git removes an index without a pack.
+        """
+        needed = self._needed_by(commit)
+        if not needed:
+            yield
+            return
+        packs = Path(self.repo.path) / "objects" / "pack"
+        with TemporaryDirectory(dir=self.repo.path, prefix=UNFINISHED) as folder:
+            built = self._build_pack(folder, needed)
+            placed = packs / built.name
+            keep = placed.with_suffix(".keep")
+            keep.write_text(_REASON)
+            try:
+                built.replace(placed)
+                built.with_suffix(".idx").replace(placed.with_suffix(".idx"))
+                sync_folder(packs)
+                for oid in needed:
+                    del self._known[oid]
+                yield
+            finally:
+                keep.unlink(missing_ok=True)
+
+    def _build_pack(self, folder: str, needed: list[Oid]) -> Path:
+        """Build a pack and its index; libgit2 syncs both, and raises if that fails."""
+        builder = PackBuilder(self.repo)
+        builder.set_threads(1)
+        for oid in needed:
+            builder.add(oid)
+        builder.write(folder)
+        (pack,) = Path(folder).glob("*.pack")
+        return pack
+
+    def _needed_by(self, commit: Oid) -> list[Oid]:
+        needed, queue = dict[Oid, None](), [commit]
+        while queue:
+            oid = queue.pop()
+            if oid in needed or oid not in self._known:
+                continue
+            needed[oid] = None
+            kind, data = self._known[oid]
+            if kind is ObjectType.COMMIT:
+                found = self.repo[oid].peel(pygit2.Commit)
+                queue += [found.tree_id, *found.parent_ids]
+            elif kind is ObjectType.TREE:
+                queue += [Oid(raw=raw) for _, raw in entries_of(data).values()]
+        return list(needed)
+
+    # ---- what libgit2 calls ----
+
+    def __iter__(self) -> Iterator[Oid]:
+        """Iterate over the ids of the new objects."""
+        return iter(self._known)
+
+    def exists_cb(self, oid: Oid) -> bool:
+        """Return whether this is a new object."""
+        return oid in self._known
+
+    def read_cb(self, oid: Oid) -> tuple[int, bytes]:
+        """Return the type and the content of a new object."""
+        return self._known[oid]
+
+    def read_header_cb(self, oid: Oid) -> tuple[int, int]:
+        """Return the type and the size of a new object."""
+        kind, data = self._known[oid]
+        return kind, len(data)
+
+    def read_prefix_cb(self, oid: Oid) -> tuple[int, bytes, Oid]:
+        """Return type, content and id of a new object; only full ids are looked up."""
+        kind, data = self._known[oid]
+        return kind, data, oid
+
+    def refresh_cb(self) -> None:
+        """Do nothing: memory is always current."""
+
+
+def entries_of(data: bytes) -> Entries:
+    """Return the entries of a tree object."""
+    entries, start = Entries(), 0
+    while start < len(data):
+        space = data.index(b" ", start)
+        end = data.index(b"\0", space) + 1
+        entries[data[space + 1 : end - 1]] = (data[start:space], data[end : end + 20])
+        start = end + 20
+    return entries
+
+
+def sync_folder(folder: Path) -> None:
+    """Sync a folder, so that the names of its files are on the disk."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

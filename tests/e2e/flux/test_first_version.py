@@ -1,0 +1,42 @@
+"""A state repo that the first version wrote is upgraded while its services run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.e2e.common import expected
+from tests.e2e.common.staterepo import demandops
+from tests.e2e.rig.cluster import Rig
+from tests.kit.repo import first_version
+
+from .conftest import CLUSTER, MakeWorld
+
+URL = "https://git.example/fleet/state-repo.git"
+
+
+def test_an_upgrade_from_the_first_version_restarts_no_pod(
+    make_world: MakeWorld, rig: Rig, tmp_path: Path
+) -> None:
+    world = make_world()
+    old = first_version(tmp_path / "first.git", "three-joins").files()
+    url = rig.git_url(world.name)
+    laid_down = {path: None for path in world.person.git("ls-files").split("\n") if path}
+    files = {path: text.replace(URL, url) for path, text in old.items()}
+    world.push(laid_down | files, "As the first version left it")
+    domain = world.bootstrap(CLUSTER, rig)
+    domain.wait_lines(expected.after(3))
+    domain.wait_releases()
+    before = domain.pods()
+    assert before
+
+    demandops(world.folder, "upgrade", "--state-repo", world.push_url)
+    domain.wake()
+    domain.wait_applied(world.tip())
+    domain.wait_releases()
+    assert domain.pods() == before
+    (fusion,) = domain.find("HelmRelease", expected.FUSION)
+    assert fusion["metadata"]["labels"]["app.kubernetes.io/part-of"] == "object-detection-fusion"
+
+    world.generator.start()
+    world.step(4, expected.after(4))
+    world.step(5, expected.after(5))
