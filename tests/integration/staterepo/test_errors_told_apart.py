@@ -112,11 +112,10 @@ def _with_nonsense_encoding(bare: Path) -> None:
     repo.references["refs/heads/main"].set_target(made)
 
 
-def _with_a_missing_file(bare: Path) -> None:
+def _with_entry_in_overrides(bare: Path, name: bytes, blob: pygit2.Oid) -> None:
     repo = pygit2.Repository(str(bare))
     tree = repo.TreeBuilder(repo[tip(bare)].peel(pygit2.Tree))
-    raw = b"100644 gone.yaml\0" + b"\x11" * 20
-    made = repo.write(pygit2.enums.ObjectType.TREE, raw)
+    made = repo.write(pygit2.enums.ObjectType.TREE, b"100644 %s\0%s" % (name, blob.raw))
     tree.insert("overrides", made, pygit2.enums.FileMode.TREE)
     by = pygit2.Signature("Petra", "petra@example.org", 1_770_000_000, 0)
     repo.create_commit("refs/heads/main", by, by, "By hand", tree.write(), [tip(bare)])
@@ -128,7 +127,7 @@ def test_a_tip_that_cannot_be_read_is_told_once_and_tried_again_with_pauses(
     with rig.running(bare, fetch_interval=0.01) as generator:
         rig.book(generator, goal(1))
         good = tip(bare)
-        _with_a_missing_file(bare)
+        _with_entry_in_overrides(bare, b"gone.yaml", pygit2.Oid(raw=b"\x11" * 20))
         rig.wait_until(lambda: generator.failures, "the failure is shown")
         assert list(generator.failures) == ["writer"]
         with pytest.raises(StateRepoError, match="internal error of the generator: KeyError"):
@@ -145,6 +144,14 @@ def test_a_commit_in_an_unknown_encoding_is_like_any_other(bare: Path) -> None:
         rig.book(generator, goal(1))
         _with_nonsense_encoding(bare)
         assert rig.book(generator, goal(2))[0].outcome == "booked"
+
+
+def test_a_file_whose_name_is_no_text_holds_back_itself_alone(bare: Path, person: Person) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        _with_entry_in_overrides(bare, b"\xff.yaml", pygit2.Repository(str(bare)).create_blob(b"x"))
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+        assert {fault.file for fault in generator.snapshot.problems} == {"overrides/\ufffd.yaml"}
 
 
 # ---- a damaged clone ----
