@@ -37,7 +37,7 @@ class RemoteMonitor:
         """Record that the remote cannot be reached; warn if it could be before."""
         since = self.status.unreachable_since
         if since is None:
-            log.warning("%s; trying again", reason)
+            log.warning("%s; trying again until it is back", reason)
         else:
             log.debug("%s", reason)
         since = since or self._runtime.now()
