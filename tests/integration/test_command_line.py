@@ -284,7 +284,7 @@ class TestRequest:
             "unchanged",
             "refused",
             "released",
-            "refused",
+            "unchanged",
         ]
         assert all(list(row) == REQUEST_KEYS for row in ran.json())
         assert (ran.code, state.tip) == (1, before)

@@ -343,9 +343,9 @@ def test_a_symbolic_link_is_not_followed(
 def test_the_check_of_another_render_version_says_so(
     branch: Path, check: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checking, "RENDER_VERSION", 2)
+    monkeypatch.setattr(checking, "RENDER_VERSION", 3)
     assert check()[2] == (
-        "error: demandops.yaml: renderVersion: is 1, but this program renders version 2; check "
+        "error: demandops.yaml: renderVersion: is 2, but this program renders version 3; check "
         "with the generator's version of the program, or run `demandops upgrade` to render "
         "everything again\n"
     )
