@@ -7,9 +7,13 @@ faults that were found together, so that a person can fix a file or a request in
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+
+MOST_FAULTS = 100
+"""The faults of one file, or of a request, that are told; the others are counted."""
+_LONGEST_FIELD, _LONGEST_MESSAGE = 2_000, 4_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +47,33 @@ class InvalidInput(DemandOpsError):
     """Raised when something that a person wrote is invalid; nothing was changed."""
 
     def __init__(self, faults: Iterable[Fault]) -> None:
-        self.faults = tuple(faults)
+        self.faults = tuple(_fewer(faults))
         super().__init__("\n".join(str(fault) for fault in self.faults))
 
     @classmethod
     def at(cls, field: str, message: str, *, code: str = "invalid", file: str = "") -> InvalidInput:
         """Return the error with one fault."""
         return cls([Fault(code, field, message, file)])
+
+
+def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
+    """Yield the first faults of each file, shortened, and how many more it has."""
+    counts: dict[str, int] = {}
+    for fault in faults:
+        count = counts[fault.file] = counts.get(fault.file, 0) + 1
+        if count <= MOST_FAULTS:
+            yield replace(
+                fault,
+                field=_shortened(fault.field, _LONGEST_FIELD),
+                message=_shortened(fault.message, _LONGEST_MESSAGE),
+            )
+    for file, count in counts.items():
+        if count > MOST_FAULTS:
+            yield Fault("more", "", f"has {count - MOST_FAULTS} more faults", file)
+
+
+def _shortened(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
 
 
 class Refused(InvalidInput):
@@ -81,6 +105,13 @@ class NotReached(DemandOpsError):
 
 class ShuttingDown(DemandOpsError):
     """Raised when a demand arrives while the generator stops."""
+
+
+class Unsound(DemandOpsError):
+    """Raised when going on could lose or double a demand: nobody is answered, the process ends.
+
+    Its exit code is 3. The next start goes by the journal.
+    """
 
 
 class QueueFull(DemandOpsError):
