@@ -11,18 +11,21 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib import import_module
-from multiprocessing import get_context
+from multiprocessing import current_process, get_context
 from pathlib import Path
+from typing import Any
 
-from tests.faults import injection
-from tests.faults.injection import Job, Result
+from tests.faults import disk, injection, power_loss
+from tests.faults.injection import Result
 from tests.faults.rig import Rig
 
 WORKERS = 2
 OUT = Path(__file__).parents[2] / "build" / "faults.json"
-_RIGS: dict[bool, Rig] = {}
+_RIGS: dict[tuple[bool, bool], Rig] = {}
+_FOLDER, _SHORT = Path(), True
 _IMPORTED = (
     "demandops.service",
     *(f"demandops.cli.{name}" for name in ("actions.request", "repo.init", "repo.verify")),
@@ -30,42 +33,81 @@ _IMPORTED = (
 )
 
 
+@dataclass(frozen=True)
+class _Task:
+    """One part of the work; ``what`` are the arguments of its function."""
+
+    part: str
+    remote: bool
+    what: tuple[Any, ...] = ()
+
+
 def main() -> int:
     """Run the parts and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--long", action="store_true", help="every call, and every fault at it")
-    parser.add_argument("--only", default="", help="only calls and files that contain this text")
+    parser.add_argument("--only", default="", help="only tasks whose text contains this")
     chosen = parser.parse_args()
     for name in _IMPORTED:
         import_module(name)
     began = time.monotonic()
+    results: list[Result] = []
     with tempfile.TemporaryDirectory(prefix="demandops-faults-") as folder:
-        results = list(_injected(Path(folder), short=not chosen.long, only=chosen.only))
+        tasks = [each for each in _tasks(Path(folder), chosen.long) if chosen.only in str(each)]
+        print(f"{len(tasks)} tasks", flush=True)
+        start = (Path(folder), not chosen.long)
+        with get_context("fork").Pool(WORKERS, _start, start) as pool:
+            for found in pool.imap_unordered(_run, tasks):
+                results += found
     _report(results, time.monotonic() - began)
     return int(any(result.problems for result in results))
 
 
-def _injected(folder: Path, *, short: bool, only: str) -> Iterable[Result]:
-    jobs: list[Job] = []
+def _tasks(folder: Path, long: bool) -> Iterator[_Task]:
+    """Yield all that there is to do, the longest tasks first."""
+    mounts = disk.may_mount()
+    if not mounts:
+        print("a full disk is not tried: only root can mount a small one")
     for remote in (False, True):
+        if long or not remote:
+            yield _Task("power", remote)
+        yield _Task("damage", remote)
+        for blocks in (range(0, 40, 2) if long else (0, 3, 6)) if mounts else ():
+            yield _Task("full", remote, ("home", blocks))
+            if not remote:
+                yield _Task("full", remote, ("state.git", blocks))
         rig = Rig(folder / f"plan-{remote}", remote=remote)
-        jobs += injection.jobs(injection.sites(rig), remote=remote, short=short)
-    jobs = [job for job in jobs if only in f"{job.remote} {job.site} {job.fault}"]
-    print(f"{len(jobs)} faults to inject", flush=True)
-    with get_context("fork").Pool(WORKERS, _start, (folder,)) as pool:
-        yield from pool.imap_unordered(_run, jobs)
+        sites = injection.sites(rig)
+        syncs = [each for each in sites if each.role == "demandops-writer" and each.kind == "fsync"]
+        if not remote:
+            yield from (_Task("failed sync", False, (each.n,)) for each in syncs if each.n > 1)
+        for job in injection.jobs(sites, remote=remote, short=not long):
+            yield _Task("injection", remote, (job,))
 
 
-def _start(folder: Path) -> None:
-    from multiprocessing import current_process
-
-    for remote in (False, True):
-        name = f"{current_process().name}-{remote}"
-        _RIGS[remote] = Rig(folder / name, remote=remote)
+def _start(folder: Path, short: bool) -> None:
+    global _FOLDER, _SHORT  # noqa: PLW0603 - of this worker process
+    _FOLDER, _SHORT = folder / current_process().name, short
 
 
-def _run(job: Job) -> Result:
-    return injection.run(_RIGS[job.remote], job)
+def _run(task: _Task) -> list[Result]:
+    key = (task.part == "damage", task.remote)
+    if key not in _RIGS:
+        _RIGS[key] = Rig(_FOLDER / str(key), remote=task.remote)
+        if key[0]:
+            disk.interrupted(_RIGS[key])
+    rig = _RIGS[key]
+    match task.part:
+        case "power":
+            return list(power_loss.run(rig))
+        case "failed sync":
+            return [power_loss.failed_sync(rig, *task.what)]
+        case "damage":
+            return list(disk.damage(rig, short=_SHORT))
+        case "full":
+            name, blocks = task.what
+            return [disk.full(rig, rig.folder / name, blocks)]
+    return [injection.run(rig, *task.what)]
 
 
 def _report(results: list[Result], seconds: float) -> None:
@@ -82,7 +124,7 @@ def _report(results: list[Result], seconds: float) -> None:
         for problem in result.problems:
             print(f"VIOLATED {result.part} {' '.join(result.where)} {result.fault}: {problem}")
     wrong = sum(bool(result.problems) for result in results)
-    print(f"{len(results)} faults, {wrong} with a violation, {seconds:.0f} s")
+    print(f"{len(results)} faults and states, {wrong} with a violation, {seconds:.0f} s")
 
 
 if __name__ == "__main__":

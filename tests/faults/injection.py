@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -150,10 +151,10 @@ def run(rig: Rig, job: Job) -> Result:
     part = "remote" if job.remote else "local"
     if not any(each.file == site.file for each in hit):
         return Result(part, where, job.fault, ("not reached",))
-    number = getattr(__import__("errno"), job.fault, 0)
-    told = (os.strerror(number), "disk", "damaged")
+    number = getattr(errno, job.fault, 0)
+    told = (os.strerror(number), "no room", "not a Git repository")
     own = not command.startswith("git") and ">" not in site.role and command == site.role
     unsound = own and site.kind in SYNCS and job.fault == "EIO" and "stop" not in site.role
     problems = list(after_fault(ran, told, unsound=unsound))
-    problems += after_restart(rig, ran, acknowledged=bool(ran.commit))
+    problems += after_restart(rig, ran)
     return Result(part, where, job.fault, tuple(problems))

@@ -41,10 +41,12 @@ def after_fault(ran: Ran, told: tuple[str, ...], *, unsound: bool) -> Iterator[s
         yield "does not say what is wrong"
 
 
-def after_restart(rig: Rig, ran: Ran | None, *, acknowledged: bool) -> Iterator[str]:
+def after_restart(rig: Rig, ran: Ran, *, journaled: bool = False) -> Iterator[str]:
     """Book another demand in a fresh process, and yield what is wrong with the state repo.
 
-    ``ran`` is the process that the fault met, if it had an outcome of its own.
+    Args:
+        ran: the process that the fault met.
+        journaled: the demand is in the journal, so it must be booked.
     """
     found = rig.book(NEXT, limit=15.0)
     if not found.commit:
@@ -55,11 +57,11 @@ def after_restart(rig: Rig, ran: Ran | None, *, acknowledged: bool) -> Iterator[
     times = len(booked.get(DEMAND, []))
     if times > 1:
         yield f"booked {times} times"
-    if acknowledged and not times:
+    if journaled and not times:
+        yield "journaled and missing"
+    if ran.commit and not includes(rig, ran.commit):
         yield "acknowledged and missing"
-    if ran is not None and ran.commit and not includes(rig, ran.commit):
-        yield "the acknowledged commit is missing"
-    if ran is not None and times and '"refused"' in ran.out:
+    if times and '"refused"' in ran.out:
         yield "refused and booked"
     for number in (0, NEXT):
         if len(booked.get(number, [])) != 1:

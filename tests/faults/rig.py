@@ -108,9 +108,7 @@ class Rig:
         command = ("request", str(file), "--state-repo", self.address, "--output", "json")
         return self.demandops(*command, strace=strace, limit=limit)
 
-    def demandops(
-        self, *command: str, strace: Strace | None = None, limit: float = 60.0
-    ) -> Ran:
+    def demandops(self, *command: str, strace: Strace | None = None, limit: float = 60.0) -> Ran:
         """Run a command in a process of its own."""
         paths = {name: self.scratch / name for name in ("out", "err", "trace", "once")}
         for path in paths.values():
@@ -209,9 +207,7 @@ def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
     return tracer
 
 
-def _become(
-    command: Sequence[str], out: Path, err: Path, tell: int, waits: int
-) -> None:
+def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int) -> None:
     """Run the command line in this forked process, and end."""
     from demandops.cli import main
 
@@ -223,9 +219,10 @@ def _become(
         sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: PTH123, SIM115
 
         def begin(name: str) -> None:
+            if select.select([waits], [], [], 0)[0]:
+                os.read(waits, 1)  # of the thread before: strace must count no read of this one
             os.write(tell, f"{name} {threading.get_native_id()}\n".encode())
             select.select([waits], [], [])
-            os.read(waits, 1)
             with suppress(OSError):
                 os.stat(BEGIN)
 

@@ -54,9 +54,7 @@ def file_class(path: str, root: Path) -> str:
     return name
 
 
-def parse(
-    text: str, roles: dict[int, str], root: Path, folder: str = "/"
-) -> list[Call]:
+def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> list[Call]:
     """Return the calls that touch a file below ``root``, in the order in which they ended.
 
     ``roles`` names the threads; a process that executes a program is called after it. The first
