@@ -86,7 +86,7 @@ def _tasks(folder: Path, long: bool) -> Iterator[_Task]:
 
 
 def _start(folder: Path, short: bool) -> None:
-    global _FOLDER, _SHORT  # noqa: PLW0603 - of this worker process
+    global _FOLDER, _SHORT
     _FOLDER, _SHORT = folder / current_process().name, short
 
 

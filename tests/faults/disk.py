@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from tests.faults.invariants import DEMAND, NEXT, after_fault, after_restart
 from tests.faults.rig import Ran, Rig, Strace
 from tests.faults.trace import file_class
 
+_UNREAD = re.compile(r"\.git/(hooks/|info/|description|FETCH_HEAD)")
 _BLOCK = 4096
 _SIZE = 4 << 20
 _OWN_MOUNTS = 0x20000  # CLONE_NEWNS
@@ -73,7 +75,7 @@ def damage(rig: Rig, *, short: bool) -> Iterator[Result]:
     classes: dict[str, Path] = {}
     for path in sorted(rig.folder.rglob("*")):
         name = file_class(str(path), rig.folder)
-        if path.is_file() and not name.startswith(("state.git/hooks/", "state.git/info/")):
+        if path.is_file() and not _UNREAD.search(name):
             if rig.remote and name.startswith("state.git/"):
                 continue
             if path.stat().st_size:

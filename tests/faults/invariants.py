@@ -66,7 +66,7 @@ def after_restart(rig: Rig, ran: Ran, *, journaled: bool = False) -> Iterator[st
     for number in (0, NEXT):
         if len(booked.get(number, [])) != 1:
             yield f"demand {number} is booked {len(booked.get(number, []))} times"
-    yield from _state(rig, {number for number in booked})
+    yield from _state(rig, set(booked))
 
 
 def _state(rig: Rig, numbers: set[int]) -> Iterator[str]:
@@ -87,8 +87,10 @@ def _state(rig: Rig, numbers: set[int]) -> Iterator[str]:
             text=True,
             check=False,
         )
-        if checked.returncode or checked.stdout or checked.stderr:
-            yield f"git fsck: {(checked.stdout + checked.stderr).strip()}"
+        lines = (checked.stdout + checked.stderr).splitlines()
+        told = [line for line in lines if not line.startswith("notice: ")]
+        if checked.returncode or told:
+            yield f"git fsck: {' '.join(told)}"
         for pattern in _LEFTOVERS:
             yield from (f"left over: {_named(path)}" for path in folder.glob(pattern))
 

@@ -207,7 +207,7 @@ class Disk:
 
 
 def run(rig: Rig) -> Iterator[Result]:
-    """Book a demand, lose power at each of its syncs and at its end, and yield what became of it."""
+    """Book a demand, lose power at each sync and at the end, and yield what became of it."""
     rig.restore()
     disk = Disk(rig.folder, always_safe=str(rig.state) if rig.remote else "")
     ran = rig.must(rig.book(DEMAND, Strace(_TRACE)))

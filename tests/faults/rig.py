@@ -216,7 +216,7 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
         os.setsid()
         for path, number in ((out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: PTH123, SIM115
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
 
         def begin(name: str) -> None:
             if select.select([waits], [], [], 0)[0]:
@@ -224,7 +224,7 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
             os.write(tell, f"{name} {threading.get_native_id()}\n".encode())
             select.select([waits], [], [])
             with suppress(OSError):
-                os.stat(BEGIN)
+                Path(BEGIN).stat()
 
         run: Callable[[threading.Thread], None] = threading.Thread.run
 

@@ -135,7 +135,7 @@ def _paths(arguments: str, folder: str) -> list[str]:
     first = arguments.lstrip()
     if first.startswith('"'):
         return [each if each.startswith("/") else f"{folder}/{each}" for each in named[:2]]
-    if first.startswith("AT_FDCWD") or re.match(r'\d+<[^>]*>, "', first) and _is_at(arguments):
+    if first.startswith("AT_FDCWD") or (re.match(r'\d+<[^>]*>, "', first) and _is_at(arguments)):
         base = annotated[0] if annotated else folder
         return [each if each.startswith("/") else f"{base}/{each}" for each in named[:2]]
     return [each for each in annotated if each.startswith("/")]

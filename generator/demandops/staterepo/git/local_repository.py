@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from pygit2 import Oid, Repository
 
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
-from demandops.staterepo.git.new_objects import NewObjects
+from demandops.staterepo.git.new_objects import NewObjects, sync_folder
 from demandops.staterepo.git.repository import MAIN, StateRepository, Unavailable, disk_error
 
 _STALE_LOCK_S = 5.0
@@ -34,7 +35,23 @@ class LocalRepository(StateRepository):
             raise StateRepoError(
                 f"{path} is not a Git repository; make one with `demandops init {path} --bare`"
             ) from None
+        borrowed = Path(self.objects.path) / "objects" / "info" / "alternates"
+        if borrowed.exists():
+            raise StateRepoError(
+                f"{path} borrows objects of another repository, which may remove them; copy them "
+                f"with `git -C {path} repack -a -d`, then remove {borrowed}"
+            )
         self.new = NewObjects(self.objects)
+        self.new.clean()
+        try:
+            self._require_branch(path)
+        except (pygit2.GitError, KeyError) as error:
+            raise disk_error(error, self.address) or StateRepoError(
+                f"{path} is damaged: {error}; `git -C {path} fsck` lists what is broken, restore "
+                "it from a backup or from a clone"
+            ) from None
+
+    def _require_branch(self, path: Path) -> None:
         if MAIN not in self.objects.references:
             raise StateRepoError(
                 f"{path} has no branch '{MAIN_BRANCH}'; make a state repo with "
@@ -45,6 +62,7 @@ class LocalRepository(StateRepository):
                 f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
                 f"use a bare clone: git clone --bare {path} {path}.git"
             )
+        _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         """Return the tip, which is always current."""
@@ -67,6 +85,23 @@ class LocalRepository(StateRepository):
                 raise Unavailable(f"{self.address} cannot be written: {error}") from None
             return False  # another writer holds the lock or was first: evaluate again
         return True
+
+    def write_anew(self, since: str) -> None:
+        """Write the commits after ``since`` and the branch to new files, and sync these."""
+        branch = Path(self.objects.path) / MAIN
+        lock = branch.with_name(f"{branch.name}.lock")
+        try:
+            with self.new.packed_anew(self.tip(), since), lock.open("x") as file:
+                file.write(f"{self.tip()}\n")
+                file.flush()
+                os.fsync(file.fileno())
+                lock.replace(branch)
+                sync_folder(branch.parent)
+        except (pygit2.GitError, OSError) as error:
+            self._break_stale_lock()
+            raise disk_error(error, self.address) or Unavailable(
+                f"{self.address} cannot be written: {error}"
+            ) from None
 
     def _break_stale_lock(self) -> None:
         """Remove the branch's lock if a killed process left it.

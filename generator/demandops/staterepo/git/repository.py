@@ -122,6 +122,12 @@ class StateRepository(ABC):
         Unsound if nobody knows whether it was.
         """
 
+    def write_anew(self, since: str) -> None:  # noqa: B027 - a remote's answer was its promise
+        """Make durable what was published after the commit ``since``, whatever became of it before.
+
+        Raises Unavailable, PushDenied or Unsound if that fails.
+        """
+
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``commit`` is ``other`` or a descendant; false if one is not here.
 
