@@ -10,6 +10,7 @@ import json
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -91,6 +92,14 @@ def _start(folder: Path, short: bool) -> None:
 
 
 def _run(task: _Task) -> list[Result]:
+    try:
+        return _results(task)
+    except Exception as error:  # the other tasks' results must not be lost
+        traceback.print_exc()
+        return [Result(task.part, (str(task.what), "", ""), "", (f"not tried: {error!r}",))]
+
+
+def _results(task: _Task) -> list[Result]:
     key = (task.part == "damage", task.remote)
     if key not in _RIGS:
         _RIGS[key] = Rig(_FOLDER / str(key), remote=task.remote)

@@ -72,16 +72,15 @@ def interrupted(rig: Rig) -> None:
 def damage(rig: Rig, *, short: bool) -> Iterator[Result]:
     """Flip and cut bytes of each class of file, and start again."""
     rig.restore()
-    classes: dict[str, Path] = {}
+    classes: dict[str, tuple[Path, int]] = {}
     for path in sorted(rig.folder.rglob("*")):
         name = file_class(str(path), rig.folder)
         if path.is_file() and not _UNREAD.search(name):
             if rig.remote and name.startswith("state.git/"):
                 continue
             if path.stat().st_size:
-                classes[name] = path
-    for name, path in classes.items():
-        size = path.stat().st_size
+                classes[name] = path, path.stat().st_size
+    for name, (path, size) in classes.items():
         places = {0: "the first", size // 2: "a middle", size - 1: "the last"}
         for place, title in places.items():
             yield _damaged(rig, path, name, place, f"{title} byte is changed")
@@ -105,7 +104,7 @@ def _damaged(rig: Rig, path: Path, name: str, place: int, title: str) -> Result:
     if ran.code and mendable:
         problems.append(f"not mended: {ran.err.strip()[-200:]}")
     if not ran.code and (mendable or "outbox" in name):
-        problems += after_restart(rig, Ran(0, "", ""))
+        problems += after_restart(rig, Ran(0, "", ""), clones=False)
     return Result(
         "damage, remote" if rig.remote else "damage", (name, title, ""), "", tuple(problems)
     )

@@ -42,6 +42,8 @@ _NEED_ROOM = {
 }  # fmt: skip
 _INTERRUPTIBLE = {"flock", "fsync", "open", "openat", "pread64", "pwrite64", "read", "write"}
 KILL = "SIGKILL"
+_SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
+"""What the short form tries, without and with a remote."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +105,9 @@ def _site(call: Call, rig: Rig) -> Site:
 
 
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
-    """Return every fault at every call; if ``short``, at the first and last call of each class.
+    """Return every fault at every call; if ``short``, at the last call of each class.
 
-    Calls that only read meet fewer faults then, and those of git at a remote fewer still.
+    Calls that only read meet fewer faults then. Those of git and at a remote fewer still.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
@@ -118,13 +120,14 @@ def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
         if short and remote and (">" in group[0].role or not group[0].changes):
             continue
         if short:
-            chosen = list(dict.fromkeys((group[0], group[-1]))) if group[0].changes else group[-1:]
+            is_sync = group[0].kind in SYNCS and not remote
+            chosen = list(dict.fromkeys((group[0], group[-1]))) if is_sync else group[-1:]
         for site in chosen:
             faults = site.faults()
             if short and not site.changes:
                 faults = ["EIO"]
-            elif short and remote:
-                faults = [each for each in faults if each in ("EIO", KILL)]
+            elif short:
+                faults = [each for each in faults if each in _SHORT[remote]]
             made += [Job(remote, site, fault) for fault in faults]
     return made
 

@@ -41,12 +41,15 @@ def after_fault(ran: Ran, told: tuple[str, ...], *, unsound: bool) -> Iterator[s
         yield "does not say what is wrong"
 
 
-def after_restart(rig: Rig, ran: Ran, *, journaled: bool = False) -> Iterator[str]:
+def after_restart(
+    rig: Rig, ran: Ran, *, journaled: bool = False, clones: bool = True
+) -> Iterator[str]:
     """Book another demand in a fresh process, and yield what is wrong with the state repo.
 
     Args:
         ran: the process that the fault met.
         journaled: the demand is in the journal, so it must be booked.
+        clones: the clones must be whole too.
     """
     found = rig.book(NEXT, limit=15.0)
     if not found.commit:
@@ -66,10 +69,10 @@ def after_restart(rig: Rig, ran: Ran, *, journaled: bool = False) -> Iterator[st
     for number in (0, NEXT):
         if len(booked.get(number, [])) != 1:
             yield f"demand {number} is booked {len(booked.get(number, []))} times"
-    yield from _state(rig, set(booked))
+    yield from _state(rig, set(booked), clones)
 
 
-def _state(rig: Rig, numbers: set[int]) -> Iterator[str]:
+def _state(rig: Rig, numbers: set[int], clones: bool) -> Iterator[str]:
     books = rig.demandops("bookkeeping", "--state-repo", str(rig.state), "--output", "json")
     if books.code:
         yield f"bookkeeping: {books.err.strip()}"
@@ -80,7 +83,7 @@ def _state(rig: Rig, numbers: set[int]) -> Iterator[str]:
     verified = rig.demandops("verify", "--state-repo", str(rig.state))
     if verified.code:
         yield f"verify: {(verified.out + verified.err).strip()}"
-    for folder in (rig.state, *rig.home.rglob("clone.git")):
+    for folder in (rig.state, *(rig.home.rglob("clone.git") if clones else ())):
         checked = subprocess.run(
             ["git", "-C", folder, "fsck", "--strict", "--no-dangling", "--no-progress"],
             capture_output=True,

@@ -121,6 +121,8 @@ class RemoteRepository(StateRepository):
             with repo.config_writer() as config:
                 config.set_value('remote "origin"', "url", self._url)
                 config.set_value("gc", "auto", 0)
+                # a fetch keeps its pack, which git syncs: libgit2 hangs on half a loose object
+                config.set_value("fetch", "unpackLimit", 1)
             partial.joinpath("config").chmod(0o600)
             self._fetch(repo, timeout=_CLONE_TIMEOUT_S)
         if self._folder.exists():
