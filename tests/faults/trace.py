@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -75,7 +76,7 @@ def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> li
         if "faults-begin" in arguments:
             counts = {key: n for key, n in counts.items() if key[0] != process}
         counts[process, kind] = n = counts.get((process, kind), 0) + 1
-        paths = _paths(arguments, folders.get(process, "/"))
+        paths = [os.path.normpath(path) for path in _paths(arguments, folders.get(process, "/"))]
         if kind == "execve" and result.startswith("0"):
             roles[process] = _program(arguments, roles.get(process, ""))
             if roles[process].startswith("git ") and " > " not in roles[process]:
