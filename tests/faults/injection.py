@@ -95,7 +95,7 @@ class Result:
 def sites(rig: Rig) -> list[Site]:
     """Book one demand under strace, and return its calls."""
     rig.restore()
-    ran = rig.must(rig.book(DEMAND, Strace(["-f", "-s", "16", "-e", EVERYTHING])))
+    ran = rig.must(rig.book(DEMAND, Strace(["-f", "-s", "64", "-e", EVERYTHING])))
     return [_site(call, rig) for call in parse(ran.trace, ran.roles, rig.folder)]
 
 
@@ -137,7 +137,7 @@ def run(rig: Rig, job: Job) -> Result:
     site = job.site
     happens = "signal=KILL" if job.fault == KILL else f"error={job.fault}"
     command = site.role.partition(" > ")[0]
-    options = ["-s16", "-e", f"inject={site.kind}:{happens}:when={site.n}", "-e"]
+    options = ["-s64", "-e", f"inject={site.kind}:{happens}:when={site.n}", "-e"]
     options.append(f"trace={site.kind},chdir,execve,clone,clone3,fork,vfork")
     rig.restore()
     folder = "/"
@@ -157,6 +157,7 @@ def run(rig: Rig, job: Job) -> Result:
     number = getattr(errno, job.fault, 0)
     told = (os.strerror(number), "no room", "not a Git repository")
     own = not command.startswith("git") and ">" not in site.role and command == site.role
+    own = own and (not job.remote or "outbox" in site.file)  # a push is the remote's promise
     unsound = own and site.kind in SYNCS and job.fault == "EIO" and "stop" not in site.role
     problems = list(after_fault(ran, told, unsound=unsound))
     problems += after_restart(rig, ran)

@@ -16,7 +16,7 @@ _FILE = re.compile(r"(?:AT_FDCWD|\d+)<((?:[^>\\]|\\.)*)>")
 _FORKS = ("clone", "clone3", "fork", "vfork")
 _RANDOM = (
     (re.compile(r"\b[0-9a-f]{2}/[0-9a-f]{38}\b"), "??/*"),
-    (re.compile(r"objects/[0-9a-f]{2}(?=/|$)"), "objects/??"),
+    (re.compile(r"(?<=/)[0-9a-f]{2}(?=/|$)"), "??"),
     (re.compile(r"(pack_git2_)[0-9a-f]+?(idx|rev|$)"), r"\1*\2"),
     (re.compile(r"(?<![a-z])[0-9a-f]{12,}"), "*"),
     (re.compile(r"(demandops-pack-|tmp_\w+?_|incoming-)\w+"), r"\1*"),
@@ -72,6 +72,10 @@ def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> li
             continue
         kind, arguments, result = match[1], match[2], match[3] + match[4]
         if kind in _FORKS:
+            child = int(match[3]) if match[3].isdigit() else 0
+            if roles.get(child, "?") == "?":
+                roles[child] = f"{roles.get(process, '?')} > ?"
+                folders[child] = folders.get(process, "/")
             continue
         if "faults-begin" in arguments:
             counts = {key: n for key, n in counts.items() if key[0] != process}
