@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +14,13 @@ from pygit2 import Oid, Repository
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git.new_objects import NewObjects, sync_folder
-from demandops.staterepo.git.repository import MAIN, StateRepository, Unavailable, disk_error
+from demandops.staterepo.git.repository import (
+    ENVIRONMENT,
+    MAIN,
+    StateRepository,
+    Unavailable,
+    disk_error,
+)
 
 _STALE_LOCK_S = 5.0
 """Git holds the lock of a branch for milliseconds; for so long only if its process was killed."""
@@ -46,10 +53,28 @@ class LocalRepository(StateRepository):
         try:
             self._require_branch(path)
         except (pygit2.GitError, KeyError) as error:
-            raise disk_error(error, self.address) or StateRepoError(
-                f"{path} is damaged: {error}; `git -C {path} fsck` lists what is broken, restore "
-                "it from a backup or from a clone"
-            ) from None
+            raise disk_error(error, self.address) or self._damaged(str(error)) from None
+
+    def _damaged(self, what: str) -> StateRepoError:
+        return StateRepoError(
+            f"{self.address} is damaged: {what}; `git -C {self.address} fsck` lists what is "
+            "broken, restore it from a backup or from a clone"
+        )
+
+    def renew_if_damaged(self) -> bool:
+        """Raise StateRepoError if git finds it damaged: nobody can make it anew."""
+        checked = subprocess.run(
+            ["git", "fsck", "--no-dangling", "--no-progress"],
+            cwd=self.objects.path,
+            env=os.environ | ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+        )
+        if checked.returncode:
+            raise self._damaged((checked.stderr + checked.stdout).strip().partition("\n")[0])
+        return False
 
     def _require_branch(self, path: Path) -> None:
         if MAIN not in self.objects.references:
