@@ -45,6 +45,9 @@ KILL = "SIGKILL"
 _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
 """What the short form tries, without and with a remote."""
 
+_HIDDEN = ("not a Git repository", "checked out")
+"""What is said if libgit2 takes a file that it cannot read for one that is not there."""
+
 
 @dataclass(frozen=True)
 class Site:
@@ -155,7 +158,7 @@ def run(rig: Rig, job: Job) -> Result:
     if not any(each.file == site.file for each in hit):
         return Result(part, where, job.fault, ("not reached",))
     number = getattr(errno, job.fault, 0)
-    told = (os.strerror(number), "no room", "not a Git repository")
+    told = (os.strerror(number), "no room", *_HIDDEN)
     own = not command.startswith("git") and ">" not in site.role and command == site.role
     own = own and (not job.remote or "outbox" in site.file)  # a push is the remote's promise
     unsound = own and site.kind in SYNCS and job.fault == "EIO" and "stop" not in site.role

@@ -57,6 +57,7 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NOT_ALLOWED = (errno.EACCES, errno.EPERM, errno.EROFS)
 _BROKEN = (errno.EIO, errno.EUCLEAN, errno.ENODEV, errno.ENXIO, errno.ESTALE)
 _TOLD = {os.strerror(number): number for number in (*_NO_ROOM, *_NOT_ALLOWED, *_BROKEN)}
+_TOLD["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objects/pack
 
 
 def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
