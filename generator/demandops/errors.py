@@ -11,14 +11,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 
+from demandops.quoting import one_line
+
 
 @dataclass(frozen=True, slots=True)
 class Fault:
     """One problem in an input.
 
     ``code`` is a stable word for programs (``unknown-node``). ``field`` is the path inside the
-    input (``apps[0].header.node_id``). ``message`` says what is wrong and how to fix it. ``file``
-    names the file, if the input is one.
+    input (``apps[0].header.node_id``). ``message`` says what is wrong and how to fix it, on one
+    line. ``file`` names the file, if the input is one.
     """
 
     code: str
@@ -26,9 +28,14 @@ class Fault:
     message: str
     file: str = ""
 
+    def __post_init__(self) -> None:
+        """Quote the message, which may name any value; ``file`` and ``field`` stay exact."""
+        object.__setattr__(self, "message", one_line(self.message))
+
     def __str__(self) -> str:
-        """Return ``file: field: message`` without the empty parts."""
-        return ": ".join(part for part in (self.file, self.field, self.message) if part)
+        """Return ``file: field: message`` on one line, without the empty parts."""
+        places = (one_line(place) for place in (self.file, self.field))
+        return ": ".join(part for part in (*places, self.message) if part)
 
     def within(self, file: str) -> Fault:
         """Return the same fault, located in ``file``."""
@@ -36,7 +43,11 @@ class Fault:
 
 
 class DemandOpsError(Exception):
-    """Base of every error that this program raises on purpose."""
+    """Base of every error that this program raises on purpose. Its text is one line."""
+
+    def __str__(self) -> str:
+        """Return the text, which may name any value, as one line."""
+        return one_line(super().__str__())
 
 
 class InvalidInput(DemandOpsError):
@@ -44,7 +55,11 @@ class InvalidInput(DemandOpsError):
 
     def __init__(self, faults: Iterable[Fault]) -> None:
         self.faults = tuple(faults)
-        super().__init__("\n".join(str(fault) for fault in self.faults))
+        super().__init__(self.faults)
+
+    def __str__(self) -> str:
+        """Return one line for each fault."""
+        return "\n".join(str(fault) for fault in self.faults)
 
     @classmethod
     def at(cls, field: str, message: str, *, code: str = "invalid", file: str = "") -> InvalidInput:
@@ -90,12 +105,6 @@ class QueueFull(DemandOpsError):
 def fault(field: str, message: str, *, code: str = "invalid") -> Fault:
     """Return a fault that is not in a file yet."""
     return Fault(code=code, field=field, message=message)
-
-
-def quoted(value: str, most: int = 80) -> str:
-    """Return foreign text for a message: quoted, printable, on one line and not too long."""
-    text = value if value.isprintable() else value.encode("unicode_escape").decode()
-    return f"'{text if len(text) <= most else text[: most - 1] + '…'}'"
 
 
 def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:

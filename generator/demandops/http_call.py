@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from demandops import __version__
-from demandops.errors import DemandOpsError, quoted
+from demandops.errors import DemandOpsError
+from demandops.quoting import quoted
 from demandops.runtime import REAL
 
 if TYPE_CHECKING:

@@ -21,8 +21,9 @@ from pydantic import (
 from pydantic.alias_generators import to_camel
 
 from demandops import strict_yaml
-from demandops.errors import Fault, InvalidInput, fault, quoted, suggestion
+from demandops.errors import Fault, InvalidInput, fault, suggestion
 from demandops.identifiers import control_character
+from demandops.quoting import quoted
 from demandops.settings import API_VERSION
 
 Model = TypeVar("Model", bound=BaseModel)
