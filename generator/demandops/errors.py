@@ -98,6 +98,13 @@ class ShuttingDown(DemandOpsError):
     """Raised when a demand arrives while the generator stops."""
 
 
+class Unsound(DemandOpsError):
+    """Raised when going on could lose or double a demand: nobody is answered, the process ends.
+
+    Its exit code is 3. The next start goes by the journal.
+    """
+
+
 class QueueFull(DemandOpsError):
     """Raised when the demand queue is full."""
 

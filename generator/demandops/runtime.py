@@ -4,10 +4,13 @@ The service and the cluster's watchers take a :class:`Runtime`. A test can pass 
 clock that it moves, numbers from a seed, and threads that take turns. An object with a state repo
 uses the repo's runtime. Commands, git's processes and locks, HTTP and ROS's executors always use
 :data:`REAL`.
+
+It also supervises the threads: none ends unseen.
 """
 
 from __future__ import annotations
 
+import logging
 import random
 import threading
 import time
@@ -15,11 +18,28 @@ import uuid
 from collections.abc import Callable
 from datetime import datetime, timezone
 
+from demandops.errors import DemandOpsError, Unsound
+
+log = logging.getLogger("demandops")
+
 Thread = threading.Thread
+
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
+_STEADY_S = 2 * _LONGEST_PAUSE_S
+"""A thread that runs for so long has recovered from its last failure."""
+_LONGEST_REASON = 300
 
 
 class Runtime:
-    """The runtime of this machine; a subclass overrides the methods that it replaces."""
+    """The runtime of this machine; a subclass overrides the methods that it replaces.
+
+    ``unsound`` is why the process must end, if it must; ``when_unsound`` is called then.
+    """
+
+    def __init__(self) -> None:
+        self._failures: dict[str, tuple[str, float]] = {}
+        self.unsound: Unsound | None = None
+        self.when_unsound: Callable[[], object] = lambda: None
 
     def now(self) -> datetime:
         """Return the time in UTC; a person may set this clock."""
@@ -58,6 +78,64 @@ class Runtime:
         thread = Thread(target=target, name=f"demandops-{name}", daemon=True)
         thread.start()
         return thread
+
+    # ---- supervision ----
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why threads failed that did not recover since, by their names."""
+        now = self.monotonic()
+        known = sorted(self._failures.items())
+        return {name: text for name, (text, at) in known if now - at < _STEADY_S}
+
+    def failed(self, name: str, error: Exception) -> None:
+        """Record that the work of a thread failed; log a new failure with its trace."""
+        is_known = self.failures.get(name) == _reason(error)
+        self._failures[name] = (_reason(error), self.monotonic())
+        if is_known:
+            log.debug("%s failed again: %s", name, _reason(error))
+        elif isinstance(error, DemandOpsError):
+            log.error("%s", error)
+        else:
+            log.error("internal error in %s: %s", name, _reason(error), exc_info=error)
+
+    def recovered(self, name: str) -> None:
+        """Record that the work of a thread succeeded."""
+        if self._failures.pop(name, None):
+            log.info("%s works again", name)
+
+    def keep_running(self, name: str, target: Callable[[], object]) -> Thread:
+        """Start a thread that is started again if it fails, after a pause that grows.
+
+        After :class:`Unsound` it is not: then the process must end.
+        """
+        return self.start_thread(name, lambda: self._supervise(name, target))
+
+    def _supervise(self, name: str, target: Callable[[], object]) -> None:
+        pause = _FIRST_PAUSE_S
+        while True:
+            began = self.monotonic()
+            try:
+                target()
+            except Unsound as error:
+                log.critical("%s; the process ends", error)
+                self.unsound = error
+                self.when_unsound()
+                return
+            except Exception as error:
+                self.failed(name, error)
+            else:
+                return
+            if self.monotonic() - began > _STEADY_S:
+                pause = _FIRST_PAUSE_S
+            self.sleep(pause)
+            pause = min(2 * pause, _LONGEST_PAUSE_S)
+
+
+def _reason(error: Exception) -> str:
+    """Return an error's text on one line."""
+    text = str(error) if isinstance(error, DemandOpsError) else repr(error)
+    return " ".join(text.split())[:_LONGEST_REASON]
 
 
 REAL = Runtime()

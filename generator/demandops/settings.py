@@ -31,6 +31,12 @@ DEFAULT_DEMAND_ACTION_NAME = "/demandops/demand"
 QUEUE_LIMIT = 10_000
 """The number of demands that may be queued; a further demand is rejected."""
 
+REQUESTER_QUEUE_LIMIT = 1_000
+"""The number of queued demands of one requester; a further demand is rejected."""
+
+PROPOSAL_LIMIT = 100
+"""The number of demands of one requester that may await approval; a further one is refused."""
+
 GENERATED_ROOTS = ("bootstrap", "clusters")
 """The top-level folders whose files are all rendered from ledger and configuration."""
 

@@ -30,6 +30,9 @@ def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # 
         response.ok = True
     except DemandOpsError as error:
         response.ok, response.message = False, str(error)
+    except Exception as error:  # whoever asks must get an answer
+        REAL.failed("bookkeeping", error)
+        response.ok, response.message = False, f"internal error: {error!r}; see the node's log"
     return response
 
 
@@ -59,7 +62,7 @@ class BookkeepingTopic:
         self._changed, self._closed = REAL.event(), REAL.event()
         self._changed.set()
         generator.on_publish(lambda config: self._changed.set())
-        REAL.start_thread("bookkeeping-topic", self._run)
+        REAL.keep_running("bookkeeping-topic", self._run)
 
     def close(self) -> None:
         """Stop publishing."""

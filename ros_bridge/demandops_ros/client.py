@@ -103,7 +103,7 @@ class DemandClient:
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._spinner = REAL.start_thread("client", self._executor.spin)
+        self._spinner = REAL.keep_running("client", self._executor.spin)
 
     def __enter__(self) -> DemandClient:
         """Return the client itself."""
@@ -249,7 +249,7 @@ class HeldDemand:
         """Put the demand and start to renew it."""
         lease_s = self._put_and_remember().lease_s
         if lease_s:
-            self._renewer = REAL.start_thread("lease", partial(self._renew_until_over, lease_s))
+            self._renewer = REAL.keep_running("lease", partial(self._renew_until_over, lease_s))
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:

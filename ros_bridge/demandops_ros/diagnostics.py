@@ -1,7 +1,7 @@
 """The node's status on ``/diagnostics``, for ROS 2's own tools.
 
-Publishes two statuses once a second: whether the state repo can be reached and written, and
-whether its configuration is valid.
+Publishes three statuses once a second: whether the state repo can be reached and written, whether
+its configuration is valid, and whether all parts of the generator work.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class Diagnostics:
     def _publish(self) -> None:
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        message.status = [_of_state_repo(self._generator), _of_configuration(self._generator)]
+        of_each = (_of_state_repo, _of_configuration, _of_parts)
+        message.status = [status(self._generator) for status in of_each]
         self._publisher.publish(message)
 
 
@@ -61,6 +62,14 @@ def _of_configuration(generator: Generator) -> DiagnosticStatus:
     for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
         values[f"problem {number}"] = str(problem)
     return _status("demandops: configuration", generator.address, level, text, values)
+
+
+def _of_parts(generator: Generator) -> DiagnosticStatus:
+    failures = generator.failures
+    level, text = DiagnosticStatus.OK, "all parts work"
+    if failures:
+        level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
+    return _status("demandops: generator", generator.address, level, text, failures)
 
 
 def _status(

@@ -16,7 +16,7 @@ from typing import Any
 
 from demandops.cluster.health.release_health import Level
 from demandops.cluster.rollout_watcher import RolloutWatcher
-from demandops.errors import NotReached, QueueFull, ShuttingDown, Withdrawn
+from demandops.errors import NotReached, QueueFull, ShuttingDown, Unsound, Withdrawn
 from demandops.runtime import REAL
 from demandops.service import Generator, Receipt
 from demandops_interfaces.srv import GetBookkeeping
@@ -33,6 +33,10 @@ from demandops_ros.diagnostics import Diagnostics
 
 DEEP_QOS = QoSProfile(depth=2000)
 """For the actions' services: with ROS's default of 10, goals that arrive at once are lost."""
+_RESULT_KEPT_S = 900
+"""How long a client may ask for a result; rclpy keeps it for ten seconds."""
+_MOST_READERS = 4
+"""How many calls of the bookkeeping's service to answer at once; each may read all of history."""
 
 
 class DemandNode(Node):  # type: ignore[misc]
@@ -62,6 +66,7 @@ class DemandNode(Node):  # type: ignore[misc]
         self._open: dict[str, ServerGoalHandle] = {}
         self._events: deque[Callable[[], None]] = deque()
         self._stopping = False
+        self._readers = 0
         # a group of its own, so that a service that waits for an event does not block events
         self._wake = self.create_guard_condition(
             self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
@@ -91,6 +96,7 @@ class DemandNode(Node):  # type: ignore[misc]
             result_service_qos_profile=DEEP_QOS,
             cancel_service_qos_profile=DEEP_QOS,
             feedback_pub_qos_profile=DEEP_QOS,
+            result_timeout=_RESULT_KEPT_S,
         )
 
     def close(self) -> None:
@@ -108,6 +114,10 @@ class DemandNode(Node):  # type: ignore[misc]
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
         """Answer from a thread of its own: an old revision may take seconds to read."""
+        if self._readers >= _MOST_READERS:
+            response.message = f"{_MOST_READERS} calls are answered already; try again later"
+            return response
+        self._readers += 1
         done = Future(executor=self.executor)
 
         def work() -> None:
@@ -115,7 +125,10 @@ class DemandNode(Node):  # type: ignore[misc]
             self._from_worker(partial(done.set_result, filled))
 
         REAL.start_thread("bookkeeping", work)
-        return await done
+        try:
+            return await done
+        finally:
+            self._readers -= 1
 
     # ---- callbacks of the action server, in the executor's thread ----
 
@@ -138,8 +151,18 @@ class DemandNode(Node):  # type: ignore[misc]
         return CancelResponse.REJECT
 
     async def _execute(self, adapter: DeploymentRequestAdapter, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
+        """Return the result of a goal; an internal error is a result too."""
+        self._open[_operation(handle)] = handle
+        try:
+            return await self._answer(adapter, handle)
+        except Exception as error:
+            REAL.failed(f"goal of {adapter.action.__name__}", error)
+            return self._finish(adapter, handle, error)
+        finally:
+            self._open.pop(_operation(handle), None)
+
+    async def _answer(self, adapter: DeploymentRequestAdapter, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
         operation, goal = _operation(handle), handle.request
-        self._open[operation] = handle
         done = Future(executor=self.executor)
 
         def notify(stage: str, text: str) -> None:
@@ -153,6 +176,8 @@ class DemandNode(Node):  # type: ignore[misc]
             lambda future: self._from_worker(partial(done.set_result, future))
         )
         outcome = (await done).exception() or ticket.future.result()
+        if isinstance(outcome, Unsound):  # nobody may be told anything; the process ends
+            await Future(executor=self.executor)
         level = adapter.answer_level(goal) or self._level
         if not isinstance(outcome, Receipt) or level == "pushed":
             return self._finish(adapter, handle, outcome)
@@ -182,7 +207,6 @@ class DemandNode(Node):  # type: ignore[misc]
         outcome: Receipt | BaseException,
         reached: Level = "pushed",
     ) -> Any:  # noqa: ANN401
-        self._open.pop(_operation(handle), None)
         result = adapter.result(outcome, reached)
         prefix = f"goal '{adapter.name(handle.request)}': "
         if isinstance(outcome, Receipt):
@@ -204,7 +228,10 @@ class DemandNode(Node):  # type: ignore[misc]
 
     def _handle_events(self) -> None:
         while self._events:
-            self._events.popleft()()
+            try:
+                self._events.popleft()()
+            except Exception as error:  # the other goals must get their events
+                REAL.failed("events of goals", error)
 
 
 def _operation(handle: ServerGoalHandle) -> str:

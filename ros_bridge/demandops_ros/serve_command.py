@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 import rclpy
+from demandops.cli.main import ExitCode
 from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_watcher import RolloutWatcher
@@ -20,7 +21,11 @@ from demandops.runtime import REAL
 from demandops.service import Generator
 from demandops.service.push_webhook import PushWebhook
 from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
-from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
+from demandops.settings import (
+    DEFAULT_ACTION_NAME,
+    DEFAULT_DEMAND_ACTION_NAME,
+    REQUESTER_QUEUE_LIMIT,
+)
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
@@ -34,7 +39,6 @@ _LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 _POLL_S = 0.02
 _TASK_S = 5.0
 _FLUSH_S = 0.3
-_EXIT_INTERRUPTED = 130
 
 
 class _RosLogHandler(logging.Handler):
@@ -107,8 +111,9 @@ def serve(
         Its actions are DeploymentRequest and Demand. Everything after --ros-args goes to ROS.
     Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
     DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds), state_repo,
-    fetch_interval, log_level (debug, info, warn, error or fatal). Stop it with Ctrl-C or SIGTERM:
-    it finishes the open goals.
+    fetch_interval, requester_queue_limit (how many demands of one requester may wait), log_level
+    (debug, info, warn, error or fatal). Stop it with Ctrl-C or SIGTERM: it finishes what it can
+    within seconds, and the journal keeps the rest.
     """
     ros_args = list(ctx.args)
     if ros_args and ros_args[0] != "--ros-args":
@@ -127,6 +132,7 @@ def serve(
             generator = Generator(
                 settings["state_repo"],
                 progress=report,
+                requester_limit=settings["requester_queue_limit"],
                 with_targets=bool(clusters),
                 fetch_interval=parse_interval(settings["fetch_interval"]),
                 signing_key=signing_key,
@@ -151,6 +157,7 @@ def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict
         "answer_timeout": 120.0,
         "state_repo": state_repo or "",
         "fetch_interval": fetch_interval or DEFAULT_INTERVAL,
+        "requester_queue_limit": REQUESTER_QUEUE_LIMIT,
         "log_level": "info",
     }
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
@@ -215,12 +222,16 @@ def _run(
     executor.add_node(node)
     signals = _Signals()
     # the executor spins in a thread, so that the main thread notices a signal at once
-    spinner = REAL.start_thread("executor", executor.spin)
+    spinner = REAL.keep_running("executor", executor.spin)
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
     if push_webhook is not None:
         node.get_logger().info(f"listening for pushes at {push_webhook.url}")
+    REAL.when_unsound = signals.wake
     signals.wait()
+    if REAL.unsound is not None:
+        errors.print(f"error: {REAL.unsound}")
+        os._exit(ExitCode.PROGRAM_ERROR)  # no goal may get an answer on the way
     if push_webhook is not None:
         push_webhook.close()
     _drain(executor, node, generator, status)
@@ -242,7 +253,8 @@ def _drain(
     published = generator.stop().result()
     if status is not None:
         status.close()  # answers the goals that wait for a rollout
-    while node.open_goals:
+    end = REAL.monotonic() + _TASK_S
+    while node.open_goals and REAL.monotonic() < end:
         REAL.sleep(_POLL_S)
     for _ in range(2):  # results are sent by tasks of the executor: wait until they have run
         done = REAL.event()
@@ -264,19 +276,23 @@ class _Signals:
 
     def __init__(self) -> None:
         self._stopping = False
-        self._read, write = os.pipe()
-        os.set_blocking(write, False)
-        signal.set_wakeup_fd(write)
+        self._read, self._write = os.pipe()
+        os.set_blocking(self._write, False)
+        signal.set_wakeup_fd(self._write)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._handle)
 
     def wait(self) -> None:
-        """Wait for a signal."""
-        while not self._stopping:
+        """Wait for a signal or :meth:`wake`."""
+        while not self._stopping and REAL.unsound is None:
             os.read(self._read, 1)
+
+    def wake(self) -> None:
+        """End the wait; from any thread."""
+        os.write(self._write, b"\0")
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self._stopping:
             errors.print("stopped at once; unpublished demands are in the journal")
-            os._exit(_EXIT_INTERRUPTED)
+            os._exit(ExitCode.INTERRUPTED)
         self._stopping = True

@@ -17,6 +17,7 @@ class Clock(Runtime):
     """
 
     def __init__(self, start: datetime | None = None) -> None:
+        super().__init__()
         self._start = start
         self._passed = self._set = 0.0
 

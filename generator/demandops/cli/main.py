@@ -14,7 +14,7 @@ import click
 
 from demandops import __version__
 from demandops.cli.output import errors
-from demandops.errors import DemandOpsError, InvalidInput
+from demandops.errors import DemandOpsError, InvalidInput, Unsound
 
 COMMANDS = {
     "bookkeeping": ("views", "Show who requests which service and connection."),
@@ -112,6 +112,9 @@ def run(args: list[str] | None = None) -> int:
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")
         return ExitCode.USER_ERROR
+    except Unsound as error:
+        errors.print(f"error: {error}")
+        return ExitCode.PROGRAM_ERROR
     except DemandOpsError as error:
         for each in error.faults if isinstance(error, InvalidInput) else [error]:
             errors.print(f"error: {each}")

@@ -55,7 +55,7 @@ class ObjectCache:
                     continue
                 self._watched.add(selector)
             name = f"watch-{self._name}-{selector.kind}"
-            self._runtime.start_thread(name, partial(self._keep_watching, selector))
+            self._runtime.keep_running(name, partial(self._keep_watching, selector))
 
     def objects(self) -> dict[Key, dict[str, Any]]:
         """Return the objects that are known now."""

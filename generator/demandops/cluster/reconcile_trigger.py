@@ -52,7 +52,7 @@ class ReconcileTrigger:
         self._apis: dict[str, Any] = {}
         self._due = runtime.event()
         self._stop = runtime.event()
-        self._thread = runtime.start_thread("wake", self._run)
+        self._thread = runtime.keep_running("wake", self._run)
 
     def __call__(self, config: Config) -> None:
         """Request a wake after a push; returns at once."""

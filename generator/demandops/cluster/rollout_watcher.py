@@ -77,7 +77,7 @@ class RolloutWatcher:
             for name, access in clusters.items()
             if access.kubeconfig
         }
-        self._thread = runtime.start_thread("status", self._run)
+        self._thread = runtime.keep_running("status", self._run)
 
     def why_unreachable(self, domains: Iterable[ClusterDomain]) -> str:
         """Return why releases in these domains cannot be followed; empty if they can."""

@@ -17,12 +17,21 @@ the worker's thread makes the other changes.
 from __future__ import annotations
 
 import logging
-from collections import deque
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 
-from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, StateRepoError, Withdrawn
+from demandops.errors import (
+    DemandOpsError,
+    QueueFull,
+    ShuttingDown,
+    StateRepoError,
+    Unsound,
+    Withdrawn,
+    quoted,
+)
 from demandops.runtime import Runtime
+from demandops.service.fair_queue import FairQueue, requester_of
 from demandops.service.ticket import ProposalRecord, Receipt, State, Ticket, ticket_from_journal
 from demandops.staterepo.write.journal import Journal
 
@@ -47,14 +56,20 @@ class Demands:
     it.
     """
 
-    def __init__(self, journal: Journal, limit: int, runtime: Runtime) -> None:
+    def __init__(
+        self, journal: Journal, limit: int, requester_limit: int, runtime: Runtime
+    ) -> None:
         self._journal = journal
-        self._limit = limit
+        self._limit, self._requester_limit = limit, requester_limit
+        self._of_requester = Counter[str]()
         self._changed = runtime.condition()
         resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
         self._arrived: list[Ticket] = []
-        self._waiting = deque(ticket for ticket in resumed if ticket.proposal is None)
+        self._waiting = FairQueue()
+        for ticket in resumed:
+            if ticket.proposal is None:
+                self._enqueue(ticket)
         self._taken_back: list[Ticket] = []
         self._closed = self._woken = False
         self.blocked = ""
@@ -125,8 +140,13 @@ class Demands:
         self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
-        """Journal all arrived demands, and fill ``batch`` with up to ``limit`` demands."""
+        """Journal all arrived demands, and fill ``batch`` with up to ``limit`` demands.
+
+        Raises:
+            Unsound: nobody knows what is in the journal.
+        """
         with self._changed:
+            self._journal.require_sound()
             self._journal_arrived()
             room = min(limit - len(batch), len(self._waiting))
             batch += [self._waiting.popleft() for _ in range(room)]
@@ -147,6 +167,13 @@ class Demands:
                 raise QueueFull(
                     f"{self._limit} demands are waiting already{why}; send it again later"
                 )
+            who = requester_of(ticket.goal)
+            if self._of_requester[who] >= self._requester_limit:
+                raise QueueFull(
+                    f"{self._requester_limit} demands of {quoted(who)} have no answer yet; send it "
+                    "again later, or raise the node's parameter requester_queue_limit"
+                )
+            self._of_requester[who] += 1
             ticket.state = "arrived"
             self._arrived.append(ticket)
             self._tickets[ticket.operation] = ticket
@@ -168,7 +195,8 @@ class Demands:
             new = []
         for ticket in arrived:
             _change(ticket, "waiting")
-        self._waiting += (ticket for ticket in arrived if ticket.state != "done")
+            if ticket.state != "done":
+                self._waiting.append(ticket)
         return new
 
     def commit(self, ticket: Ticket) -> bool:
@@ -185,6 +213,7 @@ class Demands:
             if not _may_become(ticket, "proposed"):
                 return False
             self._journal.append([ticket.journal_entry(record)])
+            self._leave(ticket)
             ticket.proposal = record
             return _change(ticket, "proposed")
 
@@ -195,7 +224,7 @@ class Demands:
                 self._journal.append([ticket.journal_entry()])
                 ticket.proposal = None
                 _change(ticket, "waiting")
-                self._waiting.append(ticket)
+                self._enqueue(ticket)
             self._changed.notify()
 
     def withdraw(self, operation: str) -> bool:
@@ -206,8 +235,9 @@ class Demands:
                 return ticket is not None and ticket.state == "withdrawn"
             try:
                 self._withdraw(ticket, TAKEN_BACK)
-            except StateRepoError as error:
+            except (StateRepoError, Unsound) as error:  # the worker ends the process, if it must
                 log.error("demand %s cannot be withdrawn: %s", operation, error)
+                self.wake()
                 return False
         return True
 
@@ -239,7 +269,7 @@ class Demands:
             withdrawn, self._taken_back = self._taken_back, []
             if not withdrawn:
                 return
-            self._waiting = deque(t for t in self._waiting if t not in withdrawn)
+            self._waiting.remove(withdrawn)
             batch[:] = [ticket for ticket in batch if ticket not in withdrawn]
         self.fail(withdrawn, Withdrawn(TAKEN_BACK))
 
@@ -256,7 +286,8 @@ class Demands:
                 self._journal.mark_done(ticket.operation for ticket, _ in results)
             for ticket, _ in results:
                 _change(ticket, "done")
-                self._tickets.pop(ticket.operation, None)
+                if self._tickets.pop(ticket.operation, None):
+                    self._leave(ticket)
         for ticket, result in results:
             if isinstance(result, Receipt):
                 ticket.notify("pushed", f"pushed {result.commit}")
@@ -267,6 +298,22 @@ class Demands:
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
         """Answer every demand of a batch with an error."""
         self.answer([(ticket, error) for ticket in batch], keep)
+
+    def end(self, error: Unsound) -> None:
+        """Accept no more demands, and end all of them with an error; the journal stays as it is."""
+        self.close()
+        with self._changed:
+            left = list(self._tickets.values())
+        self.fail(left, error, keep=True)
+
+    def _enqueue(self, ticket: Ticket) -> None:
+        self._of_requester[requester_of(ticket.goal)] += 1
+        self._waiting.append(ticket)
+
+    def _leave(self, ticket: Ticket) -> None:
+        """Count a demand no more that got its answer or its proposal."""
+        if ticket.proposal is None:
+            self._of_requester -= Counter([requester_of(ticket.goal)])
 
 
 def _may_become(ticket: Ticket, state: State) -> bool:

@@ -17,7 +17,7 @@ from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import Receipt, Ticket, receipt_of
 from demandops.service.timing.rate_limit import RateLimit
-from demandops.staterepo.git.repository import StateRepository
+from demandops.staterepo.git.repository import StateRepository, disk_error
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history.commit_log import RecordedOutcome, operations_since
 from demandops.staterepo.load.snapshot import Snapshot
@@ -53,6 +53,9 @@ class Evaluator:
 
         Returns:
             Its receipt or error; if it needs approval, the decision, which is not committed.
+
+        Raises:
+            Unavailable, PushDenied, Unsound: nothing can be written now.
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
@@ -97,6 +100,9 @@ class Evaluator:
         except SigningFailed as error:
             return error
         except Exception as error:  # a bug that one demand triggers must not stop the others
+            reason = disk_error(error, self._repository.address)
+            if reason is not None:  # it stops them all
+                raise reason from None
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 

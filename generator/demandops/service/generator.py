@@ -26,7 +26,9 @@ from demandops.staterepo.write.slot import Slot
 
 log = logging.getLogger("demandops")
 
-_STOP_TIMEOUT_S = 20.0
+_STOP_TIMEOUT_S = 5.0
+_LAST_S = 5.0
+"""How long the worker may take to end once it must; git and ssh-keygen are ended before."""
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
 
@@ -39,6 +41,7 @@ class Generator:
         *,
         data: Path | None = None,
         queue_limit: int = settings.QUEUE_LIMIT,
+        requester_limit: int = settings.REQUESTER_QUEUE_LIMIT,
         start_offline: bool = True,
         with_targets: bool = False,
         fetch_interval: float = 0.0,
@@ -52,6 +55,7 @@ class Generator:
             state_repo: a folder with a bare repository, or a URL that git clones.
             data: the folder for journal and clone; by default :func:`settings.data_home`.
             queue_limit: how many demands may be queued.
+            requester_limit: how many of them may be of one requester.
             start_offline: whether to start from the last fetch if the remote cannot be reached.
             with_targets: whether receipts list the releases that a demand needs.
             fetch_interval: seconds between two fetches while no demand comes; 0: never, except
@@ -70,7 +74,12 @@ class Generator:
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
             repository.signer, repository.runtime = signer, runtime
-            snapshot = state_in_effect.first_snapshot(repository, progress)
+            try:
+                snapshot = state_in_effect.first_snapshot(repository, progress)
+            except Exception:
+                if not repository.renew_if_damaged():
+                    raise
+                snapshot = state_in_effect.first_snapshot(repository, progress)
         except BaseException:
             self._slot.close()
             raise
@@ -78,7 +87,7 @@ class Generator:
         self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
-        self._demands = Demands(self._slot.journal, queue_limit, runtime)
+        self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime)
         token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,
@@ -92,7 +101,7 @@ class Generator:
         self._stop_lock = runtime.lock()
         for operation in self.operations:
             log.info("resuming demand %s from the journal", operation)
-        self._thread = runtime.start_thread("writer", self._worker.run)
+        self._thread = runtime.keep_running("writer", self._worker.run)
 
     @property
     def snapshot(self) -> Snapshot:
@@ -113,6 +122,11 @@ class Generator:
     def operations(self) -> tuple[str, ...]:
         """The operation ids of the demands that have no answer yet; any thread may read them."""
         return self._demands.operations
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why threads failed that did not recover since, by their names; from any thread."""
+        return self._runtime.failures
 
     def fetch_now(self) -> None:
         """Fetch from the state repo now, because a push was reported; from any thread."""
@@ -184,8 +198,8 @@ class Generator:
         """Refuse further demands, finish the queued ones and stop; returns at once.
 
         Args:
-            timeout: seconds to wait for a remote that cannot be reached. Unpublished demands stay
-                in the journal for the next start, and its futures raise ``ShuttingDown``.
+            timeout: seconds for the queued demands. The demands that are not published then stay in
+                the journal for the next start, and their futures raise ``ShuttingDown``.
 
         Returns:
             A future that returns, once the worker has ended, whether everything was published.
@@ -201,8 +215,12 @@ class Generator:
     def _end(self, timeout: float, finished: Future[bool]) -> None:
         self._thread.join(timeout)
         if self._thread.is_alive():
-            self._worker.stop_retrying()
-        self._thread.join()
+            self._worker.end_soon()
+            self._thread.join(_LAST_S)
+        if self._thread.is_alive():  # it may hold every lock
+            log.error("the generator did not end; its demands stay in the journal")
+            finished.set_result(False)
+            return
         unpublished = self._demands.unpublished
         self._slot.close()
         finished.set_result(not unpublished)

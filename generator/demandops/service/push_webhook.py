@@ -41,7 +41,7 @@ _TOKEN = "X-Gitlab-Token"  # noqa: S105 - a header's name
 
 
 class PushWebhook:
-    """A running server, in a thread of its own; it answers ``/`` with ok, for health checks."""
+    """A running server, in a thread of its own; it answers ``/`` for health checks."""
 
     def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:
         """Start the server.
@@ -75,7 +75,7 @@ class PushWebhook:
             timeout_graceful_shutdown=_STOP_TIMEOUT_S,
         )
         self._server = uvicorn.Server(config)
-        self._thread = REAL.start_thread("webhook", lambda: self._server.run([self._socket]))
+        self._thread = REAL.keep_running("webhook", lambda: self._server.run([self._socket]))
 
     def close(self) -> None:
         """Stop the server and wait for its end."""
@@ -133,6 +133,9 @@ class _BoundedConnection(H11Protocol):
 
 
 async def _health(request: Request) -> PlainTextResponse:
+    failures = REAL.failures  # only the names: errors may quote what must stay secret
+    if failures:
+        return PlainTextResponse(f"failing: {', '.join(failures)}\n", 503)
     return PlainTextResponse("ok\n")
 
 

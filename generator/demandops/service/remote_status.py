@@ -57,5 +57,7 @@ class RemoteMonitor:
 
     def record_push_denied(self, reason: str) -> None:
         """Record that the remote was reached and rejected a push."""
+        if reason != self.status.push_denied:
+            log.error("%s", reason)
         self.record_reached()
         self.status = replace(self.status, push_denied=reason)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 
 from demandops.config.config import Config
 from demandops.decision import Decision
-from demandops.errors import DemandOpsError, Fault, ShuttingDown, StateRepoError
+from demandops.errors import DemandOpsError, Fault, ShuttingDown, StateRepoError, Unsound
 from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.demand_lifecycle import Demands
 from demandops.service.evaluation import Evaluator
@@ -23,8 +23,9 @@ from demandops.service.timing.polling import PollTimer
 from demandops.staterepo.git.repository import (
     FetchInterrupted,
     PushDenied,
-    RemoteAway,
     StateRepository,
+    Unavailable,
+    disk_error,
 )
 from demandops.staterepo.load.snapshot import ReadAhead, Snapshot
 from demandops.staterepo.write.commit_batch import CommitBatch
@@ -35,6 +36,9 @@ _TIDY_EVERY = 300
 """After how many commits to pack the repository; each adds about twenty loose objects."""
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
+_FIRST_REST_S, _LONGEST_REST_S = 1.0, 60.0
+"""How long to follow nothing after an unexpected error; demands are taken meanwhile."""
+_NAME = "writer"
 
 
 class Worker:
@@ -69,7 +73,8 @@ class Worker:
         self._must_fetch = self._tip_is_fresh = False
         self._commits_since_tidy = 0
         self._logged: frozenset[Fault] = frozenset()
-        self._stopped_retrying = self._runtime.event()
+        self._ends_soon = self._runtime.event()
+        self._rest, self._rests_until = _FIRST_REST_S, self._runtime.monotonic()
 
     # ---- from any thread ----
 
@@ -78,9 +83,9 @@ class Worker:
         self._timer.request()
         self._demands.wake()
 
-    def stop_retrying(self) -> None:
-        """Stop waiting for a remote that cannot be reached; pending attempts are the last."""
-        self._stopped_retrying.set()
+    def end_soon(self) -> None:
+        """Publish only what is evaluated already; the other demands stay in the journal."""
+        self._ends_soon.set()
         self._repository.abort()
         self._demands.wake()
 
@@ -108,22 +113,59 @@ class Worker:
                 if self._commits_since_tidy >= _TIDY_EVERY:
                     self._commits_since_tidy = 0
                     self._repository.tidy()
-            else:
+            elif not self._rests:
                 self._follow()
-            self._check_proposals()
-        except ShuttingDown as error:
-            self._demands.fail(batch, error, keep=True)
-        except DemandOpsError as error:
-            if not batch:  # nobody gets it as an answer
-                log.error("%s", error)
-            self._demands.fail(batch, error)
+            if not self._rests:
+                self._check_proposals()
         except Exception as error:
-            log.exception("internal error")
-            answer = StateRepoError(f"internal error of the generator: {error!r}; see its log")
-            self._demands.fail(batch, answer)
+            self._fail(batch, disk_error(error, self._repository.address) or error)
+        else:
+            if not self._rests:
+                self._rest = _FIRST_REST_S
+                self._runtime.recovered(_NAME)
+
+    def _fail(self, batch: list[Ticket], error: Exception) -> None:
+        """Answer a batch with an error; without a batch, follow nothing for a while.
+
+        Raises:
+            Unsound: the process must end, and nobody is answered.
+        """
+        if isinstance(error, Unsound):
+            self._demands.end(error)
+            raise error
+        if isinstance(error, ShuttingDown):
+            self._demands.fail(batch, error, keep=True)
+            return
+        if not batch or not isinstance(error, DemandOpsError):  # else the answers tell it
+            self._runtime.failed(_NAME, error)
+        if not batch:
+            self._take_a_rest()
+        if not isinstance(error, DemandOpsError):
+            error = StateRepoError(f"internal error of the generator: {error!r}; see its log")
+        self._demands.fail(batch, error)
+
+    @property
+    def _rests(self) -> bool:
+        return self._runtime.monotonic() < self._rests_until
+
+    def _take_a_rest(self) -> None:
+        """Follow nothing for a while, because the state repo could not be followed."""
+        if self._rest == _FIRST_REST_S:
+            self._renew_clone_if_damaged()
+        self._rests_until = self._runtime.monotonic() + self._rest
+        self._rest = min(2 * self._rest, _LONGEST_REST_S)
+        self._timer.finished(reached=False)
+
+    def _renew_clone_if_damaged(self) -> None:
+        try:
+            self._repository.renew_if_damaged()
+        except StateRepoError as error:
+            log.warning("%s", error)
 
     def _seconds_until_due(self) -> float:
         """Return the seconds until a lease, override, proposal or fetch is due."""
+        if self._rests:
+            return self._rests_until - self._runtime.monotonic()
         state, tip = self.snapshot.state, str(self.snapshot.commit)
         seconds = self._approvals.seconds_until_due(tip, LONGEST_WAIT_S)
         seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
@@ -137,30 +179,44 @@ class Worker:
         """Publish a batch, with the demands that arrive during retries, and empty it.
 
         Raises:
-            ShuttingDown: after :meth:`stop_retrying`; the demands are still in the batch.
+            ShuttingDown: after :meth:`end_soon`; the demands are still in the batch.
             DemandOpsError: if the state repo cannot be used; the demands are still in the batch.
         """
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
         while batch:
+            self._require_time()
             try:
                 wait = self._attempt(batch, backoff)
-            except RemoteAway as error:
+            except Exception as error:
+                reason = disk_error(error, self._repository.address) or error
+                if isinstance(reason, PushDenied):
+                    self.remote.record_push_denied(str(reason))
+                if not isinstance(reason, Unavailable):
+                    raise reason from None
                 for ticket in batch:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
-                self._record_unreachable(error)
+                self._record_unreachable(reason)
                 self._tip_is_fresh = self._repository.always_current
                 wait = backoff.unreachable()
             if wait is None:
                 continue
             # wait before the fetch, not after it: the push must follow the fetch closely
             self._wait_to_retry(batch, wait)
-            if self._stopped_retrying.is_set():
-                raise ShuttingDown(
-                    "the remote cannot be reached; the demand stays in the journal and is resumed "
-                    "at the next start"
-                )
+            self._require_time()
             self._demands.take(batch, self._batch_limit)
+
+    def _require_time(self) -> None:
+        """Raise after :meth:`end_soon`.
+
+        Raises:
+            ShuttingDown: says that the demand is resumed.
+        """
+        if self._ends_soon.is_set():
+            reason = self._demands.blocked or "the generator stops"
+            raise ShuttingDown(
+                f"{reason}; the demand stays in the journal and is resumed at the next start"
+            )
 
     def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:
         """Evaluate and publish a part of a batch.
@@ -180,6 +236,7 @@ class Worker:
         published = self._evaluator.published_before(commits.start, part)
         results: list[Result] = []
         for ticket in part:
+            self._require_time()
             self._approvals.withdraw_released(results, ticket, commits.head.state)
             results.append((ticket, self._evaluator.evaluate(commits, ticket, published)))
         evaluated = self._runtime.monotonic()
@@ -227,7 +284,7 @@ class Worker:
         """Wait; meanwhile journal new demands and report to them why they wait."""
         end = self._runtime.monotonic() + seconds
         to_notify = list(batch)
-        while not self._stopped_retrying.is_set():
+        while not self._ends_soon.is_set():
             unreachable = self.remote.status.unreachable
             for ticket in to_notify if unreachable else ():
                 ticket.notify("away", f"waiting: {unreachable}")
@@ -270,7 +327,7 @@ class Worker:
             # a deleted branch may have been merged: only a main at least as new shows that
             if self._repository.includes(str(self.snapshot.commit), heads.main):
                 self._approvals.check(self.snapshot, heads)
-        except (RemoteAway, PushDenied) as error:
+        except (Unavailable, PushDenied) as error:
             log.warning("%s; the demands that await approval keep waiting", error)
 
     def _try_to_carry_out_changes(self) -> None:
@@ -290,7 +347,7 @@ class Worker:
                 self._set_snapshot(commits.head)
                 return not commits.is_empty
             self._repository.refresh()
-            self._stopped_retrying.wait(self._runtime.uniform(0, _LONGEST_PAUSE_S))
+            self._ends_soon.wait(self._runtime.uniform(0, _LONGEST_PAUSE_S))
         return False  # other generators are faster, and they carry out the same changes
 
     def _new_commit_batch(self) -> CommitBatch:
@@ -329,7 +386,7 @@ class Worker:
         self._timer.finished(reached=True)
 
     def _record_unreachable(self, error: StateRepoError) -> None:
-        if self._stopped_retrying.is_set():  # there is no retry to report
+        if self._ends_soon.is_set():  # there is no retry to report
             return
         self._demands.blocked = str(error)
         self.remote.record_unreachable(str(error))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -20,6 +21,7 @@ from demandops.service import Ticket
 from tests.kit import goals, rig
 from tests.kit.generator import Proposed
 from tests.kit.git_over_http import Server
+from tests.kit.limits import files_end_at
 from tests.kit.repo import Person, branches
 from tests.kit.rig import Gate, git, goal, leave
 
@@ -125,11 +127,10 @@ def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
     bare: Path, petra: Person
 ) -> None:
     gate = Gate()
-    with rig.running(bare) as generator:
+    with rig.running(bare) as generator, ExitStack() as full:
 
         def fill_disk(done: object) -> None:
-            journal = generator._slot.journal
-            journal._file = Path("/dev/full").open("ab", buffering=0)  # noqa: SIM115
+            full.enter_context(files_end_at(generator._slot.journal._size))
 
         waiting = generator.submit(goal(0), "op-0", gate)
         assert gate.reached.wait(rig.PATIENCE_S)
@@ -141,6 +142,7 @@ def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
             rig.receipt(refused)
         with pytest.raises(StateRepoError, match="cannot be written"):
             rig.receipt(unlucky)
+        full.close()
         assert Proposed(generator, goal(2), "op-3").branch in branches(bare)
         assert not waiting.future.done()
 

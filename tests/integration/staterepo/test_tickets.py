@@ -8,10 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.errors import DemandOpsError, QueueFull, ShuttingDown, StateRepoError, Withdrawn
+from demandops.errors import (
+    DemandOpsError,
+    QueueFull,
+    ShuttingDown,
+    StateRepoError,
+    Unsound,
+    Withdrawn,
+)
+from demandops.runtime import Runtime
 from demandops.service import Generator, Ticket
 
 from tests.kit import rig
+from tests.kit.limits import files_end_at
 from tests.kit.rig import Drivers, Gate, Stages, demand, goal
 
 # ---- taking back ----
@@ -268,17 +277,32 @@ def test_a_journal_that_cannot_be_written_fails_the_demand_and_works_again_later
     bare: Path,
 ) -> None:
     with rig.running(bare) as generator:
+        with files_end_at(10):
+            ticket = generator.submit(goal(1))
+            with pytest.raises(
+                StateRepoError, match=r"outbox\.jsonl cannot be written: File too large; check"
+            ):
+                rig.receipt(ticket, timeout=5)
+        rig.book(generator, goal(2))
+    assert rig.books(bare) == rig.books_after([goal(2)])
+
+
+def test_nobody_is_answered_after_a_journal_may_hold_what_it_refused(bare: Path) -> None:
+    runtime = Runtime()
+    ended = threading.Event()
+    runtime.when_unsound = ended.set
+    with rig.running(bare, runtime=runtime) as generator:
         journal = generator._slot.journal
         file, journal._file = journal._file, Path("/dev/full").open("ab", buffering=0)  # noqa: SIM115
         ticket = generator.submit(goal(1))
-        with pytest.raises(
-            StateRepoError, match=r"outbox\.jsonl cannot be written: No space left on device; check"
-        ):
-            rig.receipt(ticket, timeout=5)
-        journal._file.close()
-        journal._file = file
-        rig.book(generator, goal(2))
-    assert rig.books(bare) == rig.books_after([goal(2)])
+        with pytest.raises(Unsound, match=r"cannot be written or cut back"):
+            rig.receipt(ticket)
+        assert ended.wait(rig.PATIENCE_S)
+        assert isinstance(runtime.unsound, Unsound)
+        with pytest.raises(ShuttingDown):
+            generator.submit(goal(2))
+        file.close()
+    assert rig.operations(bare) == []
 
 
 # ---- what was promised holds after a crash ----

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from demandops.errors import StateRepoError
 from demandops.staterepo.write.journal import DamagedJournal, Journal, JournalEntry, parse, read
+
+from tests.kit.limits import files_end_at
 
 PROPOSAL = {"branch": "demand/x", "commits": ["a"]}
 
@@ -120,22 +119,11 @@ def test_the_file_stays_small_however_many_demands_pass(path: Path, waiting: int
 # ---- a full disk ----
 
 
-@contextmanager
-def room(path: Path, more: int) -> Iterator[None]:
-    """Let files grow to the size of this one and some bytes."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + more, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
 def test_without_room_nothing_is_accepted_and_nothing_lost(path: Path) -> None:
     journal = Journal(path)
     journal.append([entry("a")])
     before = path.read_bytes()
-    with room(path, 50):
+    with files_end_at(path.stat().st_size + 50):
         for _ in range(2):
             with pytest.raises(StateRepoError, match=r"outbox\.jsonl cannot be written: File too"):
                 journal.append([entry("b")])
@@ -148,7 +136,7 @@ def test_without_room_nothing_is_accepted_and_nothing_lost(path: Path) -> None:
 def test_without_room_a_withdrawal_fails_and_an_answer_does_not(path: Path) -> None:
     journal = Journal(path)
     journal.append([entry("a"), entry("b")])
-    with room(path, 10):
+    with files_end_at(path.stat().st_size + 10):
         with pytest.raises(StateRepoError):
             journal.mark_done(["op-a"], durably=True)
         assert list(journal.pending) == ["op-a", "op-b"]
@@ -160,7 +148,7 @@ def test_without_room_a_withdrawal_fails_and_an_answer_does_not(path: Path) -> N
 def test_a_journal_that_filled_the_disk_makes_room_once_all_is_done(path: Path) -> None:
     journal = Journal(path)
     journal.append([entry("a"), entry("b")])
-    with room(path, 10):
+    with files_end_at(path.stat().st_size + 10):
         journal.mark_done(["op-a", "op-b"])
         journal.append([entry("c")])
         journal.close()

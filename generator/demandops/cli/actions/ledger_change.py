@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +13,36 @@ from demandops.cli.views.diff import release_lines
 from demandops.decision import Decision
 from demandops.errors import Fault
 from demandops.service import Generator
+from demandops.settings import QUEUE_LIMIT
 
 
 @contextmanager
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
-    """Yield a generator that is closed at the end."""
-    with progress("reading the ledger") as report:
-        generator = Generator(
-            state_repo, start_offline=False, signing_key=signing_key, progress=report
-        )
+    """Yield a generator that is closed at the end; meanwhile SIGTERM is like Ctrl-C."""
+    before = signal.getsignal(signal.SIGTERM)
+    with suppress(ValueError):  # not in the main thread, which alone gets signals
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        yield generator
+        with progress("reading the ledger") as report:
+            generator = Generator(
+                state_repo,
+                requester_limit=QUEUE_LIMIT,  # there is no other client
+                start_offline=False,
+                signing_key=signing_key,
+                progress=report,
+            )
+        try:
+            yield generator
+        finally:
+            if not generator.close(timeout=0):
+                errors.print(
+                    "what is accepted and not published stays in the journal (`demandops journal` "
+                    "lists it); the next generator that starts on this machine for this state repo "
+                    "continues with it"
+                )
     finally:
-        generator.close(timeout=0)
+        with suppress(ValueError):
+            signal.signal(signal.SIGTERM, before)
 
 
 def print_consequences(decision: Decision) -> None:

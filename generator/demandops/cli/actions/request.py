@@ -19,7 +19,7 @@ from demandops.cli.actions.ledger_change import (
 from demandops.cli.json_output import faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress, signing_option, state_repo_option
 from demandops.decision import admit, decide, form_faults
-from demandops.errors import DemandOpsError, InvalidInput, fault
+from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, fault
 from demandops.input_file import read_input
 from demandops.runtime import REAL
 from demandops.service import Generator, Receipt
@@ -37,6 +37,10 @@ class _Document:
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
+
+
+class _Answer(Future["Receipt | dict[str, str]"]):
+    """The receipt of a request, or the proposal with which it awaits approval."""
 
 
 @click.command()
@@ -79,6 +83,10 @@ def request(
         print_json(rows)
     else:
         _print(rows, documents, dry_run)
+    waiting = sum(row["outcome"] == "waiting" for row in rows)
+    if waiting:
+        errors.print(f"{len(rows) - waiting} of {len(rows)} requests have an answer")
+        raise click.Abort
     if any(row["outcome"] == "refused" for row in rows):
         raise click.exceptions.Exit(1)
 
@@ -124,28 +132,48 @@ def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str
 def _book(
     documents: list[_Document], state_repo: str, wait: bool, signing_key: Path | None
 ) -> list[dict[str, Any]]:
-    with started_generator(state_repo, signing_key) as generator:
-        answers = [_submitted(generator, document, wait) for document in documents]
-        rows = []
-        for index, (document, answer) in enumerate(zip(documents, answers, strict=True)):
-            try:
-                result = answer.result()
-            except DemandOpsError as error:
-                rows.append(_refused(index, document, error))
-                continue
-            if not isinstance(result, Receipt):
-                rows.append(_row(index, document.request_id, "proposed", proposal=result))
-                continue
-            told = {name: getattr(result, name) for name in ("commit", "warnings", "not_held")}
-            rows.append(_row(index, result.request_id, result.outcome, **told))
-        return rows
+    answers: list[_Answer] = []
+    try:
+        with (
+            started_generator(state_repo, signing_key) as generator,
+            progress("booking") as report,
+        ):
+            for document in documents:
+                answers.append(_submitted(generator, document, wait))
+            for done, answer in enumerate(answers, start=1):
+                answer.exception()
+                report(done, len(documents))
+    except KeyboardInterrupt:
+        if not answers:
+            raise
+    answers += [_Answer() for _ in documents[len(answers) :]]
+    pairs = enumerate(zip(documents, answers, strict=True))
+    return [_answered(index, document, answer) for index, (document, answer) in pairs]
 
 
-def _submitted(
-    generator: Generator, document: _Document, wait: bool
-) -> Future[Receipt | dict[str, str]]:
+def _answered(index: int, document: _Document, answer: _Answer) -> dict[str, Any]:
+    """Return the row of a request.
+
+    Raises:
+        Unsound: nobody knows what became of it.
+    """
+    try:
+        result = answer.result(timeout=0)
+    except (ShuttingDown, TimeoutError):  # the command was interrupted
+        return _row(index, document.request_id, "waiting")
+    except Unsound:
+        raise
+    except DemandOpsError as error:
+        return _refused(index, document, error)
+    if not isinstance(result, Receipt):
+        return _row(index, document.request_id, "proposed", proposal=result)
+    told = {name: getattr(result, name) for name in ("commit", "warnings", "not_held")}
+    return _row(index, result.request_id, result.outcome, **told)
+
+
+def _submitted(generator: Generator, document: _Document, wait: bool) -> _Answer:
     """Submit a request; return a future of its receipt, or of the proposal that awaits approval."""
-    answer: Future[Receipt | dict[str, str]] = Future()
+    answer = _Answer()
     name = document.request_id
 
     def listen(stage: str, text: str) -> None:
@@ -204,7 +232,9 @@ def _print(rows: list[dict[str, Any]], documents: list[_Document], dry_run: bool
     out = console()
     for row, document in zip(rows, documents, strict=True):
         title = f"{document.file}: request {row['index']} '{row['request']}'"
-        if row["outcome"] == "refused":
+        if row["outcome"] == "waiting":
+            errors.print(f"{title} has no answer yet")
+        elif row["outcome"] == "refused":
             print_refusal(f"{title} refused", row["faults"])
         elif not dry_run:
             told, proposal = f"{row['outcome']} in {row['commit']}", row.get("proposal")

@@ -8,7 +8,7 @@ Until then the branch is kept up to date, so that merging it gives what main wou
 from __future__ import annotations
 
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from demandops.errors import (
     ShuttingDown,
     Withdrawn,
     fault,
+    quoted,
 )
 from demandops.service.approvals.forge_worker import ForgeWorker
 from demandops.service.approvals.proposal import (
@@ -43,6 +44,7 @@ from demandops.service.approvals.proposal import (
 from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import ProposalRecord, Receipt, Ticket, receipt_of
+from demandops.settings import PROPOSAL_LIMIT
 from demandops.staterepo.git.repository import PushDenied, StateRepository
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
@@ -154,6 +156,13 @@ class Approvals:
             message = f"'{request.demand}' is a demand of {owners}; choose another demand id"
             self._demands.fail([ticket], Refused([fault("demand", message, code="not-yours")]))
             return
+        if proposal is None and (full := self._requester_with_most(request)):
+            message = (
+                f"{PROPOSAL_LIMIT} demands of {quoted(full)} await approval already; release some, "
+                "or have them decided"
+            )
+            self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
+            return
         if proposal is None:
             branch = branch_name(request.demand or request.id, ticket.operation)
             proposal = Proposal(key, ProposalRecord(branch), searched_to=ticket.base)
@@ -167,6 +176,12 @@ class Approvals:
         proposal.tickets.append(ticket)
         proposal.requests.append(request)
         self._changed.append(proposal.branch)
+
+    def _requester_with_most(self, request: DemandRequest) -> str:
+        """Return a requester that may have no further proposal, or an empty text."""
+        counts = Counter(name for each in self._proposals.values() for name in each.requesters())
+        full = (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT)
+        return next(full, "")
 
     def withdraw_replaced(self, request: DemandRequest) -> None:
         """Withdraw the proposal of a demand that was put again and needs no approval now."""

@@ -22,6 +22,10 @@ log = logging.getLogger("demandops")
 POLL_S = 30.0
 """The interval between queries; only the forge knows that a pull request was closed."""
 
+_TOO_MANY_REQUESTS = 429
+_REST_S = 60.0
+"""How long to ask a forge nothing after it said that it was asked too often."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Task:
@@ -75,16 +79,19 @@ class ForgeWorker:
         self._tasks.append(task)
         self._due.set()
         if self._thread is None:
-            self._thread = self._runtime.start_thread("forge", self._run)
+            self._thread = self._runtime.keep_running("forge", self._run)
 
     # ---- in the thread of its own ----
 
     def _run(self) -> None:
+        poll_at = self._runtime.monotonic() + POLL_S
         while True:
-            if not self._due.wait(POLL_S):
+            self._due.wait(max(0.0, poll_at - self._runtime.monotonic()))
+            self._due.clear()
+            if self._runtime.monotonic() >= poll_at:
+                poll_at = self._runtime.monotonic() + POLL_S
                 with self._lock:
                     self._tasks.extend(self._wanted.values())
-            self._due.clear()
             while self._tasks:
                 task = self._tasks.popleft()
                 known = pull_request = self._pull_requests.get(task.branch)
@@ -97,8 +104,13 @@ class ForgeWorker:
                     if str(error) != self._last_error:
                         log.warning("%s: %s", task.branch, error)
                     self._last_error = str(error)
-                except Exception:
-                    log.exception("internal error at the pull request for %s", task.branch)
+                    if error.status == _TOO_MANY_REQUESTS:
+                        self._remember(task, pull_request)
+                        self._tasks.appendleft(task)
+                        self._runtime.sleep(_REST_S)
+                        continue
+                except Exception as error:  # one pull request must not stop the others
+                    self._runtime.failed(f"forge of {task.branch}", error)
                 self._remember(task, pull_request)
 
     @staticmethod

@@ -8,16 +8,17 @@ term again. The sleep of a machine looks like a jump and has the same effect.
 from __future__ import annotations
 
 import logging
+from concurrent.futures import Future
 from datetime import datetime, timedelta, timezone
 
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Expire
-from demandops.errors import InvalidInput
+from demandops.errors import InvalidInput, quoted
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.overrides.lifecycle import expired_overrides
 from demandops.runtime import Runtime
-from demandops.service.ticket import Ticket
+from demandops.service.ticket import Receipt, Ticket
 from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
@@ -47,8 +48,18 @@ class LeaseExpiry:
         self._tried = {d: at for d, at in self._tried.items() if at > now - _RETRY and d in ended}
         demands = [demand for demand in ended if demand not in self._tried]
         self._tried |= dict.fromkeys(demands, now)
-        requests = (Expire(id=demand, demand=demand) for demand in demands)
-        return [Ticket(self._runtime.fresh_id(), request, now) for request in requests]
+        return [self._ticket(demand, now) for demand in demands]
+
+    def _ticket(self, demand: str, now: datetime) -> Ticket:
+        ticket = Ticket(self._runtime.fresh_id(), Expire(id=demand, demand=demand), now)
+
+        def tell(future: Future[Receipt]) -> None:
+            error = future.exception()
+            if isinstance(error, InvalidInput):  # nobody else gets it as an answer
+                self._runtime.failed(f"end of the lease of {quoted(demand)}", error)
+
+        ticket.future.add_done_callback(tell)
+        return ticket
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
         """Return the time and the claims whose lease has ended, the first to end first.

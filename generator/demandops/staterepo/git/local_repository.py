@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import pygit2
 from pygit2 import Oid, Repository
 
 from demandops.errors import StateRepoError
-from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git.new_objects import NewObjects
-from demandops.staterepo.git.repository import MAIN, StateRepository
+from demandops.staterepo.git.repository import MAIN, StateRepository, Unavailable, disk_error
 
 _STALE_LOCK_S = 5.0
+"""Git holds the lock of a branch for milliseconds; for so long only if its process was killed."""
 
 log = logging.getLogger("demandops")
 
@@ -28,6 +27,7 @@ class LocalRepository(StateRepository):
 
     def __init__(self, path: Path) -> None:
         self.address = str(path)
+        self._lock_seen: tuple[tuple[int, int], float] | None = None
         try:
             self.objects = Repository(str(path))
         except pygit2.GitError:
@@ -58,15 +58,36 @@ class LocalRepository(StateRepository):
         try:
             with self.new.packed(commit):
                 reference.set_target(commit, "demandops")
-        except (pygit2.GitError, OSError):
+        except (pygit2.GitError, OSError) as error:
+            reason = disk_error(error, self.address)
+            if reason is not None:
+                raise reason from None
             self._break_stale_lock()
+            if self._lock_seen is None and self.tip() == expected:
+                raise Unavailable(f"{self.address} cannot be written: {error}") from None
             return False  # another writer holds the lock or was first: evaluate again
         return True
 
     def _break_stale_lock(self) -> None:
-        """Remove the branch's lock if a killed process left it: Git holds it for milliseconds."""
+        """Remove the branch's lock if a killed process left it.
+
+        Its age is measured by a clock that nobody sets, from when it was first seen here.
+        """
         lock = Path(self.objects.path) / f"{MAIN}.lock"
-        with suppress(FileNotFoundError):
-            if REAL.now().timestamp() - lock.stat().st_mtime > _STALE_LOCK_S:
-                log.warning("removing %s, which a killed process left behind", lock)
+        try:
+            found = lock.lstat()
+        except FileNotFoundError:
+            self._lock_seen = None
+            return
+        seen, now = (found.st_ino, found.st_mtime_ns), self.runtime.monotonic()
+        if self._lock_seen is None or self._lock_seen[0] != seen:
+            self._lock_seen = (seen, now)
+        elif now - self._lock_seen[1] > _STALE_LOCK_S:
+            log.warning("removing %s, which a killed process left behind", lock)
+            try:
                 lock.unlink()
+            except OSError as error:
+                raise Unavailable(
+                    f"{self.address} cannot be written: {lock} cannot be removed "
+                    f"({error.strerror}); remove it"
+                ) from None

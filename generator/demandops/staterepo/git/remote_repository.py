@@ -24,6 +24,7 @@ from demandops.staterepo.git.repository import (
     ENVIRONMENT,
     MAIN,
     TIMEOUT_S,
+    DiskFull,
     FetchInterrupted,
     PushDenied,
     RemoteAway,
@@ -36,6 +37,9 @@ _REMOTE_MESSAGE = re.compile(r"remote: ?(.*)")
 _REMOTE_REJECTED = re.compile(r"\[remote rejected\] \((.*)\)")
 _TEMPORARY = re.compile(r"lock|failed to update ref|incorrect old value")
 _POLL_S = 0.02
+_CLONE_TIMEOUT_S = 3600
+"""A first clone may take long; a connection that carries nothing is cut off before."""
+_NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
 _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
 )
@@ -69,9 +73,7 @@ class RemoteRepository(StateRepository):
             lock.unlink(missing_ok=True)
         if not self._is_usable():
             self._clone(notify)
-        self._git = git.Repo(folder)
-        self.objects = Repository(str(folder))
-        self.new = NewObjects(self.objects)
+        self._open()
         try:
             self.refresh()
         except RemoteAway as error:
@@ -79,18 +81,36 @@ class RemoteRepository(StateRepository):
                 raise
             log.warning("%s; continuing with the commits of the last fetch", error)
 
+    def _open(self) -> None:
+        self._git, self.objects = git.Repo(self._folder), Repository(str(self._folder))
+        self.new = NewObjects(self.objects)
+
     def _is_usable(self) -> bool:
         try:
             repo = Repository(str(self._folder))
-            target = repo.references[_REMOTE_MAIN].target
-            return isinstance(repo[target], pygit2.Commit)
-        except (pygit2.GitError, KeyError):
+            commit = repo[repo.references[_REMOTE_MAIN].target]
+            is_whole = isinstance(commit, pygit2.Commit) and bool(commit.tree.id)
+            # git itself must find it: it reads more of the files than libgit2
+            return is_whole and git.Repo(self._folder).remote("origin").url == self._url
+        except Exception:  # whatever is wrong with it, a new one is not
             return False
+
+    def renew_if_damaged(self) -> bool:
+        """Make the clone anew if git finds it damaged."""
+        try:
+            with git.Repo(self._folder) as repo:
+                self._run_git(repo, "fsck", "--no-dangling", "--no-progress")
+            return False
+        except RemoteAway:  # it was aborted
+            return False
+        except Exception as error:
+            log.warning("the clone %s is damaged (%s); making it anew", self._folder, error)
+        self._clone(log.info)
+        self._open()
+        return True
 
     def _clone(self, notify: Notify) -> None:
         notify(f"cloning {self.address}")
-        if self._folder.exists():
-            shutil.rmtree(self._folder)
         self._folder.parent.mkdir(parents=True, exist_ok=True)
         partial = self._folder.with_name(self._folder.name + ".partial")
         shutil.rmtree(partial, ignore_errors=True)
@@ -98,12 +118,20 @@ class RemoteRepository(StateRepository):
             with repo.config_writer() as config:
                 config.set_value('remote "origin"', "url", self._url)
             partial.joinpath("config").chmod(0o600)
-            self._fetch(repo)
+            self._fetch(repo, timeout=_CLONE_TIMEOUT_S)
+        if self._folder.exists():
+            shutil.rmtree(self._folder)
         partial.rename(self._folder)
 
-    def _fetch(self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False) -> None:
+    def _fetch(
+        self,
+        repo: git.Repo,
+        urgent: Callable[[], bool] = lambda: False,
+        timeout: float = TIMEOUT_S,
+    ) -> None:
         # given here, not configured, so that a push that outlives its generator moves no ref
-        self._read(repo, ("fetch", "--no-tags"), f"+{MAIN}:{_REMOTE_MAIN}", urgent=urgent)
+        spec = f"+{MAIN}:{_REMOTE_MAIN}"
+        self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         """Fetch, but stop if something is urgent: a demand must not wait for a slow remote."""
@@ -124,7 +152,10 @@ class RemoteRepository(StateRepository):
             if tip != expected:
                 return False
             raise self.push_error(error) from None
-        self.objects.references.create(_REMOTE_MAIN, commit, force=True)
+        try:
+            self.objects.references.create(_REMOTE_MAIN, commit, force=True)
+        except (pygit2.GitError, OSError) as error:  # the next fetch does it
+            log.warning("%s was pushed, but not noted in %s: %s", commit, self._folder, error)
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
@@ -154,8 +185,10 @@ class RemoteRepository(StateRepository):
         return f"{out}\n{err}"
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return ``PushDenied`` if the remote rejected a push, else ``RemoteAway``."""
+        """Return ``PushDenied`` if the remote rejected a push, else why it failed."""
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
+        if _NO_ROOM.search(text):
+            return self._disk_full()
         rejected = _REMOTE_REJECTED.search(text)
         if rejected and not _TEMPORARY.search(rejected[1]):
             message = " ".join(line.strip(" '") for line in _REMOTE_MESSAGE.findall(text)).strip()
@@ -172,11 +205,12 @@ class RemoteRepository(StateRepository):
         command: Sequence[str],
         *references: str,
         urgent: Callable[[], bool] = lambda: False,
+        timeout: float = TIMEOUT_S,
     ) -> str:
         """Return the output of a git command that reads from the remote, or raise RemoteAway."""
         command = (*command, "--quiet", "origin", *references)
         try:
-            return self._run_git(repo, *command, urgent=urgent)[0]
+            return self._run_git(repo, *command, urgent=urgent, timeout=timeout)[0]
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
         if "couldn't find remote ref" in text:
@@ -184,11 +218,23 @@ class RemoteRepository(StateRepository):
                 f"{self.address} has no branch '{MAIN_BRANCH}'; push one made by "
                 "`demandops init DIR`"
             )
+        if _NO_ROOM.search(text):
+            raise self._disk_full()
         failed = "read" if command[0] == "ls-remote" else "fetched"
         raise RemoteAway(f"{self.address} cannot be {failed}: {_last_line(text)}")
 
+    def _disk_full(self) -> DiskFull:
+        return DiskFull(
+            f"{self.address} cannot be fetched or pushed: the disk of {self._folder} has no room; "
+            "free some"
+        )
+
     def _run_git(
-        self, repo: git.Repo, *command: str, urgent: Callable[[], bool] = lambda: False
+        self,
+        repo: git.Repo,
+        *command: str,
+        urgent: Callable[[], bool] = lambda: False,
+        timeout: float = TIMEOUT_S,
     ) -> tuple[str, str]:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
@@ -204,7 +250,7 @@ class RemoteRepository(StateRepository):
         if self._aborted:  # since the first check
             self.abort()
         try:
-            out, err = _wait_for(process, urgent)
+            out, err = _wait_for(process, urgent, timeout)
         finally:
             self._process = None
         if process.returncode:
@@ -220,9 +266,11 @@ class RemoteRepository(StateRepository):
                 os.killpg(process.pid, signal.SIGTERM)
 
 
-def _wait_for(process: subprocess.Popen[bytes], urgent: Callable[[], bool]) -> tuple[bytes, bytes]:
+def _wait_for(
+    process: subprocess.Popen[bytes], urgent: Callable[[], bool], timeout: float
+) -> tuple[bytes, bytes]:
     """Return git's output; end git if it takes too long or something is urgent."""
-    end = REAL.monotonic() + TIMEOUT_S
+    end = REAL.monotonic() + timeout
     while True:
         try:
             return process.communicate(timeout=_POLL_S)

@@ -5,6 +5,7 @@ There are two kinds, on this disk and behind a URL; :mod:`demandops.staterepo.gi
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 from abc import ABC, abstractmethod
@@ -13,7 +14,7 @@ from collections.abc import Callable
 import pygit2
 from pygit2 import Oid, Repository, Tree
 
-from demandops.errors import StateRepoError
+from demandops.errors import StateRepoError, Unsound
 from demandops.runtime import REAL, Runtime
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
@@ -23,11 +24,25 @@ from demandops.staterepo.git.signing import Signer
 MAIN = f"refs/heads/{MAIN_BRANCH}"
 TIMEOUT_S = 120
 _REPACK = ("repack", "--geometric=2", "-d", "-l", "--quiet")
-ENVIRONMENT = {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
+ENVIRONMENT = {
+    "GIT_TERMINAL_PROMPT": "0",
+    "LC_ALL": "C",
+    # a connection that carries nothing for so many seconds is cut off
+    "GIT_HTTP_LOW_SPEED_LIMIT": "1",
+    "GIT_HTTP_LOW_SPEED_TIME": "60",
+}
 
 
-class RemoteAway(StateRepoError):
-    """The remote cannot be reached; the journal keeps the demands until it is back."""
+class Unavailable(StateRepoError):
+    """The state repo cannot be written now; the journal keeps the demands until it can."""
+
+
+class RemoteAway(Unavailable):
+    """The remote cannot be reached."""
+
+
+class DiskFull(Unavailable):
+    """The disk of the state repo, or of its clone, has no room."""
 
 
 class FetchInterrupted(StateRepoError):
@@ -35,7 +50,38 @@ class FetchInterrupted(StateRepoError):
 
 
 class PushDenied(StateRepoError):
-    """The remote rejects the push (a hook, a protected branch, missing rights)."""
+    """The state repo may not be written (a hook, a protected branch, missing rights)."""
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_NOT_ALLOWED = (errno.EACCES, errno.EPERM, errno.EROFS)
+_BROKEN = (errno.EIO, errno.EUCLEAN, errno.ENODEV, errno.ENXIO, errno.ESTALE)
+_TOLD = {os.strerror(number): number for number in (*_NO_ROOM, *_NOT_ALLOWED, *_BROKEN)}
+
+
+def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
+    """Return what it means that a state repo on this disk could not be written; None: nothing.
+
+    libgit2 tells the number of an error only by its text. After an I/O error nobody knows what is
+    on the disk.
+    """
+    number = getattr(error, "errno", None)
+    if number is None:
+        number = next((_TOLD[text] for text in _TOLD if str(error).endswith(text)), None)
+    if number in _NO_ROOM:
+        return DiskFull(
+            f"{address} cannot be written: its disk has no room ({os.strerror(number)}); free some"
+        )
+    if number in _NOT_ALLOWED:
+        return PushDenied(
+            f"{address} cannot be written: {os.strerror(number)}; let the generator's user write "
+            "all of its files and folders"
+        )
+    if number in _BROKEN:
+        return Unsound(
+            f"{address} cannot be written: {os.strerror(number)}; check its disk, then start again"
+        )
+    return None
 
 
 class StateRepository(ABC):
@@ -72,7 +118,8 @@ class StateRepository(ABC):
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Make ``commit`` the tip, durably, if the tip is ``expected``; else return false.
 
-        Raises RemoteAway or PushDenied if it could not be published for another reason.
+        Raises Unavailable or PushDenied if it could not be published for another reason, and
+        Unsound if nobody knows whether it was.
         """
 
     def includes(self, commit: str, other: str) -> bool:
@@ -107,6 +154,14 @@ class StateRepository(ABC):
             return trees.commit_of(objects, one).tree, trees.commit_of(objects, other).tree
         except StateRepoError:
             return None
+
+    def renew_if_damaged(self) -> bool:
+        """Make the files here anew if they are damaged and can be; return whether that was done.
+
+        Raises:
+            Unavailable: they are damaged and cannot be made anew now.
+        """
+        return False
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End the running transfer with a remote, if any."""

@@ -70,9 +70,14 @@ def blobs(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Blob]]:
             yield root, found
 
 
+def _name(found: Object) -> str:
+    """Return the name of a tree's entry. Invalid UTF-8 is replaced, so no path is found by it."""
+    return (found.raw_name or b"").decode("utf-8", "replace")
+
+
 def _blobs_below(tree: Tree, prefix: str) -> Iterator[tuple[str, Blob]]:
     for found in tree:
-        path = f"{prefix}{found.name}"
+        path = f"{prefix}{_name(found)}"
         if isinstance(found, Tree):
             yield from _blobs_below(found, f"{path}/")
         elif isinstance(found, Blob):
@@ -105,8 +110,8 @@ def differences(
 def _differences_below(
     before: Tree | None, after: Tree | None, prefix: str
 ) -> Iterator[tuple[str, Oid | None]]:
-    old = {str(found.name): found for found in before or ()}
-    new = {str(found.name): found for found in after or ()}
+    old = {_name(found): found for found in before or ()}
+    new = {_name(found): found for found in after or ()}
     for name in sorted({*old, *new}):
         yield from _differences_at(old.get(name), new.get(name), f"{prefix}{name}")
 

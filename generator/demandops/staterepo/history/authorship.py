@@ -9,7 +9,7 @@ from __future__ import annotations
 import getpass
 import os
 from collections.abc import Callable, Iterable, Sequence
-from datetime import datetime, timezone
+from datetime import datetime
 from functools import cache
 from typing import NamedTuple
 
@@ -66,13 +66,8 @@ def _touches(commit: Commit, paths: Iterable[str]) -> bool:
 
 def author_of(commit: Commit) -> Person:
     """Return the author of a commit, without characters that trailers and signatures forbid."""
-    author = commit.author
-    plain = commit_message.signature(author.name, author.email or "", _time_of(commit))
+    plain = commit_message.signature(*commit_log.author_of(commit), commit_log.time_of(commit))
     return Person(plain.name, plain.email)
-
-
-def _time_of(commit: Commit) -> datetime:
-    return datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
 
 
 def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
@@ -90,7 +85,7 @@ def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
     people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))
     names = ", ".join(dict.fromkeys(one.name for one in people))
     email = people[0].email if len(people) == 1 else commit_message.GENERATOR_EMAIL
-    return commit_message.signature(names, email, _time_of(causes[0]))
+    return commit_message.signature(names, email, commit_log.time_of(causes[0]))
 
 
 def operator(folder: str | None = None) -> Person:

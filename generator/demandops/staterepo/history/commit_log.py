@@ -25,6 +25,8 @@ PROPOSAL = "Proposal"
 """The trailer of a commit that needs approval: the branch that it was proposed on."""
 
 _WHY = "Why: "
+_LAST_SECOND = 253402300799
+"""The last second of the year 9999."""
 _NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
 
 
@@ -67,15 +69,32 @@ def trailers_of(message: str) -> dict[str, list[str]]:
     return trailers
 
 
+def time_of(commit: Commit) -> datetime:
+    """Return the committer's time; beyond the calendar it is the calendar's end."""
+    seconds = min(max(commit.commit_time, 0), _LAST_SECOND)
+    return datetime.fromtimestamp(seconds, tz=timezone.utc)
+
+
+def author_of(commit: Commit) -> tuple[str, str]:
+    """Return name and address of the author."""
+    return _text(commit.author.raw_name), _text(commit.author.raw_email)
+
+
+def _text(raw: bytes) -> str:
+    """Return a text of a commit, whatever encoding the commit names."""
+    return raw.decode("utf-8", "replace")
+
+
 def entry_of(commit: Commit) -> LogEntry:
     """Return the log entry of a commit."""
-    whys = (line for line in commit.message.split("\n") if line.startswith(_WHY))
+    message = _text(commit.raw_message)
+    whys = (line for line in message.split("\n") if line.startswith(_WHY))
     return LogEntry(
         commit=str(commit.id),
-        time=datetime.fromtimestamp(commit.commit_time, tz=timezone.utc),
-        author=commit.author.name,
-        summary=commit.message.split("\n", 1)[0],
-        trailers=trailers_of(commit.message),
+        time=time_of(commit),
+        author=author_of(commit)[0],
+        summary=message.split("\n", 1)[0],
+        trailers=trailers_of(message),
         why=next(whys, "").removeprefix(_WHY),
     )
 

@@ -91,7 +91,7 @@ def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
     for commit in commit_log.first_parents(repo, tip):
         if commit.commit_time <= latest:
             return commit
-    first = datetime.fromtimestamp(commit.commit_time, tz=timezone.utc)
+    first = commit_log.time_of(commit)
     raise StateRepoError(
         f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
         f"{format_time(first)}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from datetime import datetime, timezone
 
 from pygit2 import Oid, Repository, Tree
 
@@ -98,7 +97,7 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     return Restoration(
         id="",
         to=str(commit.id),
-        made=datetime.fromtimestamp(commit.commit_time, tz=timezone.utc),
+        made=commit_log.time_of(commit),
         claims=found.claims,
         **more,  # type: ignore[arg-type]
     )

@@ -22,7 +22,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from demandops.errors import StateRepoError
+from demandops.errors import StateRepoError, Unsound
 
 _MOST_BYTES = 1 << 20
 _SEALED = re.compile(rb'(\{.*), "digest": "([0-9a-f]{64})"\}')
@@ -68,14 +68,27 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self._unsound: Unsound | None = None
         self.pending = read(path)
         self._chain, self._size, self._limit, self._is_broken = "", 0, 0, True
         with self._explained():
             self._file = path.open("ab", buffering=0)
             self._rewrite()
 
+    def require_sound(self) -> None:
+        """Raise if nobody knows what is in the file.
+
+        Raises:
+            Unsound: as every write from then on.
+        """
+        if self._unsound is not None:
+            raise self._unsound
+
     def append(self, entries: Iterable[JournalEntry]) -> None:
-        """Write and fsync all ``entries``, or raise StateRepoError and write none of them."""
+        """Write and fsync all ``entries``, or raise StateRepoError and write none of them.
+
+        Raises Unsound if nobody knows whether they are written.
+        """
         entries = list(entries)
         if entries:
             with self._explained():
@@ -103,11 +116,14 @@ class Journal:
 
     def close(self) -> None:
         """Close the journal; pending demands stay for the next process."""
-        with suppress(OSError):  # the demands are there; what is done may be evaluated again
+        with suppress(
+            OSError, Unsound
+        ):  # the demands are there; what is done may be evaluated again
             self._write([], durably=True)
         self._file.close()
 
     def _write(self, records: list[dict[str, Any]], *, durably: bool) -> None:
+        self.require_sound()
         if self._is_broken:
             self._rewrite()
         text, chain = _sealed(records, self._chain)
@@ -116,9 +132,15 @@ class Journal:
             _write_all(self._file.fileno(), text)
             if durably:
                 os.fdatasync(self._file.fileno())
-        except OSError:
-            with suppress(OSError):  # a restart must not find half of it
+        except OSError as error:
+            try:
                 self._file.truncate(self._size)
+            except OSError:  # a restart may find what is refused here
+                self._unsound = Unsound(
+                    f"the journal {self._path} cannot be written or cut back: {error.strerror}; "
+                    "check its disk, then start again"
+                )
+                self.require_sound()
             raise
         self._is_broken, self._chain, self._size = False, chain, self._size + len(text)
 

@@ -1,0 +1,139 @@
+"""The queue of waiting demands: requesters take turns, and what belongs together keeps its order.
+
+A demand belongs to its first requester. Demands that share an application, a connection or a demand
+id keep their order. So if the turn comes to a demand that must follow another one, that one is
+taken in its place. A rollback or a decommission may touch anything: nothing overtakes it, and it
+overtakes nothing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from demandops.service.ticket import Ticket
+
+_ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
+"""Each goal that lists its subjects has one of these fields."""
+
+
+@dataclass(eq=False)
+class _Place:
+    """The place of a demand in the queue; ``subjects`` is None if it may touch anything."""
+
+    number: int
+    ticket: Ticket
+    subjects: frozenset[tuple[str, str]] | None
+    is_left: bool = False
+
+
+class FairQueue:
+    """Demands that wait; not thread-safe."""
+
+    def __init__(self) -> None:
+        self._places: dict[Ticket, _Place] = {}
+        self._lanes: dict[str, deque[_Place]] = {}
+        self._subjects: dict[tuple[str, str], deque[_Place]] = {}
+        self._barriers: deque[_Place] = deque()
+        self._arrived = 0
+
+    def __len__(self) -> int:
+        """Return how many demands wait."""
+        return len(self._places)
+
+    def append(self, ticket: Ticket) -> None:
+        """Add a demand at the end."""
+        self._arrived += 1
+        place = _Place(self._arrived, ticket, subjects_of(ticket.goal))
+        self._places[ticket] = place
+        self._lanes.setdefault(requester_of(ticket.goal), deque()).append(place)
+        for subject in place.subjects or ():
+            self._subjects.setdefault(subject, deque()).append(place)
+        if place.subjects is None:
+            self._barriers.append(place)
+
+    def remove(self, tickets: Collection[Ticket]) -> None:
+        """Remove demands, whether they are in the queue or not."""
+        for ticket in tickets:
+            place = self._places.pop(ticket, None)
+            if place is not None:
+                place.is_left = True
+
+    def popleft(self) -> Ticket:
+        """Remove and return the next demand.
+
+        Raises:
+            KeyError: the queue is empty.
+        """
+        while True:
+            requester = next(iter(self._lanes))
+            lane = self._lanes.pop(requester)
+            first = _first(lane)
+            if first is not None:
+                self._lanes[requester] = lane  # at the end: the others come first
+                break
+        while True:
+            before = self._before(first)
+            if before is None:
+                self.remove([first.ticket])
+                self._forget(first)
+                return first.ticket
+            first = before
+
+    def _before(self, place: _Place) -> _Place | None:
+        """Return a demand that this one must follow, or None."""
+        barrier = _first(self._barriers)
+        if barrier is not None and barrier.number < place.number:
+            return barrier
+        if place.subjects is None:
+            oldest = next(iter(self._places.values()))
+            return oldest if oldest is not place else None
+        for subject in place.subjects:
+            first = _first(self._subjects[subject])
+            if first is not None and first is not place:
+                return first
+        return None
+
+    def _forget(self, place: _Place) -> None:
+        """Forget subjects that no demand in the queue has."""
+        for subject in place.subjects or ():
+            if _first(self._subjects[subject]) is None:
+                del self._subjects[subject]
+
+
+def _first(places: deque[_Place]) -> _Place | None:
+    while places and places[0].is_left:
+        places.popleft()
+    return places[0] if places else None
+
+
+def requester_of(goal: Any) -> str:  # noqa: ANN401 - plain data
+    """Return the first requester in a goal, which may be invalid, or an empty text."""
+    fields = goal if isinstance(goal, dict) else {}
+    bodies = (app.get("object_detection_fusion_app") for app in _items(fields, "apps"))
+    named = [
+        fields.get("requesters"),
+        *(body.get("requester_ids") for body in bodies if isinstance(body, dict)),
+        *(each.get("requester_ids") for each in _items(fields, "connections")),
+    ]
+    lists = (names for names in named if isinstance(names, list))
+    return next((name for names in lists for name in names if isinstance(name, str)), "")
+
+
+def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401 - plain data
+    """Return what a goal, which may be invalid, is about; None if it may be anything."""
+    if not isinstance(goal, dict) or _ORDINARY.isdisjoint(goal):
+        return None
+    headers = (app.get("header") for app in _items(goal, "apps"))
+    found = [("demand", goal.get("demand"))]
+    found += [("application", each.get("id")) for each in headers if isinstance(each, dict)]
+    for kind in ("application", "connection"):
+        found += [(kind, each.get("id")) for each in _items(goal, f"{kind}s")]
+    return frozenset((kind, id) for kind, id in found if isinstance(id, str))
+
+
+def _items(fields: dict[str, Any], name: str) -> Iterator[dict[str, Any]]:
+    items = fields.get(name)
+    return (item for item in (items if isinstance(items, list) else ()) if isinstance(item, dict))

@@ -1,0 +1,210 @@
+"""What goes wrong at publishing: who is told what, and when it is tried again."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pygit2
+import pytest
+from demandops.errors import StateRepoError, Unsound
+from demandops.runtime import Runtime
+from demandops.service import Generator
+from demandops.staterepo.git.repository import DiskFull, PushDenied, disk_error
+
+from tests.kit import rig
+from tests.kit.limits import files_end_at
+from tests.kit.repo import tip
+from tests.kit.rig import Person, Stages, goal
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [
+        (errno.ENOSPC, DiskFull),
+        (errno.EDQUOT, DiskFull),
+        (errno.EACCES, PushDenied),
+        (errno.EROFS, PushDenied),
+        (errno.EIO, Unsound),
+        (errno.ENOENT, type(None)),
+    ],
+)
+def test_an_error_of_a_disk_is_known_by_number_or_text(number: int, kind: type) -> None:
+    of_python = OSError(number, os.strerror(number))
+    of_libgit2 = OSError(f"failed to write out file: {os.strerror(number)}")
+    for error in (of_python, of_libgit2):
+        assert type(disk_error(error, "fleet.git")) is kind
+
+
+def test_a_full_disk_keeps_demands_waiting_until_there_is_room(
+    bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        stages = Stages()
+        journal = generator._slot.folder / "outbox.jsonl"
+        with files_end_at(journal.stat().st_size + 1500):  # more than an entry, less than a pack
+            ticket = generator.submit(goal(2), listener=stages)
+            rig.wait_until(lambda: ticket.future.done() or "away" in stages.names, "it is told")
+            told = dict(stages.told).get("away", "")
+            assert "its disk has no room (File too large); free some" in told
+            assert "no room" in generator.remote_status.unreachable
+        assert rig.receipt(ticket).outcome == "booked"
+    assert caplog.text.count("trying again") == 1
+    rig.assert_sound(bare)
+
+
+def test_an_io_error_ends_the_process_and_the_next_start_goes_by_the_journal(bare: Path) -> None:
+    runtime = Runtime()
+    generator = Generator(str(bare), runtime=runtime)
+    broken = OSError(errno.EIO, os.strerror(errno.EIO))
+
+    def fail(stage: str, text: str) -> None:
+        if stage == "committed":
+            generator._repository.objects = _Broken(generator._repository.objects, broken)
+
+    ticket = generator.submit(goal(1), "op-1", fail)
+    with pytest.raises(Unsound, match=r"Input/output error; check its disk"):
+        rig.receipt(ticket)
+    assert generator.close(timeout=5) is False
+    assert rig.operations(bare) == []
+    assert rig.restart(bare) is True
+    assert rig.operations(bare) == ["op-1"]
+
+
+class _Broken:
+    """A repository on a disk whose references cannot be read."""
+
+    def __init__(self, repo: pygit2.Repository, error: OSError) -> None:
+        self._repo, self._error = repo, error
+
+    def __getattr__(self, name: str) -> object:
+        if name == "references":
+            raise self._error
+        return getattr(self._repo, name)
+
+
+def test_a_lock_that_is_no_file_is_told_and_not_waited_for_in_silence(bare: Path) -> None:
+    with rig.running(bare) as generator:
+        stages = Stages()
+        lock = bare / "refs" / "heads" / "main.lock"
+        lock.mkdir()
+        generator.submit(goal(1), listener=stages)
+        rig.wait_until(lambda: "away" in stages.names, "it is told", 20)
+        lock.rmdir()
+    rig.assert_sound(bare)
+
+
+# ---- a tip that cannot be read ----
+
+
+def _with_nonsense_encoding(bare: Path) -> None:
+    repo, parent = pygit2.Repository(str(bare)), tip(bare)
+    people = "Petra <petra@example.org> 1770000000 +0000"
+    text = (
+        f"tree {repo[parent].peel(pygit2.Tree).id}\nparent {parent}\nauthor {people}\n"
+        f"committer {people}\nencoding nonsense-7\n\nHello\n"
+    )
+    made = repo.write(pygit2.enums.ObjectType.COMMIT, text.encode())
+    repo.references["refs/heads/main"].set_target(made)
+
+
+def _with_entry_in_overrides(bare: Path, name: bytes, blob: pygit2.Oid) -> None:
+    repo = pygit2.Repository(str(bare))
+    tree = repo.TreeBuilder(repo[tip(bare)].peel(pygit2.Tree))
+    made = repo.write(pygit2.enums.ObjectType.TREE, b"100644 %s\0%s" % (name, blob.raw))
+    tree.insert("overrides", made, pygit2.enums.FileMode.TREE)
+    by = pygit2.Signature("Petra", "petra@example.org", 1_770_000_000, 0)
+    repo.create_commit("refs/heads/main", by, by, "By hand", tree.write(), [tip(bare)])
+
+
+def test_a_tip_that_cannot_be_read_is_told_once_and_tried_again_with_pauses(
+    bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with rig.running(bare, fetch_interval=0.01) as generator:
+        rig.book(generator, goal(1))
+        good = tip(bare)
+        _with_entry_in_overrides(bare, b"gone.yaml", pygit2.Oid(raw=b"\x11" * 20))
+        rig.wait_until(lambda: generator.failures, "the failure is shown")
+        assert list(generator.failures) == ["writer"]
+        with pytest.raises(StateRepoError, match="internal error of the generator: KeyError"):
+            rig.receipt(generator.submit(goal(2)))
+        assert caplog.text.count("Traceback") == 1
+        pygit2.Repository(str(bare)).references["refs/heads/main"].set_target(good)
+        rig.book(generator, goal(3))
+        rig.wait_until(lambda: not generator.failures, "it works again")
+    rig.assert_sound(bare)
+
+
+def test_a_commit_in_an_unknown_encoding_is_like_any_other(bare: Path) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        _with_nonsense_encoding(bare)
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+
+
+def test_a_file_whose_name_is_no_text_holds_back_itself_alone(bare: Path, person: Person) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        _with_entry_in_overrides(bare, b"\xff.yaml", pygit2.Repository(str(bare)).create_blob(b"x"))
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+        assert {fault.file for fault in generator.snapshot.problems} == {"overrides/\ufffd.yaml"}
+
+
+# ---- a damaged clone ----
+
+
+def _truncate_packs(clone: Path) -> None:
+    for pack in clone.glob("objects/pack/*.pack"):
+        pack.chmod(0o644)
+        os.truncate(pack, pack.stat().st_size // 2)
+
+
+def _drop_indexes(clone: Path) -> None:
+    for index in clone.glob("objects/pack/*.idx"):
+        index.unlink()
+
+
+def _break_head(clone: Path) -> None:
+    (clone / "HEAD").write_text("nonsense\n")
+
+
+def _empty_config(clone: Path) -> None:
+    (clone / "config").write_text("")
+
+
+def _drop_objects(clone: Path) -> None:
+    shutil.rmtree(clone / "objects")
+
+
+@pytest.mark.parametrize(
+    "damage", [_truncate_packs, _drop_indexes, _break_head, _empty_config, _drop_objects]
+)
+def test_a_damaged_clone_is_made_anew(
+    url: str, bare: Path, tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    data = tmp_path / "data"
+    with rig.running(url, data=data) as generator:
+        rig.book(generator, goal(1))
+        clone = generator._slot.folder / "clone.git"
+    rig.git(clone, "repack", "-adq")
+    damage(clone)
+    with rig.running(url, data=data) as generator:
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+    rig.assert_sound(bare)
+
+
+def test_what_people_push_beside_a_damaged_clone_is_followed(
+    url: str, bare: Path, person: Person
+) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        clone = generator._slot.folder / "clone.git"
+    _break_head(clone)
+    person.change({"README.md": "Hello\n"})
+    with rig.running(url) as generator:
+        rig.book(generator, goal(2))
+        assert str(generator.snapshot.commit) == tip(bare)

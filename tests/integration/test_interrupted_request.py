@@ -1,0 +1,45 @@
+"""Ctrl-C and SIGTERM in a command that books: it ends at once and says what has an answer."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+import yaml
+from demandops.cli.main import run
+
+from tests.kit import rig
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_request_that_is_interrupted_says_what_has_an_answer(
+    bare: Path, data_home: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], number: int
+) -> None:
+    """The first demands are booked; then a folder stands in place of the branch's lock."""
+    file = tmp_path / "demands.yaml"
+    file.write_text(yaml.safe_dump_all(rig.goal(each) for each in range(60)))
+    lock = bare / "refs" / "heads" / "main.lock"
+
+    def interrupt() -> None:
+        rig.wait_until(lambda: rig.operations(bare), "a batch is published")
+        lock.mkdir()
+        os.kill(os.getpid(), number)
+
+    handler = signal.getsignal(signal.SIGTERM)
+    helper = threading.Thread(target=interrupt)
+    helper.start()
+    code = run(["request", str(file), "--state-repo", str(bare)])
+    helper.join()
+    lock.rmdir()
+    told, booked = capfd.readouterr(), len(rig.operations(bare))
+    assert code == 130
+    assert told.out.count(" booked in ") == booked < 60
+    assert told.err.count(" has no answer yet") == 60 - booked
+    assert f"{booked} of 60 requests have an answer" in told.err
+    assert "stays in the journal" in told.err
+    assert signal.getsignal(signal.SIGTERM) is handler
+    assert rig.restart(bare) is True
+    assert len(rig.operations(bare)) == 60

@@ -1,0 +1,96 @@
+"""Who comes next, when many demands of many requesters wait."""
+
+from __future__ import annotations
+
+from random import Random
+from typing import Any
+
+import pytest
+from demandops.service.fair_queue import FairQueue, requester_of, subjects_of
+from demandops.service.ticket import Ticket
+
+from tests.kit.memory import NOW
+
+
+def ticket(name: str, who: str, *subjects: str, **fields: Any) -> Ticket:
+    applications = [{"id": subject} for subject in subjects]
+    goal = {"demand": name, "requesters": [who], "applications": applications, **fields}
+    return Ticket(name, goal, NOW)
+
+
+def order(*tickets: Ticket) -> list[str]:
+    queue = FairQueue()
+    for each in tickets:
+        queue.append(each)
+    return [queue.popleft().operation for _ in tickets]
+
+
+def test_requesters_take_turns() -> None:
+    many = [ticket(f"a{number}", "a", f"x{number}") for number in range(100)]
+    assert order(*many, ticket("b0", "b", "y"), ticket("c0", "c", "z"))[:5] == [
+        *("a0", "b0", "c0"),
+        *("a1", "a2"),
+    ]
+
+
+def test_the_turn_goes_to_what_a_demand_must_follow() -> None:
+    waiting = (
+        ticket("a0", "a", "x0"),
+        ticket("a1", "a", "x1"),
+        ticket("a2", "a", "x2", "shared"),
+        ticket("b0", "b", "shared"),
+    )
+    assert order(*waiting) == ["a0", "a2", "a1", "b0"]
+
+
+def test_nothing_overtakes_what_may_touch_anything() -> None:
+    everything = Ticket("all", {"kind": "Decommission", "name": "vehicle01"}, NOW)
+    waiting = (ticket("a0", "a", "x"), ticket("a1", "a", "y"), everything, ticket("b0", "b", "z"))
+    assert order(*waiting) == ["a0", "a1", "all", "b0"]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_demand_comes_once_and_in_the_order_of_its_subjects(seed: int) -> None:
+    random = Random(seed)
+    queue, waiting, left = FairQueue(), list[Ticket](), list[Ticket]()
+    sent = [
+        ticket(f"{number}", random.choice("abc"), *random.sample("uvwxyz", random.randrange(3)))
+        if random.random() < 0.9
+        else Ticket(f"{number}", None, NOW)
+        for number in range(80)
+    ]
+    for each in sent:
+        queue.append(each)
+        waiting.append(each)
+        if random.random() < 0.1:
+            gone = waiting.pop(random.randrange(len(waiting)))
+            queue.remove([gone])
+        while waiting and random.random() < 0.3:
+            left.append(queue.popleft())
+            waiting.remove(left[-1])
+    while waiting:
+        left.append(queue.popleft())
+        waiting.remove(left[-1])
+    assert len(queue) == 0 and len(set(left)) == len(left)
+    for number, later in enumerate(left):
+        for earlier in left[:number]:
+            if earlier.goal is None or later.goal is None:
+                shared = True
+            else:
+                shared = bool(
+                    set(subjects_of(earlier.goal) or ()) & set(subjects_of(later.goal) or ())
+                )
+            assert not shared or sent.index(earlier) < sent.index(later)
+
+
+@pytest.mark.parametrize(
+    "goal",
+    [
+        *(None, 1, "x", [], {}, {"apps": 3}, {"apps": [3, {"header": []}], "connections": [None]}),
+        {"apps": [{"object_detection_fusion_app": {"requester_ids": [7]}}], "demand": ["x"]},
+    ],
+)
+def test_a_goal_that_is_no_goal_has_a_place_too(goal: Any) -> None:
+    assert requester_of(goal) == ""
+    assert not subjects_of(goal)
+    assert order(Ticket("one", goal, NOW), Ticket("two", goal, NOW)) == ["one", "two"]

@@ -1,0 +1,54 @@
+"""No thread ends unseen."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+from demandops.errors import StateRepoError, Unsound
+
+from tests.kit.turns import Turns
+
+
+def test_a_thread_that_fails_is_started_again_and_told_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    turns, began = Turns(1), list[float]()
+
+    def work() -> None:
+        began.append(turns.monotonic())
+        if len(began) < 4:
+            raise KeyError("odd")
+
+    thread = turns.keep_running("watch", work)
+    turns.sleep(0.5)
+    assert turns.failures == {"watch": "KeyError('odd')"}
+    thread.join()
+    assert began == [0, 1, 3, 7], "each pause is longer"
+    told = [record for record in caplog.records if record.levelno >= logging.INFO]
+    assert [record.getMessage() for record in told] == ["internal error in watch: KeyError('odd')"]
+    assert told[0].exc_info is not None
+    turns.sleep(200)
+    assert turns.failures == {}, "it works again"
+
+
+def test_what_works_again_may_fail_again(caplog: pytest.LogCaptureFixture) -> None:
+    turns = Turns(1)
+    error = StateRepoError("the tip cannot be read")
+    turns.failed("writer", error)
+    turns.recovered("writer")
+    assert turns.failures == {}
+    turns.failed("writer", error)
+    turns.failed("writer", error)
+    assert caplog.messages == ["the tip cannot be read"] * 2
+
+
+def test_after_what_is_unsound_nothing_is_started_again() -> None:
+    turns, told = Turns(1), list[object]()
+    turns.when_unsound = lambda: told.append(turns.unsound)
+
+    def work() -> None:
+        raise Unsound("an I/O error")
+
+    turns.keep_running("writer", work).join()
+    assert [str(each) for each in told] == ["an I/O error"]
