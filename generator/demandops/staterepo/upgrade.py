@@ -32,7 +32,7 @@ from demandops.staterepo import reader
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import Signer
-from demandops.staterepo.history import authorship, commit_message
+from demandops.staterepo.history import authorship, commit_message, message_format
 from demandops.staterepo.load import last_valid_config, ledger_files, state_in_effect
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress
@@ -242,7 +242,7 @@ def _message(made: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         [f"Why: `demandops upgrade` renders everything {why}."],
         ["Files written or removed:", *files],
     ]
-    return commit_message.compose(paragraphs, trailers)
+    return message_format.compose(paragraphs, trailers)
 
 
 _NAMES = {"flux": "Flux", "argocd": "Argo CD"}

@@ -78,13 +78,12 @@ def last_valid_claims(
     tree = trees.commit_of(repo, last_valid_commit).tree
     claims = {path: claim_at(tree, path) for path in paths}
     left = set(claims)
-    for commit, entry in commit_log.commits(repo, to, last_valid_commit) if left else ():
+    for commit, _ in commit_log.commits(repo, to, last_valid_commit) if left else ():
         before = trees.parent_tree(commit)
-        if before is None or not entry.by_generator:
-            continue
-        for path in [path for path in left if trees.differ(before, commit.tree, (path,))]:
-            claims[path] = claim_at(commit.tree, path)
-            left.remove(path)
+        changed = [path for path in left if trees.differ(before, commit.tree, (path,))]
+        if before is not None and changed and commit_log.is_by_generator(repo, commit):
+            claims |= {path: claim_at(commit.tree, path) for path in changed}
+            left.difference_update(changed)
     return claims
 
 

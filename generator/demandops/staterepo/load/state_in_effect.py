@@ -93,9 +93,12 @@ def start_at(
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """
     record = record_at(repo, commit)
-    if record.first("In-Force"):
-        return recorded_state(repo, record, progress)
     tried, faults = set[tuple[Oid | None, ...]](), list[InvalidInput | StateRepoError]()
+    if record.first("In-Force"):
+        try:
+            return recorded_state(repo, record, progress)
+        except (InvalidInput, StateRepoError) as error:  # a record that is not ours
+            faults.append(error)
     for ancestor in commit_log.first_parents(repo, record.commit):
         content = tuple(trees.entry_id(ancestor.tree, root) for root in _ROOTS)
         if content not in tried:
@@ -108,10 +111,12 @@ def start_at(
 
 
 def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
-    """Return the generator's newest commit up to a commit, else that commit itself."""
+    """Return the generator's newest commit up to a commit, else that commit without trailers."""
     commit = trees.commit_of(repo, revision)
     made = commit_log.last_generator_commit(repo, commit.id)
-    return commit_log.entry_of(commit if made is None else trees.commit_of(repo, made))
+    if made is None:
+        return replace(commit_log.entry_of(commit), trailers={})
+    return commit_log.entry_of(trees.commit_of(repo, made))
 
 
 def recorded_state(
@@ -133,10 +138,16 @@ def recorded_state(
 def _source(record: LogEntry) -> ConfigSource:
     commit = record.first("Configuration") or record.first("In-Force")
     replacements: dict[str, Oid | None] = {}
-    for line in record.trailers.get("Stands-In", ()):
-        path, _, blob = line.rpartition(" ")
-        replacements[unquote(path)] = None if blob == _NONE else Oid(hex=blob)
-    return ConfigSource(Oid(hex=commit), replacements)
+    try:
+        for line in record.trailers.get("Stands-In", ()):
+            path, _, blob = line.rpartition(" ")
+            replacements[unquote(path)] = None if blob == _NONE else Oid(hex=blob)
+        return ConfigSource(Oid(hex=commit), replacements)
+    except ValueError:
+        raise StateRepoError(
+            f"commit {record.commit} has trailers about invalid files that cannot be read; revert "
+            "it, or merge valid files"
+        ) from None
 
 
 Faults = Mapping[Subject, tuple[Fault, ...]]
