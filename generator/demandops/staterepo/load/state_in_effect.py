@@ -183,7 +183,7 @@ class Judgement:
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
-        return self._without(self.advance, {**faults, **self.refused})
+        return self._without(self.advance, _together(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
         """Return the state in effect, and what changed, if the new configuration has ``faults``."""
@@ -267,8 +267,12 @@ def judge(
     refused = refused_in(state) if held_back is None else _recorded(advance, held_back)
     if state.config == old.config:
         return Judgement(repo, before, advance, with_new, with_new, refused, old)
-    with_old = {**refused_in(old), **faults_in(old)}
+    with_old = _together(faults_in(old), refused_in(old))
     return Judgement(repo, before, advance, with_new, with_old, refused, old)
+
+
+def _together(one: Faults, other: Faults) -> Faults:
+    return {subject: (*one.get(subject, ()), *other.get(subject, ())) for subject in {*one, *other}}
 
 
 def _recorded(advance: Advance, held_back: Collection[str]) -> Faults:
@@ -288,4 +292,7 @@ def _located_in_claim_files(
     claims = snapshot.state.ledger.claims_on(subject)
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
     paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]
-    return [fault.within(paths[0]) if paths and not fault.file else fault for fault in faults]
+    return [
+        fault.within(paths[0]) if paths and claim_file.kind_of(fault.file) is None else fault
+        for fault in faults
+    ]
