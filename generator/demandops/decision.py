@@ -185,12 +185,14 @@ def admit(
         return Decommission.parse(goal)
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         parsed, faults = demand_goal.parse(goal)
+        _refuse_large(parsed, config)
         request = permission.with_lease_terms(parsed, config)
         request = implied_connections.with_implied_connections(request, state.ledger, config)
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
             raise Refused(faults)
+        _refuse_large(wired, config)
         request = permission.with_lease_terms(wired, config)
     request = admission.with_chosen_types(request, config, state.ledger.connection)
     malformed = {found.field for found in faults}
@@ -209,6 +211,13 @@ def admit(
     if faults:
         raise Refused(sorted(dict.fromkeys(faults), key=lambda found: _subject_of(found.field)))
     return request
+
+
+def _refuse_large(request: DemandRequest, config: Config) -> None:
+    """Refuse a request that is too large, before anything looks at all that it lists."""
+    faults = list(admission.size_faults(request, config.repo_settings.limits))
+    if faults:
+        raise Refused(faults)
 
 
 def form_faults(goal: object) -> list[Fault]:

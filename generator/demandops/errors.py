@@ -7,11 +7,15 @@ faults that were found together, so that a person can fix a file or a request in
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 
-from demandops.quoting import one_line
+from demandops.quoting import clipped, one_line
+
+MOST_FAULTS = 100
+"""The faults of one file, or of a request, that are told; the others are counted."""
+_LONGEST_FIELD = 2_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +58,7 @@ class InvalidInput(DemandOpsError):
     """Raised when something that a person wrote is invalid; nothing was changed."""
 
     def __init__(self, faults: Iterable[Fault]) -> None:
-        self.faults = tuple(faults)
+        self.faults = tuple(_fewer(faults))
         super().__init__(self.faults)
 
     def __str__(self) -> str:
@@ -65,6 +69,18 @@ class InvalidInput(DemandOpsError):
     def at(cls, field: str, message: str, *, code: str = "invalid", file: str = "") -> InvalidInput:
         """Return the error with one fault."""
         return cls([Fault(code, field, message, file)])
+
+
+def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
+    """Yield the first faults of each file, shortened, and how many more it has."""
+    counts: dict[str, int] = {}
+    for fault in faults:
+        count = counts[fault.file] = counts.get(fault.file, 0) + 1
+        if count <= MOST_FAULTS:
+            yield replace(fault, field=clipped(fault.field, _LONGEST_FIELD))
+    for file, count in counts.items():
+        if count > MOST_FAULTS:
+            yield Fault("more", "", f"has {count - MOST_FAULTS} more faults", file)
 
 
 class Refused(InvalidInput):

@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from demandops.errors import Refused
+from demandops.config.repo_settings import ROOT_FILE
+from demandops.errors import Refused, fault
 from demandops.ledger import claim_file, recent_shutdowns
 from demandops.ledger.ledger import Changes
 from demandops.ledger.world import World
@@ -107,8 +108,24 @@ def build_changeset(
         if old or new:
             releases.append(describe_change(old, new, current is not None))
     check_files(files)
+    _refuse_large(files, after.config.repo_settings.limits.file_bytes, read)
     releases.sort(key=lambda change: change.order)
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
+
+
+def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
+    """Refuse a file that grows above the limit; one that shrinks may still be above it."""
+    faults = []
+    for path, text in files.items():
+        size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
+        if size > max(most, len((read(path) or "").encode()) if size > most else 0):
+            message = (
+                f"would have {size} bytes; at most {most} are allowed; demand less of it, or have "
+                f"a platform engineer raise limits.fileBytes in {ROOT_FILE}"
+            )
+            faults.append(fault("", message, code="too-large").within(path))
+    if faults:
+        raise Refused(faults)
 
 
 def render_all(

@@ -213,7 +213,7 @@ def _holds(world: World) -> bool:
 
 
 def _generated_files(tree: Tree) -> dict[str, Oid]:
-    return {path: blob.id for path, blob in trees.blobs(tree, GENERATED_ROOTS)}
+    return {path: found.id for path, found in trees.entries(tree, GENERATED_ROOTS)}
 
 
 def _blob(text: str) -> Oid:
