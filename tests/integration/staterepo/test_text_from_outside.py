@@ -65,6 +65,9 @@ def test_a_persons_commit_that_quotes_trailers_is_a_persons(
     rig.book(generator, goal(2))
     assert read(bare, DETECTION) == before
     assert (True, "made by a person") in verdicts(bare)
+    with reader.opened(str(bare)) as repo:
+        (entry,) = [entry for entry in repo.log() if entry.author == "Petra Platform"][-1:]
+    assert (entry.trailers, entry.why) == ({}, "")
 
 
 def test_a_start_trusts_no_record_that_is_not_the_generators(bare: Path, person: Person) -> None:

@@ -62,7 +62,8 @@ def test_every_id_is_read_back_by_git_and_by_us_as_it_was(
     text = commit_message.of_decision(decision, "op-1", desk.now)
     who = commit_message.author(decision, desk.now)
     tree = repo.TreeBuilder().write()
-    commit = repo.create_commit(None, who, who, text, tree, [])
+    committer = commit_message.generator_signature(desk.now)
+    commit = repo.create_commit(None, who, committer, text, tree, [])
     ours = commit_log.entry_of(repo[commit].peel(pygit2.Commit)).trailers
     assert ours["Requester"] == names
     assert ours["Request-Id"] == [request]

@@ -74,19 +74,22 @@ def _text(raw: bytes) -> str:
 
 
 def entry_of(commit: Commit) -> LogEntry:
-    """Return the log entry of a commit."""
+    """Return the log entry of a commit.
+
+    Trailers and reason of a person's commit are left out, unless it merges a proposal.
+    """
     text = message_format.parse(_text(commit.raw_message))
     committer = _text(commit.committer.raw_name), _text(commit.committer.raw_email)
+    is_ours, is_proposal = committer == (GENERATOR_NAME, GENERATOR_EMAIL), PROPOSAL in text.trailers
+    is_told = is_ours or is_proposal
     return LogEntry(
         commit=str(commit.id),
         time=time_of(commit),
         author=author_of(commit)[0],
         summary=text.summary,
-        trailers=text.trailers,
-        why=text.why,
-        by_generator=committer == (GENERATOR_NAME, GENERATOR_EMAIL)
-        and "Render-Version" in text.trailers
-        and PROPOSAL not in text.trailers,
+        trailers=text.trailers if is_told else {},
+        why=text.why if is_told else "",
+        by_generator=is_ours and not is_proposal and "Render-Version" in text.trailers,
     )
 
 
