@@ -17,13 +17,14 @@ import pytest
 import yaml
 from demandops.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
 from demandops.service import Ticket
+from demandops.service.approvals import approvals
 
 from tests.kit import goals, rig
 from tests.kit.generator import Proposed
 from tests.kit.git_over_http import Server
 from tests.kit.limits import files_end_at
 from tests.kit.repo import Person, branches
-from tests.kit.rig import Gate, git, goal, leave
+from tests.kit.rig import Gate, Goal, git, goal, leave
 
 
 def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_it(
@@ -96,6 +97,22 @@ def assert_rendered(bare: Path) -> None:
     stands = {path: text for path, text in stands.items() if path.endswith(".yaml")}
     wanted = {p: t for p, t in rendered_files(state).items() if p.startswith("clusters/")}
     assert stands == {path: text for path, text in wanted.items() if path.endswith(".yaml")}
+
+
+def test_a_requester_may_have_only_so_many_proposals(
+    bare: Path, petra: Person, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def of(who: str, name: str) -> Goal:
+        link = {"id": name, "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
+        return {"kind": "Demand", "demand": name, "requesters": [who], "connections": [link]}
+
+    monkeypatch.setattr(approvals, "PROPOSAL_LIMIT", 1)
+    with rig.running(bare) as generator:
+        branch = Proposed(generator, of("vehicle00", "first")).branch
+        with pytest.raises(Refused, match=r"^1 demands of 'vehicle00' await approval already"):
+            rig.receipt(generator.submit(of("vehicle00", "second")))
+        other = Proposed(generator, of("vehicle01", "third"))
+        assert sorted([branch, other.branch]) == branches(bare)
 
 
 def test_a_deleted_branch_turns_the_demand_down(url: str, bare: Path, petra: Person) -> None:

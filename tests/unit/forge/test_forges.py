@@ -11,9 +11,11 @@ from demandops.config.load import load
 from demandops.config.repo_settings import Proposals
 from demandops.errors import InvalidInput
 from demandops.forge import Forge, ForgeError, PullRequest, forge_for
+from demandops.service.approvals.forge_worker import ForgeWorker
 
 from tests.kit.config import configuration
-from tests.kit.http import serving
+from tests.kit.http import Answer, serving
+from tests.kit.turns import Turns
 from tests.unit.forge.replaying import TOKEN, Replay, replaying
 
 BRANCH = "demand/one-0123456789ab"
@@ -125,6 +127,19 @@ def test_a_token_file_that_is_none_is_told(tmp_path: Path, write: Write, message
     with pytest.raises(ForgeError) as error:
         forge_for(configured, file)
     assert str(error.value) == f"the token file {file}{message}"
+
+
+def test_a_forge_that_is_asked_too_often_is_left_alone_for_a_minute(tmp_path: Path) -> None:
+    (tmp_path / "token").write_text(TOKEN)
+    turns = Turns(1)
+    with serving(lambda call: Answer.json({"message": "slow down"}, 429)) as server:
+        at = {"forge": "github", "url": "https://github.com/a/b", "api": server.url}
+        worker = ForgeWorker(tmp_path / "token", lambda branch: None, turns)
+        worker.open(Proposals.model_validate(at), "demand/x", "x", "x")
+        turns.sleep(59)
+        assert len(server.calls) == 1
+        turns.sleep(2)
+        assert len(server.calls) == 2
 
 
 def test_no_token_file_is_told_with_the_remedy() -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import stat
 from pathlib import Path
 
 import pytest
 from demandops.errors import StateRepoError
 from demandops.staterepo.write.journal import DamagedJournal, Journal, JournalEntry, parse, read
+from demandops.staterepo.write.slot import Slot
 
 from tests.kit.limits import files_end_at
 
@@ -45,6 +48,16 @@ def test_what_was_written_is_read(path: Path, text: bytes) -> None:
     assert found["op-c"].proposal == PROPOSAL
     assert Journal(path).pending == found
     assert len(path.read_bytes().splitlines()) == 2, "what is done is left out at a start"
+
+
+def test_only_its_owner_reads_a_journal(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        Slot(tmp_path / "data" / "repo").close()
+    finally:
+        os.umask(before)
+    for folder in (tmp_path / "data" / "repo", tmp_path / "data" / "repo" / "slot-0"):
+        assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IRWXU
 
 
 def test_a_torn_last_entry_is_dropped(path: Path, text: bytes) -> None:
