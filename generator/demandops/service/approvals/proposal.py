@@ -17,8 +17,9 @@ from demandops.demand.demand_request import DemandRequest, Release
 from demandops.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
 from demandops.forge import PullRequest
 from demandops.render.changes.changeset import FileReader
-from demandops.service.ticket import ProposalRecord, Ticket
+from demandops.service.ticket import Ticket
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.write.journal import ProposalRecord
 
 Key = tuple[str, ...]
 Decided: TypeAlias = list[tuple[Ticket, Decision]]
