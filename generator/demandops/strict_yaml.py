@@ -221,7 +221,8 @@ def set_key(text: str, key: str, value: object) -> str:
     Raises:
         InvalidInput: if the file's form does not allow that.
     """
-    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    with _strict(""):
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
     current = next((value for name, value in pairs if name.value == key), None)
     if isinstance(current, yaml.ScalarNode):
@@ -246,7 +247,7 @@ def to_json(value: object) -> str:
 
     Characters that YAML cannot print become ``\\uXXXX``; the others stay readable.
     """
-    text = json.dumps(value, ensure_ascii=False, sort_keys=False, default=_unknown)
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, default=_unknown)
     return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 

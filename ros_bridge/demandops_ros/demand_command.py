@@ -61,7 +61,7 @@ def demand(
                 _print_answer(client.send(data, _print_stages(output)), output)
         except DemandError as error:
             raise InvalidInput([fault("", str(error), code=error.code).within(file)]) from None
-        except (ValueError, TypeError, AssertionError, AttributeError) as error:
+        except (ValueError, TypeError, AssertionError, AttributeError, OverflowError) as error:
             raise InvalidInput([fault("", f"is not a demand: {error}").within(file)]) from None
 
 

@@ -15,6 +15,7 @@ import yaml
 from demandops import strict_yaml
 from demandops.config.load import load
 from demandops.errors import InvalidInput
+from demandops.errors import InvalidInput
 from demandops.identifiers import control_character
 
 from tests.kit.config import FAST, configuration, override, skeleton
@@ -206,6 +207,12 @@ def test_numbers_and_truths_stay_numbers_and_truths() -> None:
     assert both(written) == [data], written
 
 
+@pytest.mark.parametrize("number", [float("inf"), float("-inf"), float("nan")])
+def test_a_number_that_json_lacks_is_not_written_as_text(number: float) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        strict_yaml.to_json({"a": [number]})
+
+
 @pytest.mark.parametrize("text", [text for text in UNSEEN if ord(text[0]) < 0xFEFF])
 def test_what_no_reader_would_see_is_refused_in_an_id(text: str) -> None:
     assert MemoryRepo().faults(goal([], [connection(f"a{text.strip('ab ')}b")]))
@@ -228,3 +235,9 @@ def test_a_file_that_is_too_long_is_not_parsed() -> None:
     text = "a: [" + "x, " * (strict_yaml.MAX_LENGTH // 3) + "]"
     with pytest.raises(InvalidInput, match="at most 4000000 are allowed"):
         strict_yaml.load(text)
+
+
+@pytest.mark.parametrize("text", ["a: *b\n", "a: [", "a: \x00", "a: b: c"])
+def test_no_key_is_set_in_what_is_no_yaml(text: str) -> None:
+    with pytest.raises(InvalidInput, match="not valid YAML"):
+        strict_yaml.set_key(text, "key", 1)
