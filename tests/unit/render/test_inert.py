@@ -15,7 +15,6 @@ import yaml
 from demandops import strict_yaml
 from demandops.config.load import load
 from demandops.errors import InvalidInput
-from demandops.errors import InvalidInput
 from demandops.identifiers import control_character
 
 from tests.kit.config import FAST, configuration, override, skeleton
