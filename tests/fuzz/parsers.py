@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pygit2
+import yaml
 from application_manager_interfaces.action import DeploymentRequest
 from demandops import strict_yaml
 from demandops.cluster.health import health_reader
@@ -159,11 +160,34 @@ def config_file(data: bytes) -> None:
 
 
 def chart_file(data: bytes) -> None:
+    _try({_CHARTS[data[0] % len(_CHARTS)] if data else "": _text(data[1:])})
+
+
+def chart_values(file: tuple[str, Any]) -> None:
+    _try({file[0]: json.dumps(file[1])})
+
+
+def _try(changed: dict[str, str]) -> None:
     try:
-        changed = {_CHARTS[data[0] % len(_CHARTS)] if data else "": _text(data[1:])}
         try_configuration(State.of(load(_CONFIG | changed), Ledger()))
     except InvalidInput as error:
         _told(error)
+
+
+def _changed_charts() -> st.SearchStrategy[tuple[str, Any]]:
+    paths = [
+        path for path in _CHARTS if path.endswith((".yaml", ".json")) and "/templates/" not in path
+    ]
+    files = [(path, yaml.safe_load(_CONFIG[path])) for path in paths]
+    odd = ANYTHING.filter(_is_json)
+    return st.one_of([st.tuples(st.just(path), _near(data, odd)) for path, data in files])
+
+
+def _is_json(value: Any) -> bool:
+    try:
+        return bool(json.dumps(value, allow_nan=False))
+    except (TypeError, ValueError):
+        return False
 
 
 def set_key(data: bytes) -> None:
@@ -412,6 +436,7 @@ TARGETS = (
     ),
     Target(config_file, _seeds_of(_FILES)),
     Target(chart_file, _seeds_of(_CHARTS)),
+    Target(chart_values, values=_changed_charts()),
     Target(set_key, tuple(_CONFIG[path].encode() for path in _FILES)),
     Target(claim, _bytes(path for path in _BOOKED if "shutdowns" not in path.parts)),
     Target(marker, (_MARKER,)),
