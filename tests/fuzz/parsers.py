@@ -395,17 +395,16 @@ def _reported(value: Any, *, is_top: bool = True) -> st.SearchStrategy[Any]:
     """Return what an API may report: parts are missing or null, texts and numbers are others."""
     if isinstance(value, dict):
         parts = {key: _reported(inner, is_top=False) for key, inner in value.items()}
-        metadata = parts.pop("metadata", None) if is_top else None
-        every = (
-            {"metadata": metadata.map(lambda found: found or {})} if metadata is not None else {}
-        )
+        if not is_top:
+            return st.none() | st.fixed_dictionaries({}, optional=parts)
+        every = {"metadata": parts.pop("metadata").map(lambda found: found or {})}
         return st.fixed_dictionaries(every, optional=parts)
     if isinstance(value, list):
         inner = [_reported(one, is_top=False).filter(lambda one: one is not None) for one in value]
         return st.none() | (st.lists(st.one_of(inner), max_size=2) if inner else st.just([]))
     if isinstance(value, bool | int):
-        return st.just(value) | st.integers(0, 3)
-    return st.just(value) | st.sampled_from(["", "a", "c"])
+        return st.none() | st.just(value) | st.integers(0, 3)
+    return st.none() | st.just(value) | st.sampled_from(["", "a", "c"])
 
 
 def cluster_objects(objects: dict[Any, Any]) -> None:
