@@ -20,6 +20,7 @@ from demandops import naming, strict_yaml
 from demandops.config.load import load
 from demandops.decision import State, try_configuration
 from demandops.demand.claim import ClaimKey
+from demandops.demand.demand_goal import _value_problem
 from demandops.errors import InvalidInput
 from demandops.identifiers import topic_problem
 from demandops.ledger import claim_file
@@ -233,7 +234,7 @@ _PAIR = st.tuples(TEXT, TEXT)
 
 TARGETS = (
     Target(text_in_yaml, values=TEXT),
-    Target(value_in_yaml, values=values),
+    Target(value_in_yaml, values=values.filter(lambda value: not _value_problem(value, 0))),
     Target(claim_in_its_file, values=claims | joined_claims()),
     Target(
         rendered_file,

@@ -201,9 +201,10 @@ def test_a_written_text_is_read_back_by_every_parser(text: str) -> None:
 
 
 def test_numbers_and_truths_stay_numbers_and_truths() -> None:
-    data = {"a": [1, -1, 0, 1.5, 1e30, 10**20, True, False, None]}
-    written = strict_yaml.dump(data)
-    assert both(written) == [data], written
+    numbers = [1, -1, 0, 1.5, 1e30, -1e-09, 2.5e-300, 10**20, True, False, None]
+    data = {"a": [*numbers, '"1e-09', "e+1e-09"]}
+    for written in (strict_yaml.dump(data), strict_yaml.to_json(data)):
+        assert both(written) == [data], written
 
 
 @pytest.mark.parametrize("number", [float("inf"), float("-inf"), float("nan")])
