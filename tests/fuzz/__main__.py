@@ -8,11 +8,12 @@ import resource
 import shutil
 import signal
 import sys
+import tempfile
 import time
 import traceback
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stderr
+from io import StringIO
 from multiprocessing import get_context
 from pathlib import Path
 from random import Random, SystemRandom
@@ -70,6 +71,7 @@ class Run:
             os._exit(status)  # what the parent has registered for its own end is not for this one
 
     def _look(self) -> None:
+        tempfile.tempdir = str(self.folder)  # which the next run removes
         signal.signal(signal.SIGVTALRM, _stop)
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, used + MOST_MEMORY))
@@ -195,8 +197,9 @@ def run(one: Run) -> list[str]:
 
 def main(names: list[str]) -> int:
     """Run the named targets, two at once; return the exit code."""
-    instrument: Callable[..., Any] = atheris.instrument_imports if atheris else nullcontext
-    with instrument(include=["demandops", "demandops_ros"]) if atheris else nullcontext():
+    ours = ["demandops", "demandops_ros"]
+    instrumented = atheris.instrument_imports(include=ours) if atheris else nullcontext()
+    with instrumented, redirect_stderr(StringIO()):  # it names each module
         from tests.fuzz import parsers, written
     targets = {one.name: one for one in (*parsers.TARGETS, *written.TARGETS)}
     seconds = float(os.environ.get("FUZZ_S", "10"))
