@@ -17,7 +17,7 @@ from demandops.config.base_model import (
     Visible,
     without,
 )
-from demandops.errors import quoted
+from demandops.quoting import quoted
 
 ROOT_FILE = "demandops.yaml"
 

@@ -19,8 +19,9 @@ from demandops.demand.application import Application
 from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put, Release, Renew
 from demandops.demand.lease import LONGEST_S
-from demandops.errors import Fault, fault, quoted, suggestion
+from demandops.errors import Fault, fault, suggestion
 from demandops.identifiers import id_problem, topic_problem
+from demandops.quoting import quoted
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:

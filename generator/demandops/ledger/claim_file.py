@@ -24,7 +24,8 @@ from demandops.connections.route import Route, RouteOptions
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
-from demandops.errors import Fault, InvalidInput, fault, quoted
+from demandops.errors import Fault, InvalidInput, fault
+from demandops.quoting import quoted
 from demandops.settings import LEDGER_API_VERSION
 from demandops.subject import Subject, SubjectKind, TopicKey
 

@@ -10,7 +10,8 @@ from typing import Any
 import jsonschema_rs
 
 from demandops.config.base_model import field_path
-from demandops.errors import InvalidInput, fault, quoted
+from demandops.errors import InvalidInput, fault
+from demandops.quoting import quoted
 
 _MAX_WORK = 100_000
 _MAX_VISITS = 1_000_000

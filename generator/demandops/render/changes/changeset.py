@@ -17,6 +17,7 @@ from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
+from demandops.quoting import one_line
 from demandops.render import release_file
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
@@ -172,8 +173,8 @@ def _differences(old: Release | None, new: Release) -> tuple[str, ...]:
         before = (old.facts() if old else []) + before
         after = new.facts() + after
     old_facts, new_facts = frozenset(before), frozenset(after)
-    removed = [f"- {fact}" for fact in before if fact not in new_facts]
-    added = [f"+ {fact}" for fact in after if fact not in old_facts]
+    removed = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
+    added = [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
     return (*removed, *added)
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from demandops.errors import StateRepoError, quoted
+from demandops.errors import StateRepoError
+from demandops.quoting import quoted
 from demandops.staterepo.git.local_repository import LocalRepository
 from demandops.staterepo.git.remote_repository import HAS_PASSWORD, Notify, RemoteRepository
 from demandops.staterepo.git.repository import StateRepository
