@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 from demandops.config.load import load
 from demandops.config.repo_settings import Proposals
 from demandops.errors import InvalidInput
-from demandops.forge import Forge, ForgeError, PullRequest, forge_for
+from demandops.forge import Forge, ForgeError, Gitea, PullRequest, forge_for
 from demandops.service.approvals.forge_worker import ForgeWorker
 
 from tests.kit.config import configuration
@@ -195,3 +196,12 @@ def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> No
         load(config)
     faults = [str(found) for found in error.value.faults]
     assert any(message in found for found in faults), faults
+
+
+@pytest.mark.parametrize(
+    ("number", "link"), [("1e999", "https://x"), ("null", "https://x"), ("1", r"https://x\nA: b")]
+)
+def test_an_answer_with_an_odd_number_or_link_is_no_pull_request(number: str, link: str) -> None:
+    answer = f'{{"number": {number}, "html_url": "{link}", "merged": false, "state": "open"}}'
+    with pytest.raises(ForgeError, match="is not a pull request; check that this is Gitea's API"):
+        Gitea("https://x", "token", "owner", "name")._read(json.loads(answer))

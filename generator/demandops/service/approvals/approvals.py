@@ -36,7 +36,7 @@ from demandops.service.approvals.proposal import (
 )
 from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
-from demandops.service.ticket import ProposalRecord, Receipt, Ticket, receipt_of
+from demandops.service.ticket import Receipt, Ticket, receipt_of
 from demandops.settings import PROPOSAL_LIMIT
 from demandops.staterepo.git.repository import PushDenied, StateRepository
 from demandops.staterepo.git.signing import SigningFailed
@@ -44,6 +44,7 @@ from demandops.staterepo.history import commit_log
 from demandops.staterepo.history.commit_log import RecordedOutcome
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.write.commit_batch import CommitBatch
+from demandops.staterepo.write.journal import ProposalRecord
 from demandops.staterepo.write.proposal_branch import (
     BranchHeads,
     BranchMoved,
