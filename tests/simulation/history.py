@@ -9,13 +9,14 @@ from tempfile import TemporaryDirectory, mkdtemp
 
 import pygit2
 import yaml
+from demandops.service.timing.expiry import LONGEST_WAIT_S
 from demandops.staterepo.git.repository import MAIN
 
 from tests.kit import repo
 from tests.kit.promises import Maker, name_of
 from tests.kit.repo import POLICY, GitRepo
 from tests.model.leases import Goal
-from tests.simulation.oracle import SLACK_S, VISITOR, Asked, Oracle
+from tests.simulation.oracle import SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
 
 STEPS = 30
@@ -54,6 +55,7 @@ class History:
         self.chance, self.turns = world.turns.chance, world.turns
         self._maker = Maker(self.chance)
         self._latest = 0.0
+        self._sent: list[Goal] = []
 
     def run(self, steps: int) -> None:
         """Let things happen, then heal everything and check the end."""
@@ -79,6 +81,7 @@ class History:
             machine.crashes_in = machine.losses = machine.rejections = 0
             if not machine.is_up:
                 machine.start()
+        self.turns.sleep(2 * LONGEST_WAIT_S)
         self.world.set_clocks(self._latest - self.turns.offset)
         self.turns.sleep(60)
         self.oracle.check()
@@ -96,17 +99,26 @@ class History:
             return
         machine = self.chance.choice(ready)
         for _ in range(self.chance.choice([1, 1, 1, 2, 4])):
-            goal = self._visitor() if not self.chance.randrange(8) else self._maker.any()
-            self._ask(machine.name, goal)
+            self._sent.append(self._goal())
+            self.oracle.ask(machine, self._sent[-1])
 
-    def _ask(self, name: str, goal: Goal) -> Asked:
-        (machine,) = [each for each in self.world.machines if each.name == name]
-        return self.oracle.ask(machine, goal)
+    def _goal(self) -> Goal:
+        kind = self.chance.randrange(8)
+        if kind == 0:
+            return self._visitor()
+        if kind == 1 and self._sent:  # as who waited in vain for an answer
+            return self.chance.choice(self._sent[-6:])
+        if kind == 2:
+            return self._maker._message(shutdown=bool(self.chance.randrange(2)))
+        return self._maker.any()
 
     def _visitor(self) -> Goal:
         number = self.chance.randrange(3)
         made = self._maker.put()
         made |= {"demand": f"visit{number}", "requesters": [f"{VISITOR}{number}"]}
+        if not self.chance.randrange(4):
+            named = {key: made[key] for key in ("kind", "demand", "requesters")}
+            return named | {"operation": self.chance.choice(["release", "renew"])}
         topics = [{"topic": f"/ego{self.chance.randrange(3)}", "source": "vehicle00"}]
         made["applications"] = [
             {
@@ -131,9 +143,9 @@ class History:
 
     def spoil_network(self) -> None:
         machine = self.chance.choice(self.world.machines)
-        kind = self.chance.randrange(6)
-        if kind < 2:
-            machine.losses += self.chance.randrange(1, 3)
+        kind = self.chance.randrange(7)
+        if kind < 3:
+            machine.losses += self.chance.randrange(1, 4)
         elif kind == 2:
             machine.rejections += 1
         elif kind == 3:
@@ -144,8 +156,13 @@ class History:
             machine.is_cut_off, machine.delay = False, 0.0
 
     def set_clocks(self) -> None:
+        """Set the clocks; once set back, not forward again before every machine has seen it.
+
+        Who saw neither may end a lease early that another recorded in between.
+        """
         self.oracle.check()
-        self.world.set_clocks(self.chance.choice([-1, 1]) * self.chance.choice([60, 600, 4000]))
+        sign = self.chance.choice([-1, 1]) if self.turns.offset == self._latest else -1
+        self.world.set_clocks(sign * self.chance.choice([60, 600, 4000]))
         self._latest = max(self._latest, self.turns.offset)
 
     # ---- people ----

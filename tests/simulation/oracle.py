@@ -66,9 +66,9 @@ class Oracle:
         self._place: dict[str, int] = {}
         self._parsed: dict[pygit2.Oid, Claim] = {}
         self._last: dict[Any, int] = {}
-        self._failure: Exception | None = None
         self._claims: dict[Any, Any] = {}
-        world.on_start, world.on_push = self._check_resumed, self._follow_main
+        world.on_start = self._check_resumed
+        world.on_push = lambda: self._guard(self._follow_main)
 
     def ask(self, machine: Machine, goal: Goal) -> Asked:
         """Send a demand to a machine and watch for its answer."""
@@ -86,9 +86,9 @@ class Oracle:
 
     def check(self) -> None:
         """Fail if anything that happened should not have."""
-        self._follow_main()
-        if self._failure is not None:
-            raise self._failure
+        self._guard(self._follow_main)
+        if self.world.failure is not None:
+            raise self.world.failure
 
     def claims(self, revision: str = MAIN) -> dict[str, Claim]:
         """Return the claims of a commit by their files."""
@@ -174,13 +174,16 @@ class Oracle:
     # ---- answers ----
 
     def _watch(self, asked: Asked) -> None:
-        asked.ticket.future.add_done_callback(lambda future: self._note_answer(asked))
+        asked.ticket.future.add_done_callback(
+            lambda future: self._guard(lambda: self._check_answer(asked))
+        )
 
-    def _note_answer(self, asked: Asked) -> None:
+    def _guard(self, check: Callable[[], object]) -> None:
+        """Keep a failure for the next check: generators and futures survive most errors."""
         try:
-            self._check_answer(asked)
+            check()
         except Exception as error:
-            self._failure = self._failure or error
+            self.world.failure = self.world.failure or error
 
     def _check_answer(self, asked: Asked) -> None:
         self._follow_main()
@@ -188,6 +191,7 @@ class Oracle:
         operation, error = asked.ticket.operation, asked.ticket.future.exception()
         place = self._place.get(operation)
         if error is not None:
+            assert "internal error" not in str(error), error
             assert place is None, f"{operation} is booked, but was answered {error}"
             if isinstance(error, InvalidInput) and not asked.needs_approval:
                 self._assert_possible(asked, "refused")

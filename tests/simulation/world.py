@@ -18,7 +18,7 @@ from typing import Any
 
 import git
 import pygit2
-from demandops.errors import StateRepoError
+from demandops.errors import DemandOpsError, StateRepoError
 from demandops.runtime import Runtime
 from demandops.service import Generator, generator
 from demandops.staterepo.git.remote_repository import RemoteRepository
@@ -72,6 +72,12 @@ class Machine(Runtime):
                 self.sleep(5)
         self.generator, self.started_at = made, self.monotonic()
         self.world.on_start(self)
+
+    def failed(self, name: str, error: Exception) -> None:
+        """Note what no fault of this world explains."""
+        super().failed(name, error)
+        if not isinstance(error, DemandOpsError):
+            self.world.failure = self.world.failure or error
 
     def may_crash(self) -> None:
         """Crash if it is time; then the calling thread never goes on."""
@@ -225,7 +231,8 @@ class Clone(RemoteRepository):
             references.delete(reference)
             return ""
         if reference == MAIN:
-            assert self._machine.world.remote.descendant_of(commit, now), "history was rewritten"
+            if not self._machine.world.remote.descendant_of(commit, now):
+                self._machine.world.failure = AssertionError("history was rewritten")
             self._machine.world.pushed_by[commit] = (
                 self._machine,
                 self._machine.started_at,
@@ -250,6 +257,8 @@ class World:
         """Who pushed a tip of main, when it had started, and when it did."""
         self.dead: list[Any] = []
         self.on_start: Callable[[Machine], object] = lambda machine: None
+        self.failure: Exception | None = None
+        """What must not happen, if it did."""
         self.on_push: Callable[[], object] = lambda: None
         self.machines = [Machine(self, f"machine{number}") for number in range(machines)]
         self.last_jump = -1.0
