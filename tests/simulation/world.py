@@ -261,6 +261,7 @@ class World:
         """What must not happen, if it did."""
         self.on_push: Callable[[], object] = lambda: None
         self.machines = [Machine(self, f"machine{number}") for number in range(machines)]
+        self.last_set_back = -1000.0
         self.last_jump = -1.0
         """When the clocks were set forward the last time."""
 
@@ -300,6 +301,8 @@ class World:
         self.turns.set_by(seconds)
         if seconds > 0:
             self.last_jump = self.turns.monotonic()
+        else:
+            self.last_set_back = self.turns.monotonic()
 
     def time_of(self, moment: datetime) -> float:
         """Return the seconds of a wall clock's time, to be compared only."""

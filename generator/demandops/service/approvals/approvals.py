@@ -130,7 +130,7 @@ class Approvals:
             for proposal in [p for p in self._proposals.values() if releases(request, p.requests)]:
                 self._demands.withdraw_proposed(proposal.tickets, RELEASED)
                 self._delete_branch(proposal, self._branches.heads())
-                self._end(proposal, Withdrawn(RELEASED))
+                self._changed.append(proposal.branch)  # the check answers: it may be merged already
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
