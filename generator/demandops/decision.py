@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import chain
 from types import MappingProxyType
 from typing import Literal
 
@@ -19,8 +20,9 @@ from demandops.demand import admission, demand_goal, deployment_request_goal, pe
 from demandops.demand.application import Application
 from demandops.demand.demand_request import Decommission, DemandRequest
 from demandops.errors import Fault, InvalidInput, Refused
+from demandops.ledger import claim_file
 from demandops.ledger.apply import apply
-from demandops.ledger.ledger import Changes, Ledger, changes_on
+from demandops.ledger.ledger import Changes, ClaimChange, Ledger, changes_on
 from demandops.ledger.operations import restoration
 from demandops.ledger.operations.restoration import Restoration
 from demandops.ledger.world import World
@@ -183,12 +185,14 @@ def admit(
         return Decommission.parse(goal)
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         parsed, faults = demand_goal.parse(goal)
+        _refuse_large(parsed, config)
         request = permission.with_lease_terms(parsed, config)
         request = implied_connections.with_implied_connections(request, state.ledger, config)
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
             raise Refused(faults)
+        _refuse_large(wired, config)
         request = permission.with_lease_terms(wired, config)
     request = admission.with_chosen_types(request, config, state.ledger.connection)
     malformed = {found.field for found in faults}
@@ -209,6 +213,13 @@ def admit(
     return request
 
 
+def _refuse_large(request: DemandRequest, config: Config) -> None:
+    """Refuse a request that is too large, before anything looks at all that it lists."""
+    faults = list(admission.size_faults(request, config.repo_settings.limits))
+    if faults:
+        raise Refused(faults)
+
+
 def form_faults(goal: object) -> list[Fault]:
     """Return the faults in a goal's form: unknown fields, wrong types."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
@@ -223,6 +234,35 @@ def changeset_of_edit(
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
     return changeset.build_changeset(old, state, Changes(), keys, state.engine, read)
+
+
+def policy_faults_of_edit(
+    before: World, after: World, changes: Iterable[ClaimChange]
+) -> Iterator[Fault]:
+    """Yield why policy refuses claims that a person wrote, each located in the claim's file.
+
+    A claim must be permitted and within the quotas, as if a demand asked for it. An edit that only
+    takes requesters away is always allowed, like a release.
+
+    Args:
+        before, after: the world before and after the edit.
+        changes: each claim as it was booked, and as the person wrote it.
+    """
+    for change in changes:
+        claim = change.after
+        if claim is None or _only_reduces(change):
+            continue
+        not_permitted = permission.faults(restoration.request_for(claim), after.config)
+        for each in chain(not_permitted, quota.faults(before, after, Changes((change,)))):
+            yield each.within(claim_file.path_of(claim.key))
+
+
+def _only_reduces(change: ClaimChange) -> bool:
+    before, after = change.before, change.after
+    if before is None or after is None:
+        return False
+    as_before = replace(after, requesters=before.requesters, partial=before.partial)
+    return as_before == before and {*after.requesters} <= {*before.requesters}
 
 
 def rendered_files(

@@ -7,9 +7,15 @@ faults that were found together, so that a person can fix a file or a request in
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+
+from demandops.quoting import clipped, one_line
+
+MOST_FAULTS = 100
+"""The faults of one file, or of a request, that are told; the others are counted."""
+_LONGEST_FIELD = 2_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,8 +23,8 @@ class Fault:
     """One problem in an input.
 
     ``code`` is a stable word for programs (``unknown-node``). ``field`` is the path inside the
-    input (``apps[0].header.node_id``). ``message`` says what is wrong and how to fix it. ``file``
-    names the file, if the input is one.
+    input (``apps[0].header.node_id``). ``message`` says what is wrong and how to fix it, on one
+    line. ``file`` names the file, if the input is one.
     """
 
     code: str
@@ -26,9 +32,14 @@ class Fault:
     message: str
     file: str = ""
 
+    def __post_init__(self) -> None:
+        """Quote the message, which may name any value; ``file`` and ``field`` stay exact."""
+        object.__setattr__(self, "message", one_line(self.message))
+
     def __str__(self) -> str:
-        """Return ``file: field: message`` without the empty parts."""
-        return ": ".join(part for part in (self.file, self.field, self.message) if part)
+        """Return ``file: field: message`` on one line, without the empty parts."""
+        places = (one_line(place) for place in (self.file, self.field))
+        return ": ".join(part for part in (*places, self.message) if part)
 
     def within(self, file: str) -> Fault:
         """Return the same fault, located in ``file``."""
@@ -36,20 +47,40 @@ class Fault:
 
 
 class DemandOpsError(Exception):
-    """Base of every error that this program raises on purpose."""
+    """Base of every error that this program raises on purpose. Its text is one line."""
+
+    def __str__(self) -> str:
+        """Return the text, which may name any value, as one line."""
+        return one_line(super().__str__())
 
 
 class InvalidInput(DemandOpsError):
     """Raised when something that a person wrote is invalid; nothing was changed."""
 
     def __init__(self, faults: Iterable[Fault]) -> None:
-        self.faults = tuple(faults)
-        super().__init__("\n".join(str(fault) for fault in self.faults))
+        self.faults = tuple(_fewer(faults))
+        super().__init__(self.faults)
+
+    def __str__(self) -> str:
+        """Return one line for each fault."""
+        return "\n".join(str(fault) for fault in self.faults)
 
     @classmethod
     def at(cls, field: str, message: str, *, code: str = "invalid", file: str = "") -> InvalidInput:
         """Return the error with one fault."""
         return cls([Fault(code, field, message, file)])
+
+
+def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
+    """Yield the first faults of each file, shortened, and how many more it has."""
+    counts: dict[str, int] = {}
+    for fault in faults:
+        count = counts[fault.file] = counts.get(fault.file, 0) + 1
+        if count <= MOST_FAULTS:
+            yield replace(fault, field=clipped(fault.field, _LONGEST_FIELD))
+    for file, count in counts.items():
+        if count > MOST_FAULTS:
+            yield Fault("more", "", f"has {count - MOST_FAULTS} more faults", file)
 
 
 class Refused(InvalidInput):
@@ -97,12 +128,6 @@ class QueueFull(DemandOpsError):
 def fault(field: str, message: str, *, code: str = "invalid") -> Fault:
     """Return a fault that is not in a file yet."""
     return Fault(code=code, field=field, message=message)
-
-
-def quoted(value: str, most: int = 80) -> str:
-    """Return foreign text for a message: quoted, printable, on one line and not too long."""
-    text = value if value.isprintable() else value.encode("unicode_escape").decode()
-    return f"'{text if len(text) <= most else text[: most - 1] + '…'}'"
 
 
 def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:

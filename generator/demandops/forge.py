@@ -17,8 +17,9 @@ from urllib.parse import quote, urlencode, urlsplit
 
 from demandops import http_call
 from demandops.config.repo_settings import Proposals
-from demandops.errors import DemandOpsError, InvalidInput, quoted
+from demandops.errors import DemandOpsError, InvalidInput
 from demandops.input_file import read_secret
+from demandops.quoting import quoted
 
 _TIMEOUT_S = 15.0
 _NOT_FOUND = 404

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from demandops import __version__
-from demandops.errors import DemandOpsError, quoted
+from demandops.errors import DemandOpsError
+from demandops.quoting import one_line
 from demandops.runtime import REAL
 
 if TYPE_CHECKING:
@@ -94,8 +95,7 @@ def _cause(error: httpx.TransportError) -> str:
     """Return why there is no answer, without any part of the request."""
     if type(error).__name__ in ("LocalProtocolError", "UnsupportedProtocol"):
         return "the URL or a header is not valid; check them"
-    text = str(error) or type(error).__name__
-    text = text if text.isprintable() else quoted(text)
+    text = one_line(str(error) or type(error).__name__)
     if "CERTIFICATE_VERIFY_FAILED" in text:
         return f"{text}; if you trust the certificate, name it in SSL_CERT_FILE"
     return f"{text}; check that it runs and can be reached"

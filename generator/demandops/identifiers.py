@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 
-from demandops.errors import quoted
+from demandops.quoting import quoted
 
 MAX_ID = 1024
 """The longest id, in characters; file and object names are shortened and hashed."""

@@ -28,7 +28,13 @@ _WORDS = frozenset(
 
 _OPENING = (yaml.MappingStartEvent, yaml.SequenceStartEvent)
 _CLOSING = (yaml.MappingEndEvent, yaml.SequenceEndEvent)
+MAX_LENGTH = 4_000_000
+"""The characters of a file that is read; an inventory of 20,000 nodes has fewer."""
 _MAX_DEPTH = 100
+_MAX_BITS = 14_000
+"""Of a whole number; Python prints no more than 4,300 digits."""
+_NEEDS_CHECK = re.compile(r"[&*]|[-?:][ \t]+[-?][ \t]|^\?", re.MULTILINE)
+"""Text that may hold an alias, or many levels on one line."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: a tag or number is not allowed there"
 
@@ -62,7 +68,28 @@ def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:  # noqa: AN
     return seen
 
 
+def _integer(loader: Any, node: yaml.ScalarNode) -> int:  # noqa: ANN401
+    number: int = loader.construct_yaml_int(node)
+    if number.bit_length() > _MAX_BITS:
+        raise yaml.constructor.ConstructorError(
+            None, None, f"a whole number has more than {_MAX_BITS} bits", node.start_mark
+        )
+    return number
+
+
+def _not_data(loader: Any, node: yaml.Node) -> None:  # noqa: ANN401
+    raise yaml.constructor.ConstructorError(
+        None,
+        None,
+        f"the tag {short_repr(node.tag)} is not allowed; write plain data",
+        node.start_mark,
+    )
+
+
 _StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping)
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", _integer)
+for _tag in ("binary", "set", "omap", "pairs"):  # JSON has no such values
+    _StrictLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _not_data)
 # PyYAML resolves each scalar anew; the same words and topics come again and again
 _StrictLoader.resolve = staticmethod(lru_cache(16_384)(yaml.resolver.Resolver().resolve))
 _StrictLoader.add_constructor(
@@ -128,6 +155,9 @@ def load_all(text: str, file: str = "") -> Iterator[Any]:
     Raises:
         InvalidInput: if it is not strict YAML; the fault names ``file``.
     """
+    if len(text) > MAX_LENGTH:
+        message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
+        raise InvalidInput.at("", message, file=file)
     with _strict(file):
         depth = 0
         for event in yaml.parse(text, Loader=_Loader):
@@ -158,11 +188,13 @@ def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which mo
 def load_rendered(text: str) -> Any:  # noqa: ANN401
     """Return the document that a template produced.
 
-    Duplicate keys are errors; anchors are not checked, which saves a pass for each release.
+    Anchors and depth are checked only if the text can have them, which saves a pass for most.
 
     Raises:
-        InvalidInput: if it is not valid YAML.
+        InvalidInput: if it is not strict YAML.
     """
+    if _NEEDS_CHECK.search(text) or text.count("[") + text.count("{") > _MAX_DEPTH:
+        return load(text)
     with _strict(""):
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
 

@@ -20,6 +20,7 @@ from demandops.errors import (
     TurnedDown,
     Withdrawn,
 )
+from demandops.quoting import one_line
 from demandops.service import Receipt
 from demandops_interfaces.action import Demand
 
@@ -54,7 +55,7 @@ class DeploymentRequestAdapter:
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         """Return the feedback for a stage."""
-        return DeploymentRequest.Feedback(message=text)
+        return DeploymentRequest.Feedback(message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
         """Return the result of a goal: ``<outcome>: <commit>``, or ``<code>: <field>: <remedy>``.
@@ -85,7 +86,7 @@ class DemandAdapter(DeploymentRequestAdapter):
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         """Return stage and text."""
-        return Demand.Feedback(stage=stage, message=text)
+        return Demand.Feedback(stage=stage, message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
         """Return code and text, and the receipt's fields if there is a receipt."""
@@ -93,23 +94,24 @@ class DemandAdapter(DeploymentRequestAdapter):
         if isinstance(outcome, Receipt):
             result.outcome, result.commit, result.reached = outcome.outcome, outcome.commit, reached
             result.lease = Duration(sec=outcome.lease_s or 0)
-            result.warnings = [*outcome.warnings, *_not_held(outcome)]
+            result.warnings = [*map(one_line, outcome.warnings), *_not_held(outcome)]
         return result
 
 
 def _text(outcome: Receipt | BaseException) -> str:
     if isinstance(outcome, Receipt):
-        warnings = (f"warning: {warning}" for warning in outcome.warnings)
+        warnings = (f"warning: {one_line(warning)}" for warning in outcome.warnings)
         return "\n".join([f"{outcome.outcome}: {outcome.commit}", *warnings, *_not_held(outcome)])
     if isinstance(outcome, InvalidInput):
         return refusal_text(outcome)
     if isinstance(outcome, Withdrawn):
         return str(outcome)
-    return f"{_code(outcome)}: {outcome if isinstance(outcome, DemandOpsError) else repr(outcome)}"
+    text = outcome if isinstance(outcome, DemandOpsError) else one_line(repr(outcome))
+    return f"{_code(outcome)}: {text}"
 
 
 def _not_held(receipt: Receipt) -> list[str]:
-    return [f"not held: {item}" for item in receipt.not_held]
+    return [f"not held: {one_line(item)}" for item in receipt.not_held]
 
 
 def _code(outcome: Receipt | BaseException) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from demandops.errors import DemandOpsError
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.quoting import one_line
 from demandops.runtime import REAL
 from demandops.service import Generator
 from demandops.staterepo import reader
@@ -32,7 +33,10 @@ def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # 
         response.ok, response.message = False, str(error)
     except Exception as error:  # whoever asks must get an answer
         REAL.failed("bookkeeping", error)
-        response.ok, response.message = False, f"internal error: {error!r}; see the node's log"
+        response.ok, response.message = (
+            False,
+            one_line(f"internal error: {error!r}; see the node's log"),
+        )
     return response
 
 

@@ -60,7 +60,9 @@ def demand(
             else:
                 _print_answer(client.send(data, _print_stages(output)), output)
         except DemandError as error:
-            raise InvalidInput([fault("", str(error), code=error.code).within(file)]) from None
+            lines = str(error).splitlines() or [error.code]
+            faults = [fault("", line, code=error.code).within(file) for line in lines]
+            raise InvalidInput(faults) from None
         except (ValueError, TypeError, AssertionError, AttributeError) as error:
             raise InvalidInput([fault("", f"is not a demand: {error}").within(file)]) from None
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from datetime import datetime
 
+from demandops.quoting import one_line
 from demandops.service import Generator
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
@@ -75,8 +76,11 @@ def _of_parts(generator: Generator) -> DiagnosticStatus:
 def _status(
     name: str, address: str, level: bytes, text: str, values: dict[str, str]
 ) -> DiagnosticStatus:
-    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-    return DiagnosticStatus(level=level, name=name, message=text, hardware_id=address, values=pairs)
+    pairs = [KeyValue(key=one_line(key), value=one_line(value)) for key, value in values.items()]
+    message = one_line(text)
+    return DiagnosticStatus(
+        level=level, name=name, message=message, hardware_id=address, values=pairs
+    )
 
 
 def _time(time: datetime | None) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 from demandops.cluster.health.release_health import Level
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.errors import NotReached, QueueFull, ShuttingDown, Unsound, Withdrawn
+from demandops.quoting import one_line, quoted
 from demandops.runtime import REAL
 from demandops.service import Generator, Receipt
 from demandops_interfaces.srv import GetBookkeeping
@@ -140,7 +141,7 @@ class DemandNode(Node):  # type: ignore[misc]
             unreachable = self._generator.remote_status.unreachable
             reason += f" for the state repo: {unreachable}" if unreachable else ""
         if reason:
-            self.get_logger().warning(f"goal '{adapter.name(goal)}' rejected: {reason}")
+            self.get_logger().warning(f"goal {quoted(adapter.name(goal))} rejected: {reason}")
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
@@ -208,16 +209,17 @@ class DemandNode(Node):  # type: ignore[misc]
         reached: Level = "pushed",
     ) -> Any:  # noqa: ANN401
         result = adapter.result(outcome, reached)
-        prefix = f"goal '{adapter.name(handle.request)}': "
+        text = one_line(result.message.replace("\n", "; "))
+        prefix = f"goal {quoted(adapter.name(handle.request))}: "
         if isinstance(outcome, Receipt):
             handle.succeed()
-            self.get_logger().info(prefix + result.message)
+            self.get_logger().info(prefix + text)
         elif isinstance(outcome, Withdrawn) and handle.is_cancel_requested:
             handle.canceled()
             self.get_logger().info(prefix + "cancelled")
         else:
             handle.abort()
-            self.get_logger().error(prefix + result.message)
+            self.get_logger().error(prefix + text)
         return result
 
     # ---- from the worker thread into the executor's ----

@@ -17,6 +17,7 @@ from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.input_file import read_secret
+from demandops.quoting import OneLineFormatter
 from demandops.runtime import REAL
 from demandops.service import Generator
 from demandops.service.push_webhook import PushWebhook
@@ -41,12 +42,13 @@ _TASK_S = 5.0
 _FLUSH_S = 0.3
 
 
-class _RosLogHandler(logging.Handler):
+class RosLogHandler(logging.Handler):
     """Passes the generator's log records to the node's log."""
 
     def __init__(self, node: Node) -> None:
         super().__init__()
         self._log = node.get_logger()
+        self.setFormatter(OneLineFormatter())
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log a record at the matching ROS level."""
@@ -55,8 +57,10 @@ class _RosLogHandler(logging.Handler):
             self._log.error(text)
         elif record.levelno >= logging.WARNING:
             self._log.warning(text)
-        else:
+        elif record.levelno >= logging.INFO:
             self._log.info(text)
+        else:
+            self._log.debug(text)
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -216,7 +220,7 @@ def _run(
         node.declare_parameter(name, shown, _descriptor(name, read_only=True))
     set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
     library_log = logging.getLogger("demandops")
-    library_log.handlers, library_log.propagate = [_RosLogHandler(node)], False
+    library_log.handlers, library_log.propagate = [RosLogHandler(node)], False
     library_log.setLevel(logging.DEBUG)
     executor = SingleThreadedExecutor()
     executor.add_node(node)

@@ -16,7 +16,7 @@ from demandops.ledger.claim_file import read
 
 from tests.kit.goals import APP, EXPERIMENT, application, connection, goal, perception, put
 from tests.kit.golden import GOLDEN, requests_of
-from tests.kit.repo import git
+from tests.kit.repo import FORGER, git
 
 Run = Callable[..., Any]
 
@@ -451,7 +451,9 @@ class TestVerifyByDifferences:
     ) -> None:
         path = f"clusters/c-its/perception/edge/{FUSION}.yaml"
         changed = {path: played.files()[path] + "# changed\n"}
-        made = self.surrounded(played, request_json, lambda: played.commit(changed, self.FORGED))
+        made = self.surrounded(
+            played, request_json, lambda: played.commit(changed, self.FORGED, FORGER)
+        )
         rows = self.verdicts(demandops, played)
         assert rows[made]["differing"] == [path]
         assert next(row["commit"] for row in rows.values() if not row["holds"]) == made
@@ -462,7 +464,9 @@ class TestVerifyByDifferences:
         """A claim goes, and what it asked for stays."""
         path = next(p for p, t in played.files("ledger/connections/").items() if "vehicle02/" in t)
         text = self.FORGED.replace("none", read(played.files()[path], path).demand)
-        made = self.surrounded(played, request_json, lambda: played.commit({path: None}, text))
+        made = self.surrounded(
+            played, request_json, lambda: played.commit({path: None}, text, FORGER)
+        )
         rows = self.verdicts(demandops, played)
         assert len(rows[made]["differing"]) == 2
         assert all("vehicle02" in left for left in rows[made]["differing"])
@@ -485,7 +489,7 @@ class TestVerifyByDifferences:
             "overrides/a",
         ):
             changed = {path: played.files().get(path, "# nothing\n") + "# more\n"}
-            forge = partial(played.commit, changed, self.FORGED)
+            forge = partial(played.commit, changed, self.FORGED, FORGER)
             made = self.surrounded(played, request_json, forge)
             row = self.verdicts(demandops, played)[made]
             assert (row["holds"], row["touched"]) == (False, [path])
@@ -497,6 +501,8 @@ class TestVerifyByDifferences:
         text = played.files()[path]
         message = self.FORGED.replace("none", read(text, path).demand)
         made = self.surrounded(
-            played, request_json, lambda: played.commit({path: text + "# a note\n"}, message)
+            played,
+            request_json,
+            lambda: played.commit({path: text + "# a note\n"}, message, FORGER),
         )
         assert self.verdicts(demandops, played)[made]["touched"] == [path]

@@ -20,7 +20,7 @@ from demandops import __version__
 from demandops.cli.views import bookkeeping
 
 from tests.kit.goals import APP, CLOUD, EXPERIMENT, Goal, application, connection, goal, perception
-from tests.kit.repo import git
+from tests.kit.repo import FORGER, git
 
 SHA = re.compile(r"[0-9a-f]{40}")
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
@@ -508,7 +508,7 @@ class TestVerify:
     def test_what_was_tampered_with_does_not_hold(self, demandops: Run, joined: Any) -> None:
         (path,) = (path for path in joined.manifests() if "/od-" in path)
         changed = {path: joined.files()[path] + "# changed\n"}
-        joined.commit(changed, "Forged\n\nOperation: join\nRender-Version: 2\n")
+        joined.commit(changed, "Forged\n\nOperation: join\nRender-Version: 2\n", FORGER)
         ran = demandops("verify", "--state-repo", joined.path)
         assert ran.code == 1
         assert ran.out.splitlines() == [

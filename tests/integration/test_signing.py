@@ -15,7 +15,7 @@ import pytest
 from demandops.staterepo.git.signing import Signer, SigningFailed
 
 from tests.kit.goals import connection, goal
-from tests.kit.repo import branches, git
+from tests.kit.repo import FORGER, branches, git
 
 Run = Callable[..., Any]
 
@@ -294,7 +294,7 @@ class TestVerify:
         state.commit({SIGNERS: listed(key)})
         since = state.tip
         forged = "Forged\n\nOperation: join\nRender-Version: 2\n"
-        state.commit({SIGNERS: listed(keygen(tmp_path / "forger"))}, forged)
+        state.commit({SIGNERS: listed(keygen(tmp_path / "forger"))}, forged, FORGER)
         (row,) = self.rows(demandops, state, since, 1)
         assert row["touched"] == [SIGNERS]
         assert row["signature"] == "is not signed, but policy/allowed-signers requires it"

@@ -20,6 +20,7 @@ from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.staterepo import new_repo, reader
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.new_objects import NewObjects
+from demandops.staterepo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME
 from demandops.staterepo.load import snapshot as snapshots
 
 from tests.kit.memory import NOW
@@ -38,6 +39,9 @@ GIT_ENVIRONMENT = NO_GIT_CONFIG | {
 }
 
 POLICY = "policy/access-domains.yaml"
+
+FORGER = (GENERATOR_NAME, GENERATOR_EMAIL, 1_770_000_000)
+"""A person who commits in the generator's name, which only a signature can tell."""
 
 
 def init(path: Path, *, bare: bool = True) -> Path:
@@ -146,9 +150,14 @@ class Person:
         """Return a file of the newest main."""
         return GitRepo(self.bare).files()[path]
 
-    def change(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
+    def change(
+        self,
+        files: Mapping[str, str | None],
+        message: str = "A person's change",
+        who: tuple[str, str, int] | None = None,
+    ) -> str:
         """Commit ``files`` (``None``: remove) on the newest main; return the commit."""
-        who = ("Petra Platform", "petra@example.org", int(time.time()))
+        who = who or ("Petra Platform", "petra@example.org", int(time.time()))
         for _ in range(100):
             with suppress(pygit2.GitError):  # a generator was first
                 return GitRepo(self.bare).commit(files, f"{message}\n", who)

@@ -43,6 +43,7 @@ source: demandops
 flux: {url: "https://git.example/fleet/state.git", interval: 1m, secret: git}
 argocd: {url: "https://git.example/fleet/state.git", namespace: argocd}
 proposals: {forge: gitlab, url: "https://git.example/fleet/state", labels: [demand]}
+limits: {demandItems: 400, parameterBytes: 90000, fileBytes: 900000}
 """
 _PROPOSALS_BY_API = """
 apiVersion: demandops/v1

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+import rclpy
+from demandops.quoting import is_visible
 from demandops_interfaces.srv import GetBookkeeping
+from demandops_ros.serve_command import RosLogHandler
 
 from examples.experiment import paper
 from tests.kit.goals import experiment
@@ -58,6 +63,30 @@ def test_a_goal_that_cannot_be_honoured_is_aborted_with_code_field_and_remedy(
     assert refused.feedback == []
     assert git(shared.state_repo, "log", "--format=%an: %s%n%b", f"{before}..main") == ""
     assert caller.call(connection(1001)).status == "succeeded"
+
+
+def test_a_hostile_id_stands_on_one_line_in_result_and_log(shared: Served, caller: Client) -> None:
+    hostile = "a\n[ERROR] forged\x1b[2J\u202e" + "x" * 5000
+    refused = caller.call({**connection(1002), "id": hostile})
+    assert refused.status == "aborted"
+    assert all(is_visible(line) for line in refused.message.split("\n"))
+    caller.wait(lambda: "forged" in shared.log.read_text())
+    told = [line for line in shared.log.read_text().splitlines() if "forged" in line]
+    assert [line.count("goal 'a\\n[ERROR] forged") for line in told] == [1]
+    assert is_visible(told[0]) and len(told[0]) < 5000
+
+
+def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> None:
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("of_a_test", context=context)
+    handler = RosLogHandler(node)
+    for level in (logging.DEBUG, logging.INFO, logging.ERROR):
+        handler.handle(logging.LogRecord("x", level, "", 1, "of level %d", (level,), None))
+    node.destroy_node()
+    context.try_shutdown()
+    printed, told = capfd.readouterr()
+    assert [f"of level {level}" in printed + told for level in (10, 20, 40)] == [False, True, True]
 
 
 def test_a_goal_sent_again_succeeds_without_a_commit(shared: Served, caller: Client) -> None:

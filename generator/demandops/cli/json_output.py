@@ -18,6 +18,7 @@ from demandops.demand.claim import Claim
 from demandops.errors import DemandOpsError, InvalidInput, fault
 from demandops.ledger import claim_file
 from demandops.plan.release import Release
+from demandops.quoting import json_escaped
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.subject import Subject
@@ -64,8 +65,8 @@ def show(output: str, data: object, text: Iterable[str | Table]) -> None:
 
 
 def print_json(data: object) -> None:
-    """Print ``data`` as JSON."""
-    click.echo(json.dumps(data, indent=2, ensure_ascii=False))
+    """Print ``data`` as JSON, with escapes for what is not visible."""
+    click.echo(json_escaped(json.dumps(data, indent=2, ensure_ascii=False)))
 
 
 def faults_of(error: DemandOpsError) -> list[Json]:

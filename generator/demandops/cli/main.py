@@ -15,6 +15,7 @@ import click
 from demandops import __version__
 from demandops.cli.output import errors
 from demandops.errors import DemandOpsError, InvalidInput, Unsound
+from demandops.quoting import OneLineFormatter
 
 COMMANDS = {
     "bookkeeping": ("views", "Show who requests which service and connection."),
@@ -90,7 +91,9 @@ def cli(verbose: bool) -> None:
     demands over ROS 2, or `demandops request FILE --state-repo DIR` to book demands from files.
     """
     level = logging.INFO if verbose else logging.WARNING
-    logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(OneLineFormatter("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])
 
 
 def main(args: list[str] | None = None) -> None:

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from demandops.quoting import lines
 from demandops.runtime import REAL
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as Bar
+    from rich.text import Text
 
 _WIDE = 200
 _PATIENCE_S = 0.5
@@ -29,9 +31,15 @@ def console(stderr: bool = False) -> Console:
     """Return a console; if the stream is not a terminal, it is wide and has no colors."""
     from rich.console import Console  # noqa: PLC0415
 
+    class QuotingConsole(Console):
+        """A console on which no text controls the terminal, in lines and in tables."""
+
+        def render_str(self, text: str, **how: Any) -> Text:  # noqa: ANN401 - as rich has it
+            return super().render_str(lines(text), **how)
+
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _WIDE
-    return Console(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
+    return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
@@ -42,11 +50,7 @@ class _Errors:
     """Prints plain lines on stderr, never wrapped."""
 
     def print(self, text: str) -> None:
-        escaped = (  # what would control the terminal
-            char if char.isprintable() or char in "\n\t" else char.encode("unicode_escape").decode()
-            for char in text
-        )
-        click.echo("".join(escaped), err=True)
+        click.echo(lines(text), err=True)
 
 
 errors = _Errors()
@@ -56,11 +60,6 @@ def warn_of(problems: Iterable[object]) -> None:
     """Warn about invalid files whose last valid version is in effect."""
     for problem in problems:
         errors.print(f"warning: {problem}; its last valid version is in effect")
-
-
-def printable(text: str) -> str:
-    """Return text without characters that would control a terminal or a page."""
-    return "".join(char if char.isprintable() or char in "\n\t" else "�" for char in text)
 
 
 state_repo_option = click.option(

@@ -21,8 +21,9 @@ from pydantic import (
 from pydantic.alias_generators import to_camel
 
 from demandops import strict_yaml
-from demandops.errors import Fault, InvalidInput, fault, quoted, suggestion
+from demandops.errors import Fault, InvalidInput, fault, suggestion
 from demandops.identifiers import control_character
+from demandops.quoting import escaped, quoted
 from demandops.settings import API_VERSION
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -106,7 +107,7 @@ def field_path(location: tuple[int | str, ...]) -> str:
             path += f"[{part}]"
         elif part != "[key]":
             path += f".{part}" if path else part
-    return path if path.isprintable() else path.encode("unicode_escape").decode()
+    return escaped(path)
 
 
 def faults_of(

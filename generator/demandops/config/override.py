@@ -28,8 +28,8 @@ from demandops.config.base_model import (
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.config.policy import matches
 from demandops.config.registry import Digest, Image, Repository, Tag
-from demandops.errors import quoted
 from demandops.identifiers import id_problem
+from demandops.quoting import quoted
 
 OVERRIDES_ROOT = "overrides"
 

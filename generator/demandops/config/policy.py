@@ -22,7 +22,7 @@ from demandops.config.base_model import (
     Text,
     readable_by,
 )
-from demandops.errors import quoted
+from demandops.quoting import quoted
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
 _UNITS_S = (86_400, 3_600, 60, 1)

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import StringConstraints, model_validator
 
 from demandops.config.base_model import (
+    CamelModel,
     DnsLabel,
     FileModel,
     FrozenModel,
@@ -16,7 +17,7 @@ from demandops.config.base_model import (
     Visible,
     without,
 )
-from demandops.errors import quoted
+from demandops.quoting import quoted
 
 ROOT_FILE = "demandops.yaml"
 
@@ -96,6 +97,19 @@ class Proposals(FrozenModel):
         return tuple(path.strip("/").removesuffix(".git").split("/")[-2:]) if path else ()
 
 
+class Limits(CamelModel):
+    """The sizes above which a demand is refused.
+
+    ``demand_items``: applications, connections, topics and requesters that it lists.
+    ``parameter_bytes``: an application's parameters as JSON. ``file_bytes``: a file that it writes;
+    Kubernetes stores no object above 1.5 MB.
+    """
+
+    demand_items: Positive = 10_000
+    parameter_bytes: Positive = 100_000
+    file_bytes: Positive = 1_000_000
+
+
 class RepoSettings(FileModel):
     """``demandops.yaml``: the settings of the whole state repo.
 
@@ -109,3 +123,4 @@ class RepoSettings(FileModel):
     flux: Flux | None = None
     argocd: ArgoCd | None = None
     proposals: Proposals = Proposals()
+    limits: Limits = Limits()

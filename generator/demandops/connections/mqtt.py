@@ -26,7 +26,8 @@ from demandops.connections.connection_type import (
     make_end,
 )
 from demandops.connections.route import Route
-from demandops.errors import Fault, Refused, fault, quoted
+from demandops.errors import Fault, Refused, fault
+from demandops.quoting import quoted
 
 CA_FILE = "/tls/ca.crt"
 """The path where the certificate of the broker's authority is mounted."""

@@ -13,8 +13,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from demandops.config.base_model import FrozenModel
-from demandops.errors import Fault, fault, quoted
+from demandops.errors import Fault, fault
 from demandops.identifiers import message_type_problem, topic_problem
+from demandops.quoting import quoted
 
 
 @dataclass(frozen=True, slots=True)

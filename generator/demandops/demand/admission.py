@@ -5,11 +5,13 @@ It uses appdefs, inventory, brokers and access domains, but not the ledger.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from demandops.config.appdef import ApplicationDefinition
 from demandops.config.config import Config
+from demandops.config.repo_settings import ROOT_FILE, Limits
 from demandops.connections import connection_types
 from demandops.connections import route as routes
 from demandops.connections.connection import Connection
@@ -17,8 +19,9 @@ from demandops.demand.application import Application
 from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put, Release, Renew
 from demandops.demand.lease import LONGEST_S
-from demandops.errors import Fault, fault, quoted, suggestion
+from demandops.errors import Fault, fault, suggestion
 from demandops.identifiers import id_problem, topic_problem
+from demandops.quoting import quoted
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
@@ -43,6 +46,31 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         else:
             found += _connection(one.held, config, request.adds_claims)
         yield from (replace(each, field=one.place(each.field)) for each in found)
+
+
+def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
+    """Yield a fault if the request is larger than the state repo's limits allow."""
+    items = len(request.demanded) + len(request.own_requesters)
+    for one in request.demanded:
+        held = one.held
+        items += len(one.requesters) if request.is_reference else 0
+        items += len(held.all_inputs() if isinstance(held, Application) else held.topics)
+        if isinstance(held, Application) and held.parameters:
+            size = len(json.dumps(dict(held.parameters), default=str))
+            if size > limits.parameter_bytes:
+                message = _too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
+                yield one.fault("parameters", message, code="too-large")
+    if items > limits.demand_items:
+        listed = f"lists {items} applications, connections, topics and requesters"
+        message = _too_large(listed, "demandItems", limits.demand_items)
+        yield fault("id" if request.is_reference else "demand", message, code="too-large")
+
+
+def _too_large(size: str, limit: str, most: int) -> str:
+    return (
+        f"{size}; at most {most} are allowed; a platform engineer may raise limits.{limit} in "
+        f"{ROOT_FILE}"
+    )
 
 
 def _own_fields(request: DemandRequest) -> Iterator[Fault]:

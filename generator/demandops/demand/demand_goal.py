@@ -24,8 +24,9 @@ from demandops.connections.route import RouteOptions
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.demand_request import Demanded, DemandRequest, Put, Release, Renew
 from demandops.demand.goal_validation import parse_valid_part
-from demandops.errors import Fault, fault, quoted
+from demandops.errors import Fault, fault
 from demandops.identifiers import absolute_topic
+from demandops.quoting import quoted
 from demandops.settings import API_VERSION
 
 

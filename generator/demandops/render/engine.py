@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import CodeType
 from typing import Any
 
@@ -28,7 +28,7 @@ from jinja2.runtime import Undefined
 
 from demandops import naming, strict_yaml
 from demandops.errors import InvalidInput, fault
-from demandops.render.template_sandbox import Sandbox
+from demandops.render.template_sandbox import Sandbox, budget
 from demandops.settings import data_folder
 
 _TEMPLATE_FAULTS = (
@@ -38,7 +38,12 @@ _TEMPLATE_FAULTS = (
     ArithmeticError,
     LookupError,
     RecursionError,
+    SyntaxError,
+    MemoryError,
 )  # errors that a template can cause; its author has to fix them
+
+_MAX_LENGTH = 100_000
+"""The characters of a values template."""
 
 
 class _Verbatim(str):
@@ -55,7 +60,11 @@ class _FilesLoader(BaseLoader):
         """Return the template's text, its path for tracebacks, and that it never changes."""
         if template not in self._files:
             raise TemplateNotFound(template)
-        return self._files[template], template, lambda: True
+        text = self._files[template]
+        if len(text) > _MAX_LENGTH:
+            message = f"has {len(text)} characters; at most {_MAX_LENGTH} are allowed"
+            raise TemplateSyntaxError(message, 1)
+        return text, template, lambda: True
 
 
 class _CompiledTemplates(BytecodeCache):
@@ -117,13 +126,12 @@ def _bare(value: str) -> _Verbatim:
     return _Verbatim(value)
 
 
-def _configure(environment: Environment) -> Environment:
-    environment.filters.pop("tojson", None)  # values become JSON anyway; twice would quote them
-    environment.filters["block"] = _block
-    environment.filters["literal"] = _literal
-    environment.filters["bare"] = _bare
-    environment.filters["ros_name"] = naming.ros_name
-    return environment
+_FILTERS: dict[str, Callable[..., _Verbatim | str]] = {
+    "block": _block,
+    "literal": _literal,
+    "bare": _bare,
+    "ros_name": naming.ros_name,
+}
 
 
 _OPTIONS: dict[str, Any] = {
@@ -143,12 +151,10 @@ class Engine:
 
     def __init__(self, files: Mapping[str, str]) -> None:
         own, config = FileSystemLoader(data_folder("templates")), _FilesLoader(files)
-        self._own = _configure(
-            Environment(loader=own, bytecode_cache=_OWN_COMPILED, **_OPTIONS)  # noqa: S701 - YAML, not HTML
-        )
-        self._config = _configure(
-            Sandbox(loader=config, bytecode_cache=_CONFIG_COMPILED, **_OPTIONS)
-        )
+        self._own = Environment(loader=own, bytecode_cache=_OWN_COMPILED, **_OPTIONS)  # noqa: S701 - YAML, not HTML
+        del self._own.filters["tojson"]  # values become JSON anyway; twice would quote them
+        self._own.filters |= _FILTERS
+        self._config = Sandbox(_FILTERS, loader=config, bytecode_cache=_CONFIG_COMPILED, **_OPTIONS)
 
     def text(self, template: str, **context: object) -> str:
         """Render a template of the program (``flux/release.yaml.j2``)."""
@@ -161,8 +167,11 @@ class Engine:
             InvalidInput: if the template fails; it names the template and, if known, the line.
         """
         try:
-            compiled: Template = self._config.get_template(template)
-            values = strict_yaml.load_rendered(compiled.render(**context))
+            with budget():
+                compiled: Template = self._config.get_template(template)
+            with budget():  # a full one, whether or not the template was compiled before
+                text = compiled.render(**context)
+            values = strict_yaml.load_rendered(text)
         except InvalidInput as error:
             raise InvalidInput(
                 fault(
@@ -188,7 +197,12 @@ class Engine:
             ) from None
         except _TEMPLATE_FAULTS as error:
             raise InvalidInput(
-                [fault(_line(error, template), f"{error}; fix the template").within(template)]
+                [
+                    fault(
+                        _line(error, template),
+                        f"{str(error) or type(error).__name__}; fix the template",
+                    ).within(template)
+                ]
             ) from None
         if not isinstance(values, dict):
             raise InvalidInput([fault("", "must give a mapping of Helm values").within(template)])

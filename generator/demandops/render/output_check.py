@@ -22,6 +22,7 @@ from demandops.config.config import Config
 from demandops.config.override import OVERRIDES_ROOT
 from demandops.config.registry import ChartSource
 from demandops.errors import Fault, InvalidInput, fault
+from demandops.render import values_schema
 
 KUBERNETES_VERSION = "1.36.0"
 """The Kubernetes release whose schemas check built-in kinds."""
@@ -52,12 +53,7 @@ def check_values(
     if schema is None:
         return
     file = f"{chart.folder}/values.schema.json"
-    try:
-        validator = _values_validator(schema)
-    except ValueError as error:  # invalid JSON, or an invalid schema
-        reason = str(error).splitlines()[0]
-        message = f"is not a valid JSON schema: {reason}; fix it"
-        raise InvalidInput([fault("", message).within(file)]) from None
+    validator = values_schema.validator(schema, file)
     file = f"{chart.folder}/values.yaml"
     try:
         defaults = _defaults(config.files.get(file, ""))
@@ -150,11 +146,6 @@ def _merge_values(defaults: Mapping[str, Any], values: Mapping[str, Any]) -> dic
 def _defaults(text: str) -> dict[str, Any]:
     values = strict_yaml.load(text)
     return values if isinstance(values, dict) else {}
-
-
-@lru_cache(maxsize=256)
-def _values_validator(schema: str) -> Any:  # noqa: ANN401
-    return jsonschema_rs.validator_for(json.loads(schema))
 
 
 @lru_cache(maxsize=64)

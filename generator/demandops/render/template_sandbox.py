@@ -1,79 +1,382 @@
-"""A Jinja sandbox for templates of the state repo that also limits how much memory they use.
+"""A Jinja sandbox in which a template of the state repo cannot run long, grow or be random.
 
-A reviewed template may still be wrong. An expression that would make millions of characters, such
-as a product or a padding, is refused before it is evaluated. No chart value needs that much.
+Each loop, call, filter and comparison takes steps from a budget, by the size of what it works on,
+and no value can become large. So a template fails at the same place on every machine, without a
+clock. Only the filters and methods listed here exist: the others are random, name addresses in
+memory, or make HTML.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import (
+    Callable,
+    ItemsView,
+    Iterable,
+    Iterator,
+    KeysView,
+    Mapping,
+    ValuesView,
+)
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import wraps
-from typing import Any
+from itertools import islice
+from typing import Any, cast
 
+from jinja2 import nodes, pass_context
+from jinja2.environment import Template
 from jinja2.exceptions import SecurityError
-from jinja2.runtime import Context
+from jinja2.runtime import Context, Undefined
 from jinja2.sandbox import ImmutableSandboxedEnvironment
+from jinja2.visitor import NodeTransformer
 
-MAX_LENGTH = 100_000
-_MAX_POWER = 64
-_WIDE = re.compile(r"\d{6,}|%[^a-zA-Z%]*\*|\{[^{}]*\{")
-"""A field width of six digits or more, or one that is passed as an argument."""
-_PADDING = ("format", "center", "indent", "batch", "slice", "wordwrap")
+MAX_STEPS = 1_000_000
+"""The steps of one rendering, at most a few seconds of work; 100 topics take some thousand."""
+MAX_LENGTH = 1_000_000
+"""The characters of a text. Kubernetes takes no object above 1.5 MB."""
+MAX_SIZE = 100_000
+"""The parts of a value: each item, key and 16 characters of text counts."""
+_MAX_BITS = 1024
+
+_DIGITS = re.compile(r"\d{1,9}")
+_WIDTH_AS_ARGUMENT = re.compile(r"%[^a-zA-Z%]*\*|\{[^{}]*\{")
+_FILTERS = re.findall(
+    r"\w+",
+    "abs attr batch capitalize center count d default dictsort first float format groupby indent "
+    "int items join last length list lower map max min reject rejectattr replace reverse round "
+    "select selectattr slice sort string sum title trim truncate unique upper urlencode "
+    "wordcount",
+)
+_PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
+"""Filters that take a step whatever the size: they only look at a value or return a part of it."""
+_SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
+"""Filters that take more steps for the same size."""
+_PADDING = frozenset(
+    {"batch", "center", "indent", "literal", "block", "round", "slice", "truncate"}
+)
+_METHODS: dict[type, list[str]] = {
+    str: re.findall(
+        r"\w+",
+        "capitalize center count endswith find index isalnum isalpha isdigit islower isnumeric "
+        "isupper join ljust lower lstrip partition removeprefix removesuffix replace rfind rjust "
+        "rpartition rsplit rstrip split splitlines startswith strip title upper zfill",
+    ),
+    dict: ["get", "items", "keys", "values"],
+    list: ["count", "index"],
+    tuple: ["count", "index"],
+}
+_PLAIN = (str, int, float, type(None), Undefined)
+
+
+class _Budget:
+    """The steps that a rendering has left."""
+
+    def __init__(self) -> None:
+        self.left = MAX_STEPS
+
+    def take(self, steps: int) -> None:
+        """Take steps from the budget; raise if none is left."""
+        self.left -= steps
+        if self.left < 0:
+            raise SecurityError(f"the template takes more than {MAX_STEPS} steps; make it simpler")
+
+
+_budget: ContextVar[_Budget] = ContextVar("budget")
+
+
+@contextmanager
+def budget() -> Iterator[None]:
+    """Give the templates that are compiled or rendered inside a full budget."""
+    token = _budget.set(_Budget())
+    try:
+        yield
+    finally:
+        _budget.reset(token)
+
+
+def _size(value: object, *, data: bool = True) -> int:
+    """Return the size of a value with all that it contains, also what it contains twice.
+
+    With ``data`` anything but data is refused, because its text would hold an address in memory.
+    """
+    if isinstance(value, str):
+        return 1 + (len(value) >> 4)
+    size, rest = 0, [value]
+    while rest:
+        part = rest.pop()
+        size += 1
+        if isinstance(part, str):
+            size += len(part) >> 4
+        elif isinstance(part, Mapping):
+            rest += part
+            rest += part.values()
+        elif isinstance(part, list | tuple):
+            rest += part
+        elif isinstance(part, range):
+            size += len(part)
+        elif data and not isinstance(part, _PLAIN):
+            raise SecurityError(
+                f"a template may write text, numbers, lists and mappings, not {type(part)}"
+            )
+        if size > MAX_SIZE:
+            raise SecurityError(f"a value is too large: it has more than {MAX_SIZE} parts")
+    return size
+
+
+def _kept(value: Any) -> Any:  # noqa: ANN401
+    """Return a new value if it is not too large; what is lazy becomes a list."""
+    if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
+        value = list(islice(value, MAX_SIZE + 1))
+    if isinstance(value, str) and len(value) > MAX_LENGTH:
+        raise SecurityError("a text is too large")
+    _budget.get().take(_size(value, data=False))
+    return value
+
+
+def _refuse_large(name: str, size: int, most: int = MAX_LENGTH) -> None:
+    if size > most:
+        raise SecurityError(f"the result of '{name}' is too large")
+
+
+def _refuse_wide(name: str, form: str, values: Iterable[object]) -> None:
+    """Refuse a format whose result may be too large."""
+    if _WIDTH_AS_ARGUMENT.search(form):
+        _refuse_large(name, MAX_LENGTH + 1)
+    fields = form.count("%") + form.count("{")
+    widths = sum(map(int, _DIGITS.findall(form)))
+    _refuse_large(name, len(form) + widths + fields * sum(16 * _size(value) for value in values))
+
+
+def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
+    """Refuse a filter or a method of text whose result may be a product of what it is given."""
+    subject, *others = values or ("",)
+    if name in _PADDING or name in ("ljust", "rjust", "zfill"):
+        numbers = [abs(each) for each in others if isinstance(each, int)]
+        lines = subject.count("\n") + 1 if name == "indent" and isinstance(subject, str) else 1
+        if name in ("block", "literal"):
+            lines = 16 * _size(subject)
+        _refuse_large(name, lines * max([0, *numbers]))
+        widths = [len(each) for each in others if isinstance(each, str)]
+        _refuse_large(name, lines * max([0, *widths]))
+    elif name == "replace" and len(others) > 1:
+        old, new = str(others[0]), str(others[1])
+        text = str(subject)
+        _refuse_large(name, len(text) + text.count(old) * len(new))
+    elif name == "join" and others:
+        glue, items = (others[0], subject) if not isinstance(subject, str) else (subject, others[0])
+        count = len(items) if hasattr(items, "__len__") else 1
+        _refuse_large(name, count * len(str(glue)))
+    elif name == "format":
+        _refuse_wide(name, str(subject), others)
+    elif name == "sum" and any(not isinstance(each, int | float | str) for each in others):
+        raise SecurityError("'sum' adds numbers only")
+
+
+def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a filter or test that takes steps and refuses what is too large."""
+    passed = 1 if hasattr(function, "jinja_pass_arg") else 0
+
+    @wraps(function)
+    def counted(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+        values = (*args[passed:], *kwargs.values())
+        steps = _budget.get()
+        if name in _PARTS:
+            steps.take(1)
+            return function(*args, **kwargs)
+        for value in values:
+            steps.take(_size(value) * _SLOW.get(name, 1))
+        _refuse_growth(name, values)
+        return _kept(function(*args, **kwargs))
+
+    return counted
+
+
+def _test(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a test that takes steps."""
+    passed = 1 if hasattr(function, "jinja_pass_arg") else 0
+
+    @wraps(function)
+    def counted(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+        for value in args[passed:]:
+            _budget.get().take(_size(value, data=False))
+        return function(*args, **kwargs)
+
+    return counted
+
+
+@pass_context
+def _iterated(context: Context, items: Iterable[Any], steps: int) -> Iterator[Any]:
+    budget = _budget.get()
+    for item in items:
+        budget.take(steps)
+        yield item
+
+
+@pass_context
+def _measured(context: Context, value: Any) -> Any:  # noqa: ANN401
+    _budget.get().take(_size(value, data=False))
+    return value
+
+
+@pass_context
+def _concatenated(context: Context, parts: list[Any]) -> str:
+    size = sum(_size(part) for part in parts)
+    _refuse_large("~", size, MAX_SIZE)
+    _budget.get().take(size)
+    text = "".join(map(str, parts))
+    _refuse_large("~", len(text))
+    return text
+
+
+class _Counting(NodeTransformer):
+    """Makes a parsed template take steps for its loops, literals and comparisons."""
+
+    def __init__(self, environment: Sandbox) -> None:
+        self._environment = environment
+
+    def _filter(self, node: nodes.Expr, name: str, *args: nodes.Expr) -> nodes.Expr:
+        if isinstance(node, nodes.Const):
+            return node
+        return nodes.Filter(
+            node,
+            name,
+            list(args),
+            [],
+            None,
+            None,
+            lineno=node.lineno,
+            environment=self._environment,
+        )
+
+    def visit_For(self, node: nodes.For) -> nodes.For:
+        fixed = sum(len(part.data) for part in node.find_all(nodes.TemplateData))
+        fixed += sum(len(part.value) for part in node.find_all(nodes.Const) if _is_text(part))
+        self.generic_visit(node)
+        steps = nodes.Const(1 + (fixed >> 4), lineno=node.lineno)
+        node.iter = self._filter(node.iter, "_iterated", steps)  # type: ignore[arg-type]
+        return node
+
+    def visit_List(self, node: nodes.List | nodes.Dict) -> nodes.Expr:
+        self.generic_visit(node)
+        return self._filter(node, "_measured")
+
+    visit_Dict = visit_List
+
+    def visit_Tuple(self, node: nodes.Tuple) -> nodes.Expr:
+        self.generic_visit(node)
+        return self._filter(node, "_measured") if node.ctx == "load" else node
+
+    def visit_Concat(self, node: nodes.Concat) -> nodes.Expr:
+        self.generic_visit(node)
+        return self._filter(nodes.List(node.nodes, lineno=node.lineno), "_concatenated")
+
+    def visit_Compare(self, node: nodes.Compare) -> nodes.Compare:
+        self.generic_visit(node)
+        node.expr = self._filter(node.expr, "_measured")
+        for operand in node.ops:
+            operand.expr = self._filter(operand.expr, "_measured")
+        return node
+
+    def visit_Getitem(self, node: nodes.Getitem) -> nodes.Getitem:
+        self.generic_visit(node)
+        if isinstance(node.arg, nodes.Slice):
+            node.node = self._filter(node.node, "_measured")
+        return node
+
+
+def _is_text(node: nodes.Const) -> bool:
+    return isinstance(node.value, str)
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja's sandbox with limits on the size of an expression's result."""
+    """Jinja's sandbox with a budget; templates must be used inside :func:`budget`."""
 
-    intercepted_binops = frozenset({"*", "**", "%"})
+    intercepted_binops = frozenset({"+", "*", "**", "%"})
 
-    def __init__(self, **options: Any) -> None:  # noqa: ANN401
+    def __init__(self, filters: Mapping[str, Callable[..., Any]], **options: Any) -> None:  # noqa: ANN401
+        """Make a sandbox whose templates may use some of Jinja's filters, and ``filters``."""
         super().__init__(**options)
-        for name in _PADDING:
-            self.filters[name] = _bounded(self.filters[name])
+        written = self.finalize
+        assert written is not None  # noqa: S101 - our own options
+        self.finalize = lambda value: written(_kept(value) if _size(value) else value)
+        kept = {name: one for name, one in self.filters.items() if name in _FILTERS}
+        self.filters = {name: _counted(name, one) for name, one in {**kept, **filters}.items()}
+        self.filters |= {"_iterated": _iterated, "_measured": _measured}
+        self.filters["_concatenated"] = _concatenated
+        self.tests = {
+            name: _test(cast(Callable[..., Any], one))
+            for name, one in self.tests.items()
+            if name != "sameas"
+        }
+        del self.globals["lipsum"]
+
+    def _parse(self, source: str, name: str | None, filename: str | None) -> nodes.Template:
+        tree: nodes.Template = _Counting(self).visit(super()._parse(source, name, filename))
+        return tree
+
+    def _load_template(self, name: str, globals: Any) -> Template:  # noqa: ANN401
+        found = super()._load_template(name, globals)
+        assert self.loader is not None  # noqa: S101 - our own options
+        _budget.get().take(1 + (len(self.loader.get_source(self, name)[0]) >> 4))
+        return found
+
+    def concat(self, parts: Iterable[str]) -> str:
+        """Return the text of these parts if it is not too large."""
+        pieces, length = [], 0
+        for part in parts:
+            pieces.append(part)
+            length += len(part)
+            if length > MAX_LENGTH:
+                raise SecurityError(f"the text is longer than {MAX_LENGTH} characters")
+        return "".join(pieces)
 
     def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:  # noqa: ANN401
-        """Evaluate an operator; refuse products, powers and paddings that are too large."""
-        sized = (str, list, tuple)
-        if operator == "%":
-            large = isinstance(left, str) and _WIDE.search(left) is not None
-        elif operator == "**":
-            large = isinstance(right, int | float) and right > _MAX_POWER
-        elif isinstance(left, sized) and isinstance(right, int):
-            large = len(left) * right > MAX_LENGTH
-        else:
-            large = isinstance(right, sized) and len(right) * left > MAX_LENGTH
-        if large:
-            raise SecurityError(f"the result of '{operator}' is too large")
-        return super().call_binop(context, operator, left, right)
+        """Evaluate an operator; refuse a result that is too large."""
+        if isinstance(left, int) and isinstance(right, int):
+            bits = left.bit_length() * right if operator == "**" else left.bit_length()
+            _refuse_large(
+                operator, bits + (right.bit_length() if operator == "*" else 0), _MAX_BITS
+            )
+        elif operator == "%" and isinstance(left, str):
+            _refuse_wide(operator, left, [right])
+        elif operator == "*" and isinstance(left, int | float) != isinstance(right, int | float):
+            value, times = (right, left) if isinstance(left, int | float) else (left, right)
+            length = len(value) if isinstance(value, str) else 16 * _size(value)
+            _refuse_large(operator, length * int(times))
+        elif not isinstance(left, float) and not isinstance(right, float):
+            _refuse_large(operator, _size(left) + _size(right), MAX_SIZE)
+        return _kept(super().call_binop(context, operator, left, right))
+
+    def getitem(self, obj: Any, argument: Any) -> Any:  # noqa: ANN401
+        """Return an item of a value."""
+        if isinstance(argument, tuple):
+            _budget.get().take(_size(argument))
+        return super().getitem(obj, argument)
 
     def call(__self, __context: Context, __obj: Any, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
-        """Call a function; refuse string methods that pad too far (``'x'.ljust(10 ** 9)``)."""
-        if isinstance(getattr(__obj, "__self__", None), str):
-            _refuse_large(__obj.__self__, args, kwargs)
-        return super().call(__context, __obj, *args, **kwargs)
+        """Call a macro, a function or a method; refuse methods that are not listed."""
+        steps = _budget.get()
+        for value in (*args, *kwargs.values()):
+            steps.take(_size(value, data=False))
+        owner = getattr(__obj, "__self__", None)
+        for kind in (str, int, float, bytes, dict, list, tuple, range):
+            if isinstance(owner, kind):
+                steps.take(1 if kind is dict else _size(owner))
+                if __obj.__name__ not in _METHODS.get(kind, ()):
+                    raise SecurityError(f"the method '{__obj.__name__}' is unsafe here")
+                _refuse_growth(__obj.__name__, (owner, *args, *kwargs.values()))
+        steps.take(1)
+        return _kept(super().call(__context, __obj, *args, **kwargs))
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:  # noqa: ANN401
-        """Wrap ``str.format``; refuse a format with a wide field."""
+        """Wrap ``str.format``; refuse a result that is too large."""
         wrapped = super().wrap_str_format(value)
-        if wrapped is not None and _WIDE.search(value.__self__):
-            raise SecurityError("the result of 'format' is too large")
-        return wrapped
+        if wrapped is None:
+            return None
 
+        def format(*args: Any, **kwargs: Any) -> str:  # noqa: ANN401
+            _refuse_wide("format", value.__self__, (*args, *kwargs.values()))
+            return wrapped(*args, **kwargs)
 
-def _bounded(jinja_filter: Callable[..., Any]) -> Callable[..., Any]:
-    @wraps(jinja_filter)
-    def bounded(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
-        text = next((arg for arg in args if isinstance(arg, str)), "")
-        if jinja_filter.__name__ == "do_format" and _WIDE.search(text):
-            raise SecurityError("the result of 'format' is too large")
-        _refuse_large(jinja_filter.__name__, args, kwargs)
-        return jinja_filter(*args, **kwargs)
-
-    return bounded
-
-
-def _refuse_large(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-    for number in (*args, *kwargs.values()):
-        if isinstance(number, int) and number > MAX_LENGTH:
-            raise SecurityError(f"{number} is too large here, in '{name[:20]}'")
+        return format

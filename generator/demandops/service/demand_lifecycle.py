@@ -28,8 +28,8 @@ from demandops.errors import (
     StateRepoError,
     Unsound,
     Withdrawn,
-    quoted,
 )
+from demandops.quoting import quoted
 from demandops.runtime import Runtime
 from demandops.service.fair_queue import FairQueue, requester_of
 from demandops.service.ticket import ProposalRecord, Receipt, State, Ticket, ticket_from_journal

@@ -16,7 +16,7 @@ from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.signing import Signer
-from demandops.staterepo.history import commit_message
+from demandops.staterepo.history import commit_message, message_format
 
 
 def init(
@@ -71,7 +71,7 @@ def _write(
     tree = trees.write(objects, None, content)
     why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
     trailers = [("Operation", "init"), ("Render-Version", str(RENDER_VERSION))]
-    text = commit_message.compose([["Create the state repo"], [why]], trailers)
+    text = message_format.compose([["Create the state repo"], [why]], trailers)
     signature = commit_message.generator_signature(now)
     commit = signing.create_commit(objects, signer, (signature, signature), text, tree, [])
     with objects.packed(commit):

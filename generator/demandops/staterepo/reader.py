@@ -180,7 +180,7 @@ class Reader:
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
         """Return the commits by people that a follow commit renders, newest first."""
         since, follows = entry.first("Since"), entry.first("Follows")
-        if not (since and follows):
+        if not (entry.by_generator and since and follows):
             return []
         people = commit_log.person_commits(self._objects, follows, since)
         return [commit_log.entry_of(commit) for commit in islice(people, most)]

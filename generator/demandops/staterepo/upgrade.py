@@ -16,7 +16,7 @@ from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.decision import State
+from demandops.decision import State, policy_faults_of_edit
 from demandops.demand.claim import ClaimKey
 from demandops.errors import InvalidInput, StateRepoError, fault
 from demandops.ledger import claim_file, ended_override_file
@@ -32,7 +32,7 @@ from demandops.staterepo import reader
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.git.signing import Signer
-from demandops.staterepo.history import authorship, commit_message
+from demandops.staterepo.history import authorship, commit_message, message_format
 from demandops.staterepo.load import last_valid_config, ledger_files, state_in_effect
 from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress
@@ -148,7 +148,12 @@ def _plan(
     config = load(files)
     state = State.of(config, snapshot.state.ledger)
     # what people changed since the generator's last commit is carried out too
-    known = state_in_effect.start_at(objects, tip).state
+    start = state_in_effect.start_at(objects, tip)
+    known = start.state
+    edited = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, known.ledger)
+    refused = list(policy_faults_of_edit(known, state, edited))
+    if refused:
+        raise InvalidInput(refused)
     subjects = ledger_files.changed_subjects(known.ledger, state.ledger)
     applied = update_ledger(known, state, subjects, last_valid_config.end_markers_at(tree), now)
     state = replace(state, ledger=applied.ledger)
@@ -242,7 +247,7 @@ def _message(made: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         [f"Why: `demandops upgrade` renders everything {why}."],
         ["Files written or removed:", *files],
     ]
-    return commit_message.compose(paragraphs, trailers)
+    return message_format.compose(paragraphs, trailers)
 
 
 _NAMES = {"flux": "Flux", "argocd": "Argo CD"}

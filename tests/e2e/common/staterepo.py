@@ -137,9 +137,14 @@ class StateRepo(Generic[Domain]):
         return int(self.person.git("rev-list", "--count", f"{commit}..HEAD"))
 
     def push(self, files: Mapping[str, str | None], message: str = "by hand") -> str:
-        """Commit and push files as a person would; return the commit."""
-        self._pull()
-        return self.person.push(files, message)
+        """Commit and push files as a person would, again if the generator was first."""
+        while True:
+            self._pull()
+            try:
+                return self.person.push(files, message)
+            except AssertionError as error:
+                if "[rejected]" not in str(error):
+                    raise
 
     def demand(self, goal: dict[str, Any]) -> Sent:
         """Send a goal that must succeed."""

@@ -22,12 +22,12 @@ class Clone:
         for name, text in files.items():
             path = self.folder / name
             if text is None:
-                path.unlink()
+                path.unlink(missing_ok=True)
             else:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(text)
         self.git("add", "--all")
-        self.git("commit", "--quiet", f"--message={message}")
+        self.git("commit", "--quiet", "--allow-empty", f"--message={message}")
         self.git("push", "--quiet", "origin", "HEAD:main")
         return self.git("rev-parse", "HEAD")
 

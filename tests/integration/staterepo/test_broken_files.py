@@ -6,6 +6,7 @@ finds the same, and every commit verifies by what its trailers say.
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -14,7 +15,8 @@ import pygit2
 import pytest
 import yaml
 from demandops.service import Generator
-from demandops.staterepo.load import state_in_effect
+from demandops.settings import GENERATED_ROOTS
+from demandops.staterepo.load import snapshot, state_in_effect
 
 from tests.kit import rig
 from tests.kit.config import override
@@ -208,4 +210,85 @@ def test_a_start_at_any_commit_finds_what_the_running_generator_has(
                     c.key: c for c in running.state.ledger
                 }, files
             assert bool(alone.problems) == bool(running.problems)
+    rig.assert_sound(bare)
+
+
+FOREIGN = [
+    "100644 bootstrap/evil.yml",
+    "100644 clusters/c-its/evil.json",
+    "100755 clusters/c-its/perception/edge/Kustomization",
+    "120000 clusters/c-its/perception/link.yaml",
+    "120000 clusters/README.md",
+    "160000 clusters/submodule",
+    '100644 "clusters/c-its/\\377.yaml"',
+    '100644 "clusters/\\377\\\\/evil.yaml"',
+    "100644 clusters/" + "deep/" * 3000 + "evil.yaml",
+    "100644 ledger/" + "deep/" * 3000 + "evil.yaml",
+    '100644 "inventory/\\377/\\377.yaml"',
+    "100644 policy/" + "deep/" * 3000 + "evil.yaml",
+]
+"""Modes and paths of entries, as ``git fast-import`` takes them."""
+
+
+def test_what_does_not_belong_in_generated_folders_is_removed_whatever_it_is_called(
+    bare: Path,
+) -> None:
+    def entries() -> set[str]:
+        return {
+            *rig.git(bare, "ls-tree", "-rz", "--name-only", "main", *GENERATED_ROOTS).split("\0")
+        }
+
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        before = entries()
+        lines = ["commit refs/heads/main", "committer P <p@example.org> 1767225600 +0000"]
+        lines += [
+            "data 4",
+            "evil",
+            "from refs/heads/main^0",
+            "M 100644 inline clusters/a/README.md",
+        ]
+        lines += ["data 2", "a", ""]
+        for line in FOREIGN:
+            mode, _, path = line.partition(" ")
+            if mode == "160000":
+                lines.append(f"M 160000 {'1' * 40} {path}")
+            else:
+                lines += [f"M {mode} inline {path}", "data 5", "evil", ""]
+        subprocess.run(
+            ["git", "-C", bare, "fast-import", "--quiet"],
+            input="\n".join(lines).encode(),
+            check=True,
+        )
+        rig.book(generator, goal(2))
+        assert {one for one in entries() - before if not one.endswith(".yaml")} == {
+            "clusters/a/README.md"
+        }
+        assert not any("evil" in one or "link" in one or "377" in one for one in entries())
+    rig.assert_sound(bare)
+
+
+def test_a_broken_file_is_judged_once_and_not_on_each_demand(
+    bare: Path, person: Person, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed: list[int] = []
+    load = snapshot.load_config
+    monkeypatch.setattr(
+        snapshot, "load_config", lambda files: (parsed.append(len(files)), load(files))[1]
+    )
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        nodes = "".join(f"  - {{id: n{i}, type: [], cluster: 5}}\n" for i in range(2_000))
+        person.change({NODES: text(bare, NODES) + nodes})
+        rig.book(generator, goal(2))
+        faults = [one for one in generator.snapshot.problems if one.file == NODES]
+        assert (len(faults), faults[-1].message) == (101, "has 3900 more faults")
+        judged = len(parsed)
+        assert judged
+        rig.book(generator, goal(3))
+        rig.book(generator, goal(4))
+        assert len(parsed) == judged
+        person.change({"README.md": "Ours\n"})
+        rig.book(generator, goal(5))
+        assert len(parsed) == judged
     rig.assert_sound(bare)

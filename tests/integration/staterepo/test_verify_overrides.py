@@ -11,6 +11,7 @@ from demandops.staterepo.audit.verification import Verdict
 
 from tests.kit import rig
 from tests.kit.config import override
+from tests.kit.repo import FORGER
 from tests.kit.repo import read as file
 from tests.kit.rig import Person
 
@@ -56,7 +57,7 @@ def test_a_held_file_is_compared_with_the_one_before(
         bare,
         person,
         generator,
-        lambda: person.change({path: changed}, FORGED.format("join", "")),
+        lambda: person.change({path: changed}, FORGED.format("join", ""), FORGER),
     )
     assert (made.holds, made.differing) == (False, (path,))
 
@@ -86,7 +87,7 @@ def test_what_a_commit_may_not_change(generator: Generator, bare: Path, person: 
         ("follow", "README.md"),
     ):
         text = file(bare, path) + "# more\n"
-        made = person.change({path: text}, FORGED.format(operation, ""))
+        made = person.change({path: text}, FORGED.format(operation, ""), FORGER)
         rig.book(generator, rig.goal(2), rig.leave(2))
         found = verdicts(bare)[made]
         assert (found.holds, found.touched) == (False, (path,))
@@ -104,10 +105,10 @@ def test_a_claim_that_is_kept_is_accounted_for_by_its_override(
     other = text.replace("petra", "paul")
     assert other != text
     message = FORGED.format("follow", "")
-    made = forged(bare, person, generator, lambda: person.change({path: other}, message))
+    made = forged(bare, person, generator, lambda: person.change({path: other}, message, FORGER))
     assert path in made.touched
     named = FORGED.format("follow", "Override: overrides/lasting.yaml\n")
-    made = forged(bare, person, generator, lambda: person.change({path: text}, named))
+    made = forged(bare, person, generator, lambda: person.change({path: text}, named, FORGER))
     assert path not in made.touched
 
 

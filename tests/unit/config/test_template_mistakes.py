@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 from demandops.config.load import load
 from demandops.decision import State, try_configuration
@@ -10,6 +12,7 @@ from demandops.ledger.ledger import Ledger
 
 from tests.kit.config import configuration, skeleton
 from tests.kit.goals import perception
+from tests.kit.http import serving
 from tests.kit.memory import MemoryRepo
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
@@ -64,8 +67,8 @@ APPENDED: dict[str, tuple[str, str]] = {
     "a loop without end": ("{% for i in range(1000000000) %}{% endfor %}\n", "Range too big"),
     "a division by nothing": ("x: {{ 1 / 0 }}\n", "zero"),
     "a value that YAML has no word for": (
-        "x: {{ inputs.point_cloud | map(attribute='topic') }}\n",
-        "a template may write text, numbers, lists and mappings, not <class 'generator'>",
+        "x: {{ ''.join }}\n",
+        "a template may write text, numbers, lists and mappings, not <class 'builtin_function",
     ),
 }
 """A line of a template, and a word of the message; the sentence is Jinja's own."""
@@ -113,6 +116,60 @@ def test_a_mistake_is_told_with_template_and_line(text: str, word: str) -> None:
 def test_whatever_a_template_does_it_is_told_as_the_templates_fault(text: str) -> None:
     (found, *_) = appended(text)
     assert found.startswith(f"{TEMPLATE}: ")
+
+
+GROWING = (
+    "{% set ns = namespace(x=START) %}{% for i in range(99) %}{% set ns.x = NEXT %}{% endfor %}"
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{% for a in range(99999) %}{% for b in range(99999) %}{% endfor %}{% endfor %}",
+        "{% set x = range(9999) | list %}{% for a in x if a in range(9999) | list %}{% endfor %}",
+        "{% for a in range(99999) %}" + "y" * 90 + "{{ a }}{% endfor %}",
+        "{% set z %}{% for a in range(99999) %}" + "y" * 900 + "{% endfor %}{% endset %}",
+        GROWING.replace("START", "'aaaa'").replace("NEXT", "ns.x ~ ns.x"),
+        GROWING.replace("START", "[1]").replace("NEXT", "[ns.x, ns.x]"),
+        GROWING.replace("START", "[1]").replace("NEXT", "ns.x + ns.x"),
+        GROWING.replace("START", "(1,)").replace("NEXT", "(ns.x, ns.x)") + "{{ {ns.x: 1} }}",
+        GROWING.replace("START", "{}").replace("NEXT", "dict(a=ns.x, b=ns.x)"),
+        GROWING.replace("START", "99999").replace("NEXT", "ns.x * ns.x"),
+        "x: {{ ('a' * 9999).replace('a', 'b' * 9999) }}",
+        "x: {{ range(9999) | join('b' * 9999) }}",
+        "x: {{ ('%9999d' * 999) % ((1,) * 999) }}",
+        "x: {{ ('a\n' * 999) | indent(9999) }}",
+        "x: {{ 1 | round(999999999, 'ceil') }}",
+        "{% if 0 %}" + "{% elif 0 %}" * 20_000 + "{% endif %}",
+        "a: &a [1, 1]\nb: [*a, *a]",
+        "a: " + "[" * 5000,
+        "a:\n" + "- " * 5000 + "b",
+    ],
+    ids=lambda text: repr(text[-50:]),
+)
+def test_what_would_run_for_ever_or_grow_is_the_templates_fault(text: str) -> None:
+    (found, *_) = faults(text)
+    assert found.startswith(f"{TEMPLATE}: ")
+    assert any(word in found for word in ("steps", "large", "longer", "most", "allowed", "deeper"))
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "[1, 2] | random",
+        "lipsum()",
+        "namespace() | string",
+        "'' ~ [''.join]",
+        "'%s' % [cycler(1)]",
+        "'{}'.format(joiner())",
+        "[cycler(1)] | map('string')",
+        "'a' | replace('a', joiner())",
+    ],
+)
+def test_nothing_random_gets_into_a_value(expression: str) -> None:
+    (found,) = appended("x: {{ " + expression + " }}\n")
+    assert found.startswith(f"{TEMPLATE}: line {LAST}: ")
 
 
 def test_formats_of_usual_size_work() -> None:
@@ -182,6 +239,57 @@ class TestValues:
         release = books.objects("HelmRelease")["od-edge-vehicle00"]
         text = f"x\\ny{end}".replace("\\n", "\n")
         assert release["spec"]["values"]["podAnnotations"] == {"a": text}
+
+
+def doubling(times: int) -> dict[str, object]:
+    """Return a schema that applies the last of its definitions ``2 ** times`` times."""
+    steps: dict[str, object] = {
+        f"d{i}": {"allOf": [{"$ref": f"#/$defs/d{i + 1}"}] * 2} for i in range(times)
+    }
+    return {"$ref": "#/$defs/d0", "$defs": {**steps, f"d{times}": {"type": "object"}}}
+
+
+class TestSchema:
+    """A chart's schema reads nothing else, and ends."""
+
+    def faults(self, schema: object) -> list[str]:
+        text = schema if isinstance(schema, str) else json.dumps(schema)
+        books = MemoryRepo({f"{CHART}/values.schema.json": text})
+        with pytest.raises(InvalidInput) as invalid:
+            books.send(perception())
+        return [str(found) for found in invalid.value.faults]
+
+    @pytest.mark.parametrize("scheme", ["http", "file", ""])
+    def test_a_reference_out_of_the_document_is_not_followed(self, scheme: str) -> None:
+        with serving() as server:
+            target = {"http": server.url, "file": "file:///etc/passwd", "": "secret.json"}[scheme]
+            found = self.faults({"properties": {"image": {"allOf": [{"$ref": target}]}}})
+        assert found == [
+            f"{CHART}/values.schema.json: properties.image.allOf[0].$ref: '{target}' is outside "
+            "this file; only references that start with '#' are followed, so copy the definition "
+            "here"
+        ]
+        assert server.calls == []
+
+    @pytest.mark.parametrize(
+        "schema",
+        [
+            doubling(60),
+            '{"not":' * 100_000 + "{}" + "}" * 100_000,
+            {"allOf": [{"$ref": "#"}]},
+            {"additionalProperties": {"allOf": [{"$ref": "#"}] * 2}},
+            {"patternProperties": {"a": {"$ref": "#"}, "e": {"$ref": "#"}}},
+        ],
+        ids=["doubling", "deep", "itself", "doubling by depth", "doubling by patterns"],
+    )
+    def test_a_schema_that_would_not_end_is_a_fault(self, schema: object) -> None:
+        (found,) = self.faults(schema)
+        assert found.startswith(f"{CHART}/values.schema.json: is nested too deeply or applies too")
+
+    def test_a_schema_may_refer_to_itself_for_parts(self) -> None:
+        tree = {"properties": {"image": {"$ref": "#"}, "ros": {"$ref": "#top"}}, "$anchor": "top"}
+        for schema in (tree, doubling(3)):
+            MemoryRepo({f"{CHART}/values.schema.json": json.dumps(schema)}).send(perception())
 
 
 class TestBeforeTheFirstDemand:

@@ -11,6 +11,7 @@ from demandops.decision import Decision, decide
 from demandops.demand import deployment_request_goal
 from demandops.errors import Fault, InvalidInput, Refused
 from demandops.staterepo.history import commit_message
+from demandops.staterepo.history.message_format import parse
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -145,6 +146,7 @@ def test_any_id_is_refused_or_booked_rendered_committed_and_released(
     for text in books.rendered().values():
         assert all(isinstance(item, dict) for item in yaml.load_all(text, Loader=FAST))
     assert commit_message.author(decision, NOW).name
-    assert f"\nRequester: {who}\n" in commit_message.of_decision(decision, "operation", NOW)
+    text = commit_message.of_decision(decision, "operation", NOW)
+    assert parse(text).trailers["Requester"] == [who]
     books.send(asked | {"shutdown": True})
     assert books.rendered() == {}

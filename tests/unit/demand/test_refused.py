@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
+from dataclasses import replace
 
-from tests.kit.config import brokers
+import pytest
+import yaml
+from demandops.errors import Refused
+
+from tests.kit.config import brokers, skeleton
 from tests.kit.goals import (
     BODY,
     CLOUD,
@@ -182,3 +186,54 @@ def test_a_shutdown_sent_again_changes_nothing_and_says_so() -> None:
     again = books.send(perception(shutdown=True))
     assert (again.outcome, again.files, books.books()) == ("unchanged", {}, standing)
     assert again.warnings[0].startswith("the same shutdown was carried out at ")
+
+
+def limited(**limits: int) -> MemoryRepo:
+    """Return a state repo with limits."""
+    settings = yaml.safe_load(skeleton()["demandops.yaml"])
+    return MemoryRepo({"demandops.yaml": yaml.safe_dump(settings | {"limits": limits})})
+
+
+def test_a_demand_that_lists_too_much_is_refused_at_once() -> None:
+    count = 20_000
+    clouds = [(f"/a/b{i}", "vehicle00") for i in range(count)]
+    assert MemoryRepo().faults(goal([application(clouds=clouds)])) == [
+        f"id: lists {count + 2} applications, connections, topics and requesters; at most 10000 "
+        "are allowed; a platform engineer may raise limits.demandItems in demandops.yaml"
+    ]
+
+
+def test_what_is_listed_is_counted_up_to_the_limit() -> None:
+    item = goal([], [connection(topics=["/a", "/b"])])
+    assert limited(demandItems=4).send(item).outcome == "booked"
+    assert len(limited(demandItems=3).faults(item)) == 1
+
+
+def test_a_file_that_would_grow_too_large_is_refused_and_may_shrink() -> None:
+    topics = [f"/topic_{i}" for i in range(30)]
+    refused = limited(fileBytes=1000).take(goal([], [connection(topics=topics)]))
+    assert isinstance(refused, Refused)
+    assert {found.file.split("/")[0] for found in refused.faults} == {"clusters"}
+    assert all("at most 1000 are allowed" in found.message for found in refused.faults)
+    repo = MemoryRepo()
+    repo.send(goal([], [connection(topics=topics)]))
+    small = limited(fileBytes=1000)
+    small.state, small.files = replace(small.state, ledger=repo.state.ledger), repo.files
+    small.send(goal([], [connection(topics=topics[:1])], shutdown=True))
+
+
+def test_parameters_are_bounded() -> None:
+    demand = {"kind": "Demand", "demand": "d", "requesters": ["vehicle00"]}
+    app = {"id": "a", "type": "object-detection-fusion", "node": "edge"}
+    (found, *_) = MemoryRepo().faults(
+        demand | {"applications": [app | {"parameters": {"use_sim_time": "x" * 100_000}}]}
+    )
+    assert found.startswith("applications[0].parameters: have 100020 bytes; at most 100000 are")
+
+
+def test_of_many_faults_the_first_are_told_and_the_others_counted() -> None:
+    found = MemoryRepo().faults(goal([], [connection(topics=["/a b"] * 150)]))
+    assert len(found) == 101
+    assert found[-1] == ": has 200 more faults"
+    (found, *_) = MemoryRepo().faults(goal([]) | {"x" * 10**6: 1})
+    assert len(found) < 10_000

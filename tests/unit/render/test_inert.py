@@ -13,9 +13,11 @@ from typing import Any
 import pytest
 import yaml
 from demandops import strict_yaml
+from demandops.config.load import load
+from demandops.errors import InvalidInput
 from demandops.identifiers import control_character
 
-from tests.kit.config import FAST, skeleton
+from tests.kit.config import FAST, configuration, override, skeleton
 from tests.kit.goals import application, connection, goal
 from tests.kit.memory import MemoryRepo
 
@@ -207,3 +209,22 @@ def test_numbers_and_truths_stay_numbers_and_truths() -> None:
 @pytest.mark.parametrize("text", [text for text in UNSEEN if ord(text[0]) < 0xFEFF])
 def test_what_no_reader_would_see_is_refused_in_an_id(text: str) -> None:
     assert MemoryRepo().faults(goal([], [connection(f"a{text.strip('ab ')}b")]))
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["!!binary aGk=", "!!set {x}", "!!omap [x: 1]", "0x" + "f" * 5000, "9:" * 9000 + "9"],
+    ids=lambda value: value[:10],
+)
+def test_what_json_or_a_program_cannot_hold_is_a_fault_of_its_file(value: str) -> None:
+    text = override({"nodes": ["*"]}, hold=True) + f"values: {{a: {value}}}\n"
+    with pytest.raises(InvalidInput) as invalid:
+        load(configuration({"overrides/odd.yaml": text}))
+    assert {found.file for found in invalid.value.faults} == {"overrides/odd.yaml"}
+    assert "not valid YAML" in str(invalid.value)
+
+
+def test_a_file_that_is_too_long_is_not_parsed() -> None:
+    text = "a: [" + "x, " * (strict_yaml.MAX_LENGTH // 3) + "]"
+    with pytest.raises(InvalidInput, match="at most 4000000 are allowed"):
+        strict_yaml.load(text)

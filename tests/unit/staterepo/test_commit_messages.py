@@ -9,6 +9,7 @@ import pygit2
 import pytest
 from demandops.errors import fault
 from demandops.identifiers import id_problem
+from demandops.quoting import escaped, is_visible
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.staterepo.history import commit_log, commit_message
 
@@ -181,7 +182,10 @@ def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly
     fsck = subprocess.run(command, capture_output=True, text=True, check=False)
     form = "--format=%(trailers:key=Requester,valueonly)%x1e"
     read_back = git(repo.path, "log", "--reverse", form).split("\n\x1e\n")
-    assert [name.removesuffix("\n\x1e") for name in read_back] == list(commits)
+    unlike = {name: f'"{escaped(name)}"' for name in commits if not is_visible(name)}
+    assert list(unlike) == ["\u200bx", "\u00ad", "a\u00a0b"]
+    wanted = [unlike.get(name, name) for name in commits]
+    assert [name.removesuffix("\n\x1e") for name in read_back] == wanted
     assert (fsck.returncode, fsck.stdout, fsck.stderr) == (0, "", "")
     assert failed == []
 

@@ -8,7 +8,8 @@ import pygit2
 import pytest
 from demandops.identifiers import id_problem
 from demandops.staterepo.history import commit_log, commit_message
-from demandops.staterepo.history.commit_log import operations_since, trailers_of
+from demandops.staterepo.history.commit_log import operations_since
+from demandops.staterepo.history.message_format import compose, parse
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -39,12 +40,12 @@ from tests.kit.repo import git
 def test_trailers_are_the_last_paragraph_if_it_holds_nothing_else(
     text: str, wanted: dict[str, list[str]]
 ) -> None:
-    assert trailers_of(text) == wanted
+    assert parse(text).trailers == wanted
 
 
 def test_a_commit_that_a_person_picked_is_not_taken_for_the_generators() -> None:
     text = "Join x\n\nOperation: join\nRender-Version: 1\n(cherry picked from commit 12ab)\n"
-    assert trailers_of(text) == {}
+    assert parse(text).trailers == {}
 
 
 IDS = st.text(
@@ -61,22 +62,24 @@ def test_every_id_is_read_back_by_git_and_by_us_as_it_was(
     text = commit_message.of_decision(decision, "op-1", desk.now)
     who = commit_message.author(decision, desk.now)
     tree = repo.TreeBuilder().write()
-    commit = repo.create_commit(None, who, who, text, tree, [])
+    committer = commit_message.generator_signature(desk.now)
+    commit = repo.create_commit(None, who, committer, text, tree, [])
     ours = commit_log.entry_of(repo[commit].peel(pygit2.Commit)).trailers
     assert ours["Requester"] == names
     assert ours["Request-Id"] == [request]
     assert ours["Application"] == [application]
     trailers = "--format=%(trailers:only,unfold)"
     by_git = git(repo.path, "log", "-1", "--encoding=UTF-8", trailers, str(commit))
-    lines = [f"{key}: {value}" for key, values in ours.items() for value in values]
-    assert sorted(by_git.removesuffix("\n").split("\n")) == sorted(lines)
+    lines = compose([], [(key, value) for key, values in ours.items() for value in values])
+    assert sorted(by_git.split("\n")) == sorted(lines.split("\n"))
 
 
 # ---- which demands arrived ----
 
 
 def _commit(repo: pygit2.Repository, operation: str, *parents: pygit2.Oid) -> pygit2.Oid:
-    who = pygit2.Signature("x", "x@example.org", 0, 0)
+    name = commit_log.GENERATOR_NAME if operation else "x"
+    who = pygit2.Signature(name, commit_log.GENERATOR_EMAIL, 0, 0)
     text = f"Join\n\nOperation-Id: {operation}\nRender-Version: 1\n" if operation else "By hand\n"
     return repo.create_commit(None, who, who, text, repo.TreeBuilder().write(), list(parents))
 

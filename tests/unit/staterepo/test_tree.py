@@ -134,7 +134,7 @@ def test_bytes_that_are_no_text_show_instead_of_stopping(repo: pygit2.Repository
     assert trees.read_text(tree, "nothing/there") is None
 
 
-def test_a_submodule_and_a_link_are_no_files_of_ours(repo: pygit2.Repository) -> None:
+def test_a_submodule_has_no_text_and_is_told_as_a_difference(repo: pygit2.Repository) -> None:
     builder = repo.TreeBuilder()
     builder.insert("sub", pygit2.Oid(hex="1" * 40), pygit2.enums.FileMode.COMMIT)
     builder.insert("f", repo.create_blob(b"x"), pygit2.enums.FileMode.BLOB)
@@ -143,4 +143,4 @@ def test_a_submodule_and_a_link_are_no_files_of_ours(repo: pygit2.Repository) ->
     builder.insert("top", inner, pygit2.enums.FileMode.TREE)
     tree = repo[builder.write()].peel(pygit2.Tree)
     assert trees.texts(tree, ("top",)) == {"top/f": "x"}
-    assert [path for path, _ in trees.differences(None, tree)] == ["top/f"]
+    assert [path for path, _ in trees.differences(None, tree)] == ["top/f", "top/sub"]

@@ -21,6 +21,7 @@ from demandops.cli.output import console, errors, progress, signing_option, stat
 from demandops.decision import admit, decide, form_faults
 from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, fault
 from demandops.input_file import read_input
+from demandops.quoting import one_line
 from demandops.runtime import REAL
 from demandops.service import Generator, Receipt
 from demandops.service.approvals.proposal import parse_waiting_text
@@ -231,7 +232,7 @@ def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[d
 def _print(rows: list[dict[str, Any]], documents: list[_Document], dry_run: bool) -> None:
     out = console()
     for row, document in zip(rows, documents, strict=True):
-        title = f"{document.file}: request {row['index']} '{row['request']}'"
+        title = f"{document.file}: request {row['index']} '{one_line(row['request'])}'"
         if row["outcome"] == "waiting":
             errors.print(f"{title} has no answer yet")
         elif row["outcome"] == "refused":

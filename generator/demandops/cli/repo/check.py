@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from demandops.cli.json_output import output_formats, print_json
-from demandops.cli.output import console, errors, printable
+from demandops.cli.output import console, errors
 from demandops.cli.repo import pull_request_comment
 from demandops.cli.views.diff import entry_lines, release_lines
 from demandops.render.changes.merge_preview import FileChange
@@ -97,7 +97,7 @@ def _print(directory: Path, checked: CheckResult) -> None:
     if not checked.faults:
         out.print(f"{directory}: all files are valid and everything renders")
     for line in _lines(checked):
-        out.print(printable(line), soft_wrap=True)
+        out.print(line, soft_wrap=True)
 
 
 def _lines(checked: CheckResult) -> Iterator[str]:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from demandops.cli.output import printable
 from demandops.plan.views.bookkeeping import EntryChange
+from demandops.quoting import lines, one_line
 from demandops.render.changes.changeset import CHANGE_ORDER, ReleaseChange
 from demandops.staterepo.pull_request.merge_check import CheckResult
 
@@ -33,9 +33,7 @@ def report(checked: CheckResult, longest: int = LONGEST) -> str:
 
 def code(text: str) -> str:
     """Return text as a code span of one line."""
-    text = "".join(char if char.isprintable() else " " for char in text)
-    if len(text) > _LONGEST_SPAN:
-        text = f"{text[:_LONGEST_SPAN]}…"
+    text = one_line(text, _LONGEST_SPAN)
     if not text.strip():
         return "(empty)"
     marks = _longer_than_any(text, least=1)
@@ -45,7 +43,7 @@ def code(text: str) -> str:
 
 def fence(text: str, language: str) -> str:
     """Return text as a block of code."""
-    text = printable(text)
+    text = lines(text)
     marks = _longer_than_any(text, least=3)
     return f"{marks}{language}\n{text.rstrip()}\n{marks}\n"
 
@@ -141,7 +139,7 @@ def _folded(summary: str, body: str) -> str:
 
 def _plain(path: str) -> str:
     """Return a path as HTML, because a summary does not render Markdown."""
-    safe = re.sub(r"[^A-Za-z0-9_./-]", lambda char: f"&#{ord(char[0])};", path)
+    safe = re.sub(r"[^A-Za-z0-9_./-]", lambda char: f"&#{ord(char[0])};", one_line(path))
     return f"<code>{safe if len(safe) <= _LONGEST_SPAN else '…'}</code>"
 
 

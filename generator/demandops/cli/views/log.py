@@ -13,6 +13,7 @@ from rich.table import Table
 from demandops.cli.json_output import commit_data, output_option, show
 from demandops.cli.output import state_repo_option
 from demandops.errors import StateRepoError
+from demandops.quoting import one_line
 from demandops.runtime import REAL
 from demandops.staterepo import reader
 from demandops.staterepo.history import revisions
@@ -132,13 +133,13 @@ def _matching(
 def _table(entries: Iterable[LogEntry]) -> Table:
     table = Table("Commit", "Time (UTC)", "Operation", "Requesters", "What")
     for entry in entries:
-        requesters = ", ".join(entry.trailers.get("Requester", ()))
+        requesters = one_line(", ".join(entry.trailers.get("Requester", ())))
         if entry.first("Operation") == "rollback":
             requesters = f"{entry.author}, for {requesters}"
         table.add_row(
             entry.commit[:10],
             entry.time.strftime("%Y-%m-%d %H:%M:%S"),
-            entry.first("Operation") or "by hand",
+            one_line(entry.first("Operation")) or "by hand",
             requesters or entry.author,
             entry.summary,
         )

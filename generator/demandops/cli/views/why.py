@@ -22,12 +22,13 @@ from demandops.cli.json_output import (
 from demandops.cli.output import at_option, state_repo_option
 from demandops.cli.views.diff import loaded
 from demandops.demand.claim import Claim
-from demandops.errors import StateRepoError, quoted, suggestion
+from demandops.errors import StateRepoError, suggestion
 from demandops.ledger import claim_file
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import suspended_by, without_suspended
 from demandops.plan.release import Release
 from demandops.plan.views import release_causes
+from demandops.quoting import quoted
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo import reader
 from demandops.staterepo.history.commit_log import LogEntry

@@ -112,7 +112,7 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
         after = change.after
         if after is None or after.keeping_override is not None:  # overrides decide about these
             continue
-        booking = _request_for(after)
+        booking = request_for(after)
         for found in (
             *admission.faults(booking, world.config),
             *permission.faults(booking, world.config),
@@ -120,7 +120,7 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
             yield found.within(path_of(change.key))
 
 
-def _request_for(claim: Claim) -> Put:
+def request_for(claim: Claim) -> Put:
     """Return a request that books this claim; its faults name the claim's own fields."""
     return Put(
         id=claim.request,

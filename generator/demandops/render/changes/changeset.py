@@ -9,13 +9,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from demandops.errors import Refused
+from demandops.config.repo_settings import ROOT_FILE
+from demandops.errors import Refused, fault
 from demandops.ledger import claim_file, recent_shutdowns
 from demandops.ledger.ledger import Changes
 from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
+from demandops.quoting import one_line
 from demandops.render import release_file
 from demandops.render.engine import Engine
 from demandops.render.gitops import manifests
@@ -106,8 +108,24 @@ def build_changeset(
         if old or new:
             releases.append(describe_change(old, new, current is not None))
     check_files(files)
+    _refuse_large(files, after.config.repo_settings.limits.file_bytes, read)
     releases.sort(key=lambda change: change.order)
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
+
+
+def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
+    """Refuse a file that grows above the limit; one that shrinks may still be above it."""
+    faults = []
+    for path, text in files.items():
+        size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
+        if size > max(most, len((read(path) or "").encode()) if size > most else 0):
+            message = (
+                f"would have {size} bytes; at most {most} are allowed; demand less of it, or have "
+                f"a platform engineer raise limits.fileBytes in {ROOT_FILE}"
+            )
+            faults.append(fault("", message, code="too-large").within(path))
+    if faults:
+        raise Refused(faults)
 
 
 def render_all(
@@ -155,8 +173,8 @@ def _differences(old: Release | None, new: Release) -> tuple[str, ...]:
         before = (old.facts() if old else []) + before
         after = new.facts() + after
     old_facts, new_facts = frozenset(before), frozenset(after)
-    removed = [f"- {fact}" for fact in before if fact not in new_facts]
-    added = [f"+ {fact}" for fact in after if fact not in old_facts]
+    removed = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
+    added = [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
     return (*removed, *added)
 
 

@@ -16,15 +16,8 @@ from typing import TypeAlias
 
 from demandops.decision import Decision, State
 from demandops.demand.demand_request import DemandRequest, Put
-from demandops.errors import (
-    DemandOpsError,
-    InvalidInput,
-    Refused,
-    ShuttingDown,
-    Withdrawn,
-    fault,
-    quoted,
-)
+from demandops.errors import DemandOpsError, InvalidInput, Refused, ShuttingDown, Withdrawn, fault
+from demandops.quoting import quoted
 from demandops.service.approvals.forge_worker import ForgeWorker
 from demandops.service.approvals.proposal import (
     Decided,

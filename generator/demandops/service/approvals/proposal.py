@@ -16,6 +16,7 @@ from demandops.demand import permission
 from demandops.demand.demand_request import DemandRequest, Release
 from demandops.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
 from demandops.forge import PullRequest
+from demandops.quoting import one_line
 from demandops.render.changes.changeset import FileReader
 from demandops.service.ticket import ProposalRecord, Ticket
 from demandops.settings import MAIN_BRANCH
@@ -202,7 +203,7 @@ def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
     """Return the feedback for a requester while the demand awaits approval."""
     branch_and_link = f"{branch} {link}" if link else branch
     why = ", ".join(reasons)
-    return f"{_PREFIX}{branch_and_link}" + (f" (asked for by {why})" if why else "")
+    return one_line(f"{_PREFIX}{branch_and_link}" + (f" (asked for by {why})" if why else ""))
 
 
 def parse_waiting_text(text: str) -> dict[str, str]:
@@ -248,7 +249,8 @@ def title_of(message: str) -> str:
 
 
 def _asked_for_by(reasons: Iterable[str]) -> str:
-    return f"A demand that needs approval, asked for by {', '.join(reasons) or 'an access policy'}."
+    why = one_line(", ".join(reasons)) or "an access policy"
+    return f"A demand that needs approval, asked for by {why}."
 
 
 def _fence(text: str, shortest: int) -> str:

@@ -13,10 +13,11 @@ from datetime import datetime, timedelta, timezone
 
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Expire
-from demandops.errors import InvalidInput, quoted
+from demandops.errors import InvalidInput
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.overrides.lifecycle import expired_overrides
+from demandops.quoting import quoted
 from demandops.runtime import Runtime
 from demandops.service.ticket import Receipt, Ticket
 from demandops.staterepo.write.commit_batch import CommitBatch

@@ -21,7 +21,7 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, rendered_files
 from demandops.demand.claim import OVERRIDE_PREFIX
-from demandops.errors import InvalidInput
+from demandops.errors import InvalidInput, StateRepoError
 from demandops.ledger import claim_file, ended_override_file, recent_shutdowns
 from demandops.ledger.ledger import ClaimChange
 from demandops.ledger.world import World
@@ -165,6 +165,8 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
             yield replace(verdict, skipped=why, holds=not verdict.touched)
         except InvalidInput as error:  # the generator did render it then, so it must now
             yield replace(verdict, holds=False, fault=str(error.faults[0]))
+        except StateRepoError as error:
+            yield replace(verdict, holds=False, fault=str(error))
         else:
             holds = not (differing or verdict.touched)
             yield replace(verdict, holds=holds, differing=differing)
@@ -211,7 +213,7 @@ def _holds(world: World) -> bool:
 
 
 def _generated_files(tree: Tree) -> dict[str, Oid]:
-    return {path: blob.id for path, blob in trees.blobs(tree, GENERATED_ROOTS)}
+    return {path: found.id for path, found in trees.entries(tree, GENERATED_ROOTS)}
 
 
 def _blob(text: str) -> Oid:

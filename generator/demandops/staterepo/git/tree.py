@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import pygit2
 from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
-from pygit2.enums import ObjectType
+from pygit2.enums import FileMode, ObjectType
 
 from demandops.errors import StateRepoError
 from demandops.staterepo.git.new_objects import Entries, NewObjects, entries_of
@@ -16,6 +16,8 @@ pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)  # a reported commit i
 pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
 
+MAX_DEPTH = 64
+"""The folders above a file; deeper ones are not read."""
 _FOLDER, _FILE = b"40000", b"100644"
 
 
@@ -60,28 +62,43 @@ def text_of(blob: Object) -> str:
     return blob.data.decode("utf-8", "replace") if isinstance(blob, Blob) else ""
 
 
-def blobs(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Blob]]:
-    """Yield (path, file) of every file at or below the paths ``roots``, in Git's order."""
+def entries(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Object]]:
+    """Yield (path, object) of all that is no folder at or below the paths ``roots``.
+
+    In Git's order. A folder that is deeper than :data:`MAX_DEPTH` counts as one entry. A name that
+    is not UTF-8 has ``\\xff`` for such a byte.
+    """
     for root in roots:
         found = entry(tree, root)
         if isinstance(found, Tree):
-            yield from _blobs_below(found, f"{root}/")
-        elif isinstance(found, Blob):
+            yield from _entries_below(found, f"{root}/", root.count("/") + 1)
+        elif found is not None:
             yield root, found
 
 
-def _name(found: Object) -> str:
-    """Return the name of a tree's entry. Invalid UTF-8 is replaced, so no path is found by it."""
-    return (found.raw_name or b"").decode("utf-8", "replace")
-
-
-def _blobs_below(tree: Tree, prefix: str) -> Iterator[tuple[str, Blob]]:
+def _entries_below(tree: Tree, prefix: str, depth: int) -> Iterator[tuple[str, Object]]:
     for found in tree:
-        path = f"{prefix}{_name(found)}"
-        if isinstance(found, Tree):
-            yield from _blobs_below(found, f"{path}/")
-        elif isinstance(found, Blob):
+        path = prefix + _printable(found.raw_name or b"")
+        if isinstance(found, Tree) and depth < MAX_DEPTH:
+            yield from _entries_below(found, f"{path}/", depth + 1)
+        else:
             yield path, found
+
+
+def _printable(name: bytes) -> str:
+    return name.decode("utf-8", "backslashreplace")
+
+
+def blobs(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Blob]]:
+    """Yield (path, file) of every file at or below the paths ``roots``, in Git's order."""
+    for path, found in entries(tree, roots):
+        if isinstance(found, Blob):
+            yield path, found
+
+
+def is_file(found: Object) -> bool:
+    """Return whether an entry is a file, and no link, submodule or folder."""
+    return isinstance(found, Blob) and found.filemode != FileMode.LINK
 
 
 def texts(tree: Tree, roots: Iterable[str]) -> dict[str, str]:
@@ -110,8 +127,8 @@ def differences(
 def _differences_below(
     before: Tree | None, after: Tree | None, prefix: str
 ) -> Iterator[tuple[str, Oid | None]]:
-    old = {_name(found): found for found in before or ()}
-    new = {_name(found): found for found in after or ()}
+    old = {_printable(found.raw_name or b""): found for found in before or ()}
+    new = {_printable(found.raw_name or b""): found for found in after or ()}
     for name in sorted({*old, *new}):
         yield from _differences_at(old.get(name), new.get(name), f"{prefix}{name}")
 
@@ -121,12 +138,12 @@ def _differences_at(
 ) -> Iterator[tuple[str, Oid | None]]:
     if old is not None and new is not None and old.id == new.id:
         return
-    if isinstance(old, Tree) or isinstance(new, Tree):
+    if path.count("/") < MAX_DEPTH and (isinstance(old, Tree) or isinstance(new, Tree)):
         before, after = (found if isinstance(found, Tree) else None for found in (old, new))
         yield from _differences_below(before, after, f"{path}/")
-    if isinstance(new, Blob):
+    if new is not None and not isinstance(new, Tree):
         yield path, new.id
-    elif isinstance(old, Blob):
+    elif old is not None and not isinstance(old, Tree):
         yield path, None
 
 
@@ -152,9 +169,9 @@ def _write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | Non
     for path, text in files.items():
         name, _, rest = path.partition("/")
         if rest:
-            below.setdefault(name.encode(), {})[rest] = text
+            below.setdefault(_raw_name(name, entries), {})[rest] = text
         else:
-            here[name.encode()] = text
+            here[_raw_name(name, entries)] = text
     for folder, inner in below.items():
         mode, raw = entries.get(folder, (b"", b""))
         kept = mode == _FOLDER and here.get(folder, "") is not None
@@ -171,6 +188,14 @@ def _write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | Non
     if not entries:
         return None
     return objects.add(ObjectType.TREE, _content(entries))
+
+
+def _raw_name(name: str, entries: Entries) -> bytes:
+    """Return the name of the entry that is written as ``name``, or of a new one."""
+    raw = name.encode()
+    if raw in entries or b"\\" not in raw:
+        return raw
+    return next((known for known in entries if _printable(known) == name), raw)
 
 
 def _content(entries: Entries) -> bytes:

@@ -1,7 +1,7 @@
 """Authors: the commits by people, and the person who runs this program.
 
 A follow commit renders what people committed; it names their commits and has them as author.
-A commit is by a person if no generator made it, on any machine.
+A commit is by a person if no generator made it, on any machine (:mod:`.commit_log`).
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
         return commit_message.generator_signature(now)
     people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))
     names = ", ".join(dict.fromkeys(one.name for one in people))
-    email = people[0].email if len(people) == 1 else commit_message.GENERATOR_EMAIL
+    email = people[0].email if len(people) == 1 else commit_log.GENERATOR_EMAIL
     return commit_message.signature(names, email, commit_log.time_of(causes[0]))
 
 

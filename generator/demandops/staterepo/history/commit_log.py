@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Literal
 
@@ -20,11 +20,15 @@ from pygit2.enums import SortMode
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.tree import commit_of
+from demandops.staterepo.history import allowed_signers, message_format
 
 PROPOSAL = "Proposal"
 """The trailer of a commit that needs approval: the branch that it was proposed on."""
 
-_WHY = "Why: "
+GENERATOR_NAME = "DemandOps generator"
+GENERATOR_EMAIL = "generator@demandops.invalid"
+"""Name and address of the committer of every commit by a generator."""
+
 _LAST_SECOND = 253402300799
 """The last second of the year 9999."""
 _NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
@@ -40,33 +44,17 @@ class LogEntry:
     summary: str
     trailers: dict[str, list[str]]
     why: str = ""
+    by_generator: bool = False
+    """Whether the generator is the committer, so that the files should match the ledger.
+
+    Its message alone says nothing, because anybody may quote trailers. A proposal does not count: a
+    person merges it, maybe onto other changes, so it is read again. :func:`is_by_generator` also
+    asks for a signature.
+    """
 
     def first(self, key: str) -> str:
         """Return the first value of a trailer, or an empty text."""
         return next(iter(self.trailers.get(key, ())), "")
-
-    @property
-    def by_generator(self) -> bool:
-        """Whether the generator made the commit, so that its files match its ledger.
-
-        A proposal does not count: a person merges it, maybe onto other changes, so it is read
-        again.
-        """
-        return "Render-Version" in self.trailers and PROPOSAL not in self.trailers
-
-
-def trailers_of(message: str) -> dict[str, list[str]]:
-    """Return the trailers of a commit message: the lines ``Key: value`` of its last paragraph."""
-    trailers: dict[str, list[str]] = {}
-    paragraph = message.rstrip("\n").rsplit("\n\n", 1)
-    if len(paragraph) < 2:
-        return trailers
-    for line in paragraph[1].split("\n"):
-        key, colon, value = line.partition(": ")
-        if not colon or " " in key:
-            return {}
-        trailers.setdefault(key, []).append(value)
-    return trailers
 
 
 def time_of(commit: Commit) -> datetime:
@@ -86,17 +74,28 @@ def _text(raw: bytes) -> str:
 
 
 def entry_of(commit: Commit) -> LogEntry:
-    """Return the log entry of a commit."""
-    message = _text(commit.raw_message)
-    whys = (line for line in message.split("\n") if line.startswith(_WHY))
+    """Return the log entry of a commit.
+
+    Trailers and reason of a person's commit are left out, unless it merges a proposal.
+    """
+    text = message_format.parse(_text(commit.raw_message))
+    committer = _text(commit.committer.raw_name), _text(commit.committer.raw_email)
+    is_ours, is_proposal = committer == (GENERATOR_NAME, GENERATOR_EMAIL), PROPOSAL in text.trailers
+    is_told = is_ours or is_proposal
     return LogEntry(
         commit=str(commit.id),
         time=time_of(commit),
         author=author_of(commit)[0],
-        summary=message.split("\n", 1)[0],
-        trailers=trailers_of(message),
-        why=next(whys, "").removeprefix(_WHY),
+        summary=text.summary,
+        trailers=text.trailers if is_told else {},
+        why=text.why if is_told else "",
+        by_generator=is_ours and not is_proposal and "Render-Version" in text.trailers,
     )
+
+
+def is_by_generator(repo: Repository, commit: Commit) -> bool:
+    """Return whether the generator made a commit: it is the committer, and signed if it must."""
+    return entry_of(commit).by_generator and not allowed_signers.faults(repo, [commit])
 
 
 def commits(
@@ -113,7 +112,19 @@ def person_commits(
     repo: Repository, tip: str | Oid, until: str | Oid | None = None
 ) -> Iterator[Commit]:
     """Yield the commits of :func:`commits` that people made."""
-    return (commit for commit, entry in commits(repo, tip, until) if not entry.by_generator)
+    return (commit for commit, entry in _told_apart(repo, tip, until) if not entry.by_generator)
+
+
+def _told_apart(
+    repo: Repository, tip: str | Oid, until: str | Oid | None
+) -> list[tuple[Commit, LogEntry]]:
+    """Return the commits; ``by_generator`` of an entry also says that the signature is good."""
+    found = list(commits(repo, tip, until))
+    faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])
+    return [
+        (each, replace(entry, by_generator=entry.by_generator and entry.commit not in faults))
+        for each, entry in found
+    ]
 
 
 def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
@@ -142,7 +153,8 @@ class RecordedOutcome:
 def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, RecordedOutcome]:
     """Return operation id → outcome of every demand that commits after ``base`` record.
 
-    Reads all of history if ``base`` is not known here (a remote that was made again).
+    A person who merges a proposal may keep its trailers; any other commit by a person records no
+    demand. Reads all of history if ``base`` is not known here (a remote that was made again).
     """
     if str(tip) == base:
         return {}
@@ -151,8 +163,9 @@ def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Recorde
     except (pygit2.GitError, KeyError, ValueError):
         known = False
     outcomes = {}
-    for _, entry in commits(repo, tip, base if known else None):
-        for key, outcome in _OUTCOMES.items():
+    for _, entry in _told_apart(repo, tip, base if known else None):
+        is_record = entry.by_generator or PROPOSAL in entry.trailers
+        for key, outcome in _OUTCOMES.items() if is_record else ():
             for operation in entry.trailers.get(key, ()):
                 outcomes[operation] = RecordedOutcome(entry.commit, outcome)
     return outcomes
@@ -160,8 +173,8 @@ def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, Recorde
 
 def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
     """Return the newest commit of the generator along the first parents, or None."""
-    entries = (entry_of(commit) for commit in first_parents(repo, tip))
-    return next((Oid(hex=entry.commit) for entry in entries if entry.by_generator), None)
+    found = (commit for commit in first_parents(repo, tip) if is_by_generator(repo, commit))
+    return next((commit.id for commit in found), None)
 
 
 @dataclass(frozen=True, slots=True)

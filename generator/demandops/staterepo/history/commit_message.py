@@ -1,8 +1,9 @@
 """Commit messages: what changed in the desired state and why, for people and programs.
 
 The trailers are a contract: an auditor without this program finds everything with
-``git log --format='%(trailers:key=Requester)'``. Ids hold no line breaks, so none can forge a
-trailer. :mod:`demandops.staterepo.load.state_in_effect` adds those about quarantined files.
+``git log --format='%(trailers:key=Requester)'``. Values from outside stand in a message only as
+:mod:`demandops.staterepo.history.message_format` quotes them.
+:mod:`demandops.staterepo.load.state_in_effect` adds the trailers about quarantined files.
 """
 
 from __future__ import annotations
@@ -21,40 +22,32 @@ from demandops.demand.demand_request import Decommission, Expire
 from demandops.errors import Fault
 from demandops.ledger import claim_file
 from demandops.ledger.operations.restoration import Restoration
+from demandops.quoting import one_line
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo.history import revisions
+from demandops.staterepo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME
+from demandops.staterepo.history.message_format import compose
 from demandops.subject import SubjectKind
-
-GENERATOR_NAME = "DemandOps generator"
-GENERATOR_EMAIL = "generator@demandops.invalid"
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
 _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
-_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 
 
 def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
     """Return a person and a time, without the characters that Git does not accept."""
-    email = _UNFIT.sub("", email) or GENERATOR_EMAIL
-    plain = _CONTROL.sub("", name.replace("<", "(").replace(">", ")"))
-    plain = _clipped(plain, _MAX_AUTHOR).strip(" .,:;\"'\\") or "unnamed"
+    email = one_line(_UNFIT.sub("", email), _MAX_AUTHOR) or GENERATOR_EMAIL
+    plain = one_line(name.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
+    plain = plain.strip(" .,:;\"'\\") or "unnamed"
     return pygit2.Signature(plain, email, int(time.timestamp()), 0)
 
 
 def generator_signature(time: datetime) -> pygit2.Signature:
     """Return the committer of the generator's commits."""
     return signature(GENERATOR_NAME, GENERATOR_EMAIL, time)
-
-
-def compose(paragraphs: Iterable[Iterable[str]], trailers: Iterable[tuple[str, str]]) -> str:
-    """Return a message of paragraphs, each a list of lines, and trailers; leave out empty ones."""
-    lines = [f"{key}: {value}" for key, value in trailers if value]
-    texts = ["\n".join(paragraph) for paragraph in (*paragraphs, lines)]
-    return "\n\n".join(text for text in texts if text) + "\n"
 
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
@@ -82,7 +75,7 @@ def of_decision(
     subjects = decision.changes.subjects()
     title, why = _title_and_why(decision, received)
     paragraphs = [
-        [_clipped(title, _MAX_SUBJECT)],
+        [one_line(title, _MAX_SUBJECT)],
         [f"Why: {why}"],
         _desired_state(decision.releases),
         _list("Listed, but not held by the requester:", decision.changes.not_held),
@@ -193,7 +186,7 @@ def of_follow(
     names, after = ", ".join(release.name for release in releases), f" after commit {cause[:12]}"
     title = f"Update ledger{after}"
     if names:
-        title = f"Update {_clipped(names, _MAX_SUBJECT - len(after) - len('Update '))}{after}"
+        title = f"Update {one_line(names, _MAX_SUBJECT - len(after) - len('Update '))}{after}"
     elif reports:
         title = "Report invalid files" if problems else "Report that all files are valid"
     paragraphs = [
@@ -259,7 +252,3 @@ def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
         lines.append(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
         lines += [f"      {detail}" for detail in release.details]
     return lines
-
-
-def _clipped(text: str, most: int) -> str:
-    return text if len(text) <= most else text[: most - 1].rstrip() + "…"

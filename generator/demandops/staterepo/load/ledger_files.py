@@ -11,7 +11,7 @@ from demandops import naming
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.ledger.operations.restoration import Restoration
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo.git import tree as trees
@@ -78,14 +78,35 @@ def last_valid_claims(
     tree = trees.commit_of(repo, last_valid_commit).tree
     claims = {path: claim_at(tree, path) for path in paths}
     left = set(claims)
-    for commit, entry in commit_log.commits(repo, to, last_valid_commit) if left else ():
+    for commit, _ in commit_log.commits(repo, to, last_valid_commit) if left else ():
         before = trees.parent_tree(commit)
-        if before is None or not entry.by_generator:
-            continue
-        for path in [path for path in left if trees.differ(before, commit.tree, (path,))]:
-            claims[path] = claim_at(commit.tree, path)
-            left.remove(path)
+        changed = [path for path in left if trees.differ(before, commit.tree, (path,))]
+        if before is not None and changed and commit_log.is_by_generator(repo, commit):
+            claims |= {path: claim_at(commit.tree, path) for path in changed}
+            left.difference_update(changed)
     return claims
+
+
+def claims_by_people(
+    repo: Repository, last_valid_commit: Oid, to: Oid, known: Ledger
+) -> list[ClaimChange]:
+    """Return the claims that people wrote, each with the one that the generator last wrote.
+
+    Args:
+        last_valid_commit: the newest commit with only valid files; older claims are left out.
+        known: the claims that were in effect before; these are left out too.
+    """
+    paths = {
+        path
+        for commit in commit_log.person_commits(repo, to, last_valid_commit)
+        for path in changed_files(trees.parent_tree(commit), commit.tree)
+    }
+    tree = trees.commit_of(repo, to).tree
+    found = ((path, valid_claim_at(tree, path)) for path in sorted(paths))
+    written = {path: claim for path, claim in found if claim and known.get(claim.key) != claim}
+    booked = last_valid_claims(repo, last_valid_commit, to, written)
+    changes = (ClaimChange(booked[path], claim) for path, claim in written.items())
+    return [change for change in changes if change.before != change.after]
 
 
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, fields
 
 from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput
+from demandops.quoting import is_visible, one_line
 from demandops.settings import API_VERSION, NOTES_ROOT
 
 PATH = f"{NOTES_ROOT}/reports/problems.yaml"
@@ -49,11 +50,12 @@ def with_origins(
     existing = {(old.file, old.field, old.message): old for old in known if old.since}
     problems = []
     for fault in sorted({(fault.file, fault.field, fault.message) for fault in faults}):
-        if fault in existing:
-            problems.append(existing[fault])
+        file, field, message = map(one_line, fault)
+        if (file, field, message) in existing:
+            problems.append(existing[file, field, message])
             continue
         commit, author = origin(fault[0]) or ("", "")
-        problems.append(Problem(*fault, commit, author))
+        problems.append(Problem(file, field, message, commit, one_line(author)))
     return tuple(problems)
 
 
@@ -81,13 +83,13 @@ def read(text: str | None) -> tuple[Problem, ...]:
     except InvalidInput:
         return ()
 
-    def printable(value: object) -> str:
-        return value if isinstance(value, str) and value.isprintable() else ""
+    def visible(value: object) -> str:
+        return value if isinstance(value, str) and is_visible(value) else ""
 
     entries = data.get("problems") if isinstance(data, dict) else None
     return tuple(
         Problem(
-            **{name: printable(entry.get(name)) for name in (each.name for each in fields(Problem))}
+            **{name: visible(entry.get(name)) for name in (each.name for each in fields(Problem))}
         )
         for entry in (entries if isinstance(entries, list) else ())
         if isinstance(entry, dict)

@@ -120,13 +120,7 @@ def advance(
     if recorded is not None:
         known = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
     elif before.problems or trees.differ(old, new, CONFIG_ROOTS):
-        known = load_last_valid_config(
-            repo,
-            before.config_source,
-            before.last_valid_commit,
-            to,
-            lambda files: _load_and_rehearse(files, before.state),
-        )
+        known = _last_valid_config(repo, before, to)
     config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
     world_changed = config != state.config or ended != state.ledger.ended
     config_changed = world_changed or _has_manual_edit(repo, before.commit, to)
@@ -174,6 +168,36 @@ def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
         for commit in commit_log.person_commits(repo, to, before)
         if commit.parents
     )
+
+
+_judged: dict[object, LastValidConfig] = {}
+"""The newest results, so that a file that stays broken is judged once, not on each demand."""
+_MOST_JUDGED = 8
+
+
+def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValidConfig:
+    """Return the configuration of a commit, with the last valid versions of invalid files."""
+    key = (
+        frozenset(before.config_source.files(repo).items()),
+        frozenset(ConfigSource(to).files(repo).items()),
+        before.last_valid_commit,
+        frozenset(before.state.ledger.ended.items()),
+    )
+    found = _judged.get(key)
+    if found is None:
+        found = load_last_valid_config(
+            repo,
+            before.config_source,
+            before.last_valid_commit,
+            to,
+            lambda files: _load_and_rehearse(files, before.state),
+        )
+        if len(_judged) >= _MOST_JUDGED:
+            _judged.clear()
+        _judged[key] = found
+    if found.config is None:
+        return replace(found, source=before.config_source)
+    return replace(found, source=replace(found.source, commit=to))
 
 
 def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:

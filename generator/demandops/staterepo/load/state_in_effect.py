@@ -2,27 +2,29 @@
 
 The generator's commits record it in trailers. ``In-Force`` names the newest commit where all files
 were valid. ``Configuration`` names the commit whose configuration is in effect. Each ``Stands-In``
-names a file that is in effect in another version, as path and blob. A restart and
-``demandops verify`` start from these trailers. They then apply people's later changes with the same
-code as a running generator.
+names a file that is in effect in another version, as path and blob. Each ``Held-Back`` names a file
+of the ledger that is not in effect. A restart and ``demandops verify`` start from these trailers.
+They then apply people's later changes with the same code as a running generator.
 
 People's changes that cannot be planned are not applied (quarantine). A claim that cannot be
-planned, for example because it names an unknown node, stays in its file, and its last valid version
-is in effect. If the new configuration is the reason, the old configuration stays in effect.
+planned, for example because it names an unknown node, or that policy refuses stays in its file, and
+its last valid version is in effect. If the new configuration is the reason, the old configuration
+stays in effect.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from urllib.parse import quote, unquote
 
 from pygit2 import Oid, Repository, Tree
 
 from demandops.config.config import CONFIG_ROOTS
-from demandops.decision import State, changeset_of_edit, rendered_files
+from demandops.decision import State, changeset_of_edit, policy_faults_of_edit, rendered_files
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
+from demandops.ledger.ledger import ClaimChange
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
@@ -35,6 +37,9 @@ from demandops.staterepo.load.snapshot import Advance, Progress, Snapshot
 from demandops.subject import Subject
 
 _NONE = "none"
+_HELD_BACK = "Held-Back"
+_TO_CHECK = Fault("invalid", "", "must be checked again")
+"""A placeholder: advancing to later commits finds the real problems again."""
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
 
 
@@ -50,6 +55,7 @@ def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
             ("Stands-In", f"{quote(path)} {blob or _NONE}")
             for path, blob in sorted(source.replacements.items())
         ),
+        *((_HELD_BACK, path) for path in sorted(snapshot.quarantined_files)),
     ]
 
 
@@ -93,9 +99,12 @@ def start_at(
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """
     record = record_at(repo, commit)
-    if record.first("In-Force"):
-        return recorded_state(repo, record, progress)
     tried, faults = set[tuple[Oid | None, ...]](), list[InvalidInput | StateRepoError]()
+    if record.first("In-Force"):
+        try:
+            return recorded_state(repo, record, progress)
+        except (InvalidInput, StateRepoError) as error:  # a record that is not ours
+            faults.append(error)
     for ancestor in commit_log.first_parents(repo, record.commit):
         content = tuple(trees.entry_id(ancestor.tree, root) for root in _ROOTS)
         if content not in tried:
@@ -108,10 +117,12 @@ def start_at(
 
 
 def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
-    """Return the generator's newest commit up to a commit, else that commit itself."""
+    """Return the generator's newest commit up to a commit, else that commit without trailers."""
     commit = trees.commit_of(repo, revision)
     made = commit_log.last_generator_commit(repo, commit.id)
-    return commit_log.entry_of(commit if made is None else trees.commit_of(repo, made))
+    if made is None:
+        return replace(commit_log.entry_of(commit), trailers={})
+    return commit_log.entry_of(trees.commit_of(repo, made))
 
 
 def recorded_state(
@@ -124,19 +135,26 @@ def recorded_state(
     last_valid = snapshots.load(repo, record.first("In-Force"), progress)
     source = _source(record)
     advance = snapshots.advance(repo, last_valid, commit.id, source)
-    snapshot = judge(repo, advance, last_valid, commit.tree).with_new_config().snapshot
-    # placeholder: advancing to later commits finds the real problems again
-    problems = snapshot.problems or (Fault("invalid", "", "must be checked again"),)
+    held_back = record.trailers.get(_HELD_BACK, ())
+    judgement = judge(repo, advance, last_valid, commit.tree, held_back)
+    snapshot = judgement.with_new_config().snapshot
+    problems = snapshot.problems or (_TO_CHECK,)
     return replace(snapshot, last_valid_commit=last_valid.commit, problems=problems)
 
 
 def _source(record: LogEntry) -> ConfigSource:
     commit = record.first("Configuration") or record.first("In-Force")
     replacements: dict[str, Oid | None] = {}
-    for line in record.trailers.get("Stands-In", ()):
-        path, _, blob = line.rpartition(" ")
-        replacements[unquote(path)] = None if blob == _NONE else Oid(hex=blob)
-    return ConfigSource(Oid(hex=commit), replacements)
+    try:
+        for line in record.trailers.get("Stands-In", ()):
+            path, _, blob = line.rpartition(" ")
+            replacements[unquote(path)] = None if blob == _NONE else Oid(hex=blob)
+        return ConfigSource(Oid(hex=commit), replacements)
+    except ValueError:
+        raise StateRepoError(
+            f"commit {record.commit} has trailers about invalid files that cannot be read; revert "
+            "it, or merge valid files"
+        ) from None
 
 
 Faults = Mapping[Subject, tuple[Fault, ...]]
@@ -147,7 +165,8 @@ class Judgement:
     """People's changes, and the faults of subjects with the new and with the old configuration.
 
     If a subject cannot be planned with either configuration, its claims are at fault. If it cannot
-    be planned with the new one only, the new configuration is at fault.
+    be planned with the new one only, the new configuration is at fault. If policy refuses a claim
+    that a person wrote, that claim is at fault (``refused``: with the new configuration).
     """
 
     repo: Repository
@@ -155,6 +174,7 @@ class Judgement:
     advance: Advance
     with_new: Faults
     with_old: Faults
+    refused: Faults
     old: State
     """The new ledger with the configuration that was in effect before."""
 
@@ -163,7 +183,7 @@ class Judgement:
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
-        return self._without(self.advance, faults)
+        return self._without(self.advance, _together(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
         """Return the state in effect, and what changed, if the new configuration has ``faults``."""
@@ -204,8 +224,18 @@ class Judgement:
         return replace(accepted, snapshot=snapshot, subjects=good)
 
 
-def judge(repo: Repository, advance: Advance, before: Snapshot, tree: Tree) -> Judgement:
-    """Return the subjects that people changed since ``before`` and that cannot be planned."""
+def judge(
+    repo: Repository,
+    advance: Advance,
+    before: Snapshot,
+    tree: Tree,
+    held_back: Collection[str] | None = None,
+) -> Judgement:
+    """Return the subjects that people changed since ``before`` and that cannot be accepted.
+
+    Args:
+        held_back: the claim files that were refused then, if a record says so; else policy decides.
+    """
     state, ledger = advance.snapshot.state, before.state.ledger
     old = replace(before.state, ledger=state.ledger)
 
@@ -220,9 +250,39 @@ def judge(repo: Repository, advance: Advance, before: Snapshot, tree: Tree) -> J
                 found[subject] = error.faults
         return found
 
+    start, commit = before.last_valid_commit, advance.snapshot.commit
+    by_people = list[ClaimChange]()
+    if held_back is None and advance.subjects:
+        by_people = ledger_files.claims_by_people(repo, start, commit, ledger)
+
+    def refused_in(state: State) -> Faults:
+        found: dict[Subject, tuple[Fault, ...]] = {}
+        for change in by_people:
+            faults = tuple(policy_faults_of_edit(before.state, state, [change]))
+            if faults:
+                found[change.key.subject] = (*found.get(change.key.subject, ()), *faults)
+        return found
+
     with_new = faults_in(state)
-    with_old = faults_in(old) if state.config != old.config else with_new
-    return Judgement(repo, before, advance, with_new, with_old, old)
+    refused = refused_in(state) if held_back is None else _recorded(advance, held_back)
+    if state.config == old.config:
+        return Judgement(repo, before, advance, with_new, with_new, refused, old)
+    with_old = _together(faults_in(old), refused_in(old))
+    return Judgement(repo, before, advance, with_new, with_old, refused, old)
+
+
+def _together(one: Faults, other: Faults) -> Faults:
+    return {subject: (*one.get(subject, ()), *other.get(subject, ())) for subject in {*one, *other}}
+
+
+def _recorded(advance: Advance, held_back: Collection[str]) -> Faults:
+    """Return the subjects with claims that a record names, without the reasons."""
+    ledger = advance.snapshot.state.ledger
+    return {
+        subject: (_TO_CHECK,)
+        for subject in advance.subjects
+        if any(claim_file.path_of(claim.key) in held_back for claim in ledger.claims_on(subject))
+    }
 
 
 def _located_in_claim_files(
@@ -232,4 +292,7 @@ def _located_in_claim_files(
     claims = snapshot.state.ledger.claims_on(subject)
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
     paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]
-    return [fault.within(paths[0]) if paths else fault for fault in faults]
+    return [
+        fault.within(paths[0]) if paths and claim_file.kind_of(fault.file) is None else fault
+        for fault in faults
+    ]

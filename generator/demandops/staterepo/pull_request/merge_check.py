@@ -17,10 +17,10 @@ from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.decision import State, rendered_files, try_configuration
+from demandops.decision import State, policy_faults_of_edit, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import ended_override_file
-from demandops.ledger.ledger import Ledger
+from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger.ledger import Ledger, changes_on
 from demandops.ledger.world import World
 from demandops.plan.overrides.lifecycle import expired_overrides, update_ledger
 from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
@@ -79,6 +79,7 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
         config = edit.config()
         faults += edit.unversioned_charts(config)
         state = edit.merged_state(config, claims.ledger())
+        faults += edit.refused_claims(state)
         wanted = edit.rendered(state)
     except InvalidInput as error:
         faults += error.faults
@@ -167,6 +168,16 @@ class _Edit:
         subjects = ledger_files.changed_subjects(old.ledger, ledger)
         applied = update_ledger(old, state, subjects, markers, self.now)
         return replace(state, ledger=applied.ledger)
+
+    def refused_claims(self, state: State) -> Iterator[Fault]:
+        """Yield why policy refuses claims that the edit adds or changes."""
+        old = self.start.state if self.start else None
+        if old is not None:
+            subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
+            changes = changes_on(old.ledger, state.ledger, subjects)
+            yield from policy_faults_of_edit(
+                old, state, [one for one in changes if claim_file.path_of(one.key) in self.files]
+            )
 
     def rendered(self, state: State) -> dict[str, str]:
         """Return every generated file, or raise the faults of every release."""

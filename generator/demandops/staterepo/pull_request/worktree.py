@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +55,7 @@ def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
     for root in _ROOTS:
         top = folder / root
         for path in [top, *sorted(top.rglob("*"))]:
-            name = path.relative_to(folder).as_posix()
+            name = os.fsencode(path.relative_to(folder)).decode("utf-8", "backslashreplace")
             if path.is_symlink():  # it may point to a file that the report must not show
                 message = "is a symbolic link, which is not followed; replace it by a file"
                 faults.append(fault("", message).within(name))

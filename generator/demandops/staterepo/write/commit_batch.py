@@ -204,12 +204,15 @@ class CommitBatch:
         generated = trees.texts(self._tree, GENERATED_ROOTS)
         files: dict[str, str | None] = dict(rendered_files(state, generated))
         changes = []
-        current = {path for path in generated if path.endswith(".yaml")}
-        for path in current - set(files):
-            files[path] = None
+        known = {
+            path: trees.is_file(one) for path, one in trees.entries(self._tree, GENERATED_ROOTS)
+        }
+        for path, is_file in known.items():
+            if path not in files and not (is_file and trees.is_readme(path)):
+                files[path] = None
         for path in sorted(files):
-            old = self.read(path)
-            if old == files[path]:
+            old = generated.get(path)
+            if old == files[path] and known.get(path, True):
                 del files[path]
                 continue
             kind: Change = "stop" if files[path] is None else "start" if old is None else "change"

@@ -1,0 +1,85 @@
+"""Text from outside as text that people and programs read line by line.
+
+A value of a goal, a file, a commit, a remote or an exception may hold anything. Whoever prints it
+asks this module, so that it cannot begin a line, control a terminal, reorder or hide text, or fill
+a screen. Visible text stays as it is.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from typing import Any
+
+LONGEST_LINE = 4000
+"""The longest line of text from outside, in characters; the rest is cut off."""
+
+_INVISIBLE = "\u034f\u115f-\u1160\u17b4-\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0"
+_HIDDEN = re.compile(f"[{_INVISIBLE}\U000e0100-\U000e01ef]")
+"""What Unicode ignores when it displays text, although Python calls it printable."""
+_BMP = 0xFFFF
+
+
+def is_visible(text: str) -> bool:
+    """Return whether text is one line without control, bidirectional or invisible characters."""
+    return text.isprintable() and not _HIDDEN.search(text)
+
+
+def escaped(text: str, kept: str = "") -> str:
+    """Return text with an escape like ``\\u202e`` for each character that is not visible.
+
+    ``kept`` are characters that stay as they are.
+    """
+    if is_visible(text):
+        return text
+    return "".join(
+        char if char in kept or is_visible(char) else char.encode("unicode_escape").decode()
+        for char in text
+    )
+
+
+def clipped(text: str, most: int) -> str:
+    """Return text of at most ``most`` characters, with ``…`` if it was longer."""
+    return text if len(text) <= most else text[: most - 1].rstrip() + "…"
+
+
+def one_line(text: str, most: int = LONGEST_LINE) -> str:
+    """Return text on one line, escaped and not too long."""
+    return clipped(escaped(text[: most + 1]), most)
+
+
+def lines(text: str) -> str:
+    """Return text of several lines, escaped except for line breaks and tabs."""
+    return escaped(text, kept="\n\t")
+
+
+def quoted(value: str, most: int = 80) -> str:
+    """Return a value in quotes, on one line and not too long."""
+    return f"'{one_line(value, most)}'"
+
+
+def json_escaped(text: str) -> str:
+    """Return JSON text with JSON's own escape for what is not visible: the same data."""
+    if is_visible(text.replace("\n", "")):
+        return text
+    return "".join(
+        char if char == "\n" or is_visible(char) else _json_escape(char) for char in text
+    )
+
+
+def _json_escape(char: str) -> str:
+    return json.dumps(char)[1:-1] if ord(char) > _BMP else f"\\u{ord(char):04x}"
+
+
+class OneLineFormatter(logging.Formatter):
+    """Formats a log record as one line; only a traceback has more."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Return the record's line: the lines of its message are joined by ``; ``."""
+        record.message = one_line("; ".join(record.message.splitlines()))
+        return super().formatMessage(record)
+
+    def formatException(self, info: Any) -> str:  # noqa: ANN401 - as the base class has it
+        """Return a traceback, indented, so that no line of it passes for a record."""
+        return lines(super().formatException(info)).replace("\n", "\n  ")

@@ -1,0 +1,102 @@
+"""Signatures of the generator's commits, checked against the keys that people allow.
+
+People list the keys in ``policy/allowed-signers`` (ssh-keygen's ALLOWED SIGNERS format). The list
+in the commit's parent counts, so that a commit cannot allow its own key. One git process checks
+all commits with the same list.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import git
+from pygit2 import Commit, Repository
+
+from demandops.staterepo.git import tree as trees
+
+ALLOWED_SIGNERS = "policy/allowed-signers"
+
+_SSH = "-----BEGIN SSH SIGNATURE-----"
+_CONFIG = ("-c", "gpg.ssh.program=ssh-keygen", "-c", "gpg.minTrustLevel=undefined")
+_MOST_KNOWN = 100_000
+
+
+class Check(NamedTuple):
+    """The check of a signature: who signed, or what is wrong with it."""
+
+    signer: str = ""
+    fault: str = ""
+
+
+_good: dict[str, Check] = {}
+"""Commit → its check, if it is good: a commit, its signature and its parent never change."""
+
+
+def signature_of(commit: Commit) -> str:
+    """Return the signature of a commit, or an empty text."""
+    return (commit.gpg_signature[0] or b"").decode("utf-8", "replace")
+
+
+def faults(repo: Repository, commits: Iterable[Commit]) -> dict[str, str]:
+    """Return commit → fault of each commit that should have a good signature and has none."""
+    return {commit: one.fault for commit, one in checks(repo, commits).items() if one.fault}
+
+
+def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
+    """Return commit → check of each commit whose parent lists the keys."""
+    signatures, found = dict[str, str](), dict[str, Check]()
+    lists: dict[str, list[str]] = {}
+    for commit in commits:
+        id = str(commit.id)
+        allowed = trees.read_text(trees.parent_tree(commit), ALLOWED_SIGNERS)
+        if allowed is not None and id in _good:
+            found[id] = _good[id]
+        elif allowed is not None:
+            signatures[id] = signature_of(commit)
+            lists.setdefault(allowed, []).append(id)
+    if len(_good) > _MOST_KNOWN:
+        _good.clear()
+    for allowed, ids in lists.items():
+        for id, state, signer in _check_with_git(repo, allowed, ids):
+            fault = _fault(signatures[id], state)
+            found[id] = Check("" if fault else signer, fault)
+            if not fault:
+                _good[id] = found[id]
+    return found
+
+
+def _fault(signature: str, state: str) -> str:
+    """Return what is wrong with a signature; ``state`` is git's letter for it."""
+    if not signature:
+        return f"is not signed, but {ALLOWED_SIGNERS} requires it"
+    if state == "B":
+        return "has a signature of another commit"
+    if state != "G" or not signature.lstrip().startswith(_SSH):
+        return f"is signed, but not by a key that {ALLOWED_SIGNERS} lists"
+    return ""
+
+
+def _check_with_git(
+    repo: Repository, allowed: str, commits: list[str]
+) -> Iterable[tuple[str, str, str]]:
+    """Return for each commit its id, git's letter for its signature, and the signer."""
+    with tempfile.TemporaryDirectory(prefix="demandops-") as folder, git.Repo(repo.path) as opened:
+        file = Path(folder) / "allowed-signers"
+        file.write_text(allowed)
+        revisions = Path(folder) / "commits"
+        revisions.write_text("\n".join(commits) + "\n")
+        with revisions.open("rb") as lines:
+            output = opened.git.execute(
+                [
+                    *(opened.git.GIT_PYTHON_GIT_EXECUTABLE, *_CONFIG),
+                    *("-c", f"gpg.ssh.allowedSignersFile={file}"),
+                    *("log", "--no-show-signature", "--no-walk=unsorted", "--stdin"),
+                    "--format=%H %G? %GS",
+                ],
+                istream=lines,
+            )
+    rows = (line.split(" ", 2) for line in str(output).splitlines())
+    return [(row[0], row[1], row[2] if len(row) > 2 else "") for row in rows]

@@ -1,0 +1,78 @@
+"""The text of commit messages: paragraphs of lines, and trailers in the last paragraph.
+
+The only writer and reader of messages. A line of a paragraph is for people: its text is escaped and
+cut off. A trailer is for programs: its value is read back exactly. A visible value stands as it is,
+so ``git log --format='%(trailers:key=Requester)'`` shows it; any other value stands in double
+quotes with escapes like ``\\u202e``. So no value can begin a line, end the message or pass for a
+trailer. Messages of earlier versions, which did not quote, are read the same way.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from demandops.quoting import escaped, is_visible, one_line
+
+Trailers = Iterable[tuple[str, str]]
+
+_WHY = "Why: "
+_KEY = re.compile(r"[A-Za-z0-9-]+")
+_ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8}|[nrt\\\"])"
+_ESCAPES = re.compile(_ESCAPE)
+_EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
+_QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
+"""A quoted value; it has an escape, or it would not be quoted."""
+
+
+@dataclass(frozen=True, slots=True)
+class MessageText:
+    """The parts of a message that programs read."""
+
+    summary: str
+    why: str
+    trailers: dict[str, list[str]]
+
+
+def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
+    """Return a message of paragraphs, each a list of lines, and trailers; leave out empty ones."""
+    lines = [f"{key}: {_encoded(value)}" for key, value in trailers if value]
+    body = ("\n".join(map(one_line, paragraph)) for paragraph in paragraphs)
+    return "\n\n".join(text for text in (*body, "\n".join(lines)) if text) + "\n"
+
+
+def parse(message: str) -> MessageText:
+    """Return the summary, the reason and the trailers of any message, also of a person's."""
+    lines = message.split("\n")
+    whys = (line.removeprefix(_WHY) for line in lines if line.startswith(_WHY))
+    return MessageText(lines[0], next(whys, ""), _trailers(message))
+
+
+def _trailers(message: str) -> dict[str, list[str]]:
+    """Return the lines ``Key: value`` of the last paragraph; none if it holds anything else."""
+    trailers: dict[str, list[str]] = {}
+    head, _, last = message.rstrip("\n").rpartition("\n\n")
+    for line in last.split("\n") if head else ():
+        key, colon, value = line.partition(": ")
+        if not colon or not _KEY.fullmatch(key):
+            return {}
+        trailers.setdefault(key, []).append(_decoded(value))
+    return trailers
+
+
+def _encoded(value: str) -> str:
+    if is_visible(value) and value == value.strip() and not _QUOTED.fullmatch(value):
+        return value
+    text = escaped(value.replace("\\", r"\\").replace('"', r"\""))
+    return f'"{_EDGES.sub(_SPACE, text)}"'
+
+
+def _decoded(text: str) -> str:
+    if not _QUOTED.fullmatch(text):
+        return text
+    return _ESCAPES.sub(lambda escape: _character(escape[0]), text[1:-1])
+
+
+def _character(escape: str) -> str:
+    return escape[1] if escape[1] in '\\"' else escape.encode().decode("unicode_escape")

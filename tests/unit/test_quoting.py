@@ -1,0 +1,112 @@
+"""Nothing from outside begins a line, controls a terminal, hides text or fills a screen."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import sys
+import unicodedata
+from typing import Any
+
+import pytest
+from demandops.cli import output
+from demandops.cli.json_output import print_json, show
+from demandops.cli.repo import pull_request_comment
+from demandops.errors import Fault, InvalidInput, StateRepoError, fault
+from demandops.quoting import (
+    LONGEST_LINE,
+    OneLineFormatter,
+    is_visible,
+    json_escaped,
+    lines,
+    one_line,
+    quoted,
+)
+from demandops.staterepo.load import problem_report
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.table import Table
+
+from tests.kit.chance import examples
+
+HOSTILE = "a\nERROR: forged\r\x1b[2J\x9b1m\u202eb\u200bc\u3164d\ufe0f\u2028e\x00\ud800" + "x" * 9000
+TEXTS = st.one_of(st.text(), st.text("\n\t\x1b\u202e\u200b\u00ad\u3164\ufe0f'\"\\a "))
+
+
+@given(TEXTS)
+@examples(300)
+def test_a_quoted_text_is_one_visible_line_of_bounded_length(text: str) -> None:
+    for quote in (one_line(text), quoted(text), one_line(text, 5)):
+        assert is_visible(quote)
+        assert "".join(f"{quote}\n").splitlines() == [quote]
+    assert len(one_line(text * 50, 60)) <= 60
+    assert one_line(one_line(text)) == one_line(text)
+    assert lines(text).count("\n") == text.count("\n")
+    assert json.loads(json_escaped(json.dumps(text, ensure_ascii=False))) == text
+
+
+def test_no_kind_of_character_without_a_glyph_is_visible() -> None:
+    hidden = [chr(code) for code in range(sys.maxunicode + 1) if not is_visible(chr(code))]
+    kinds = {unicodedata.category(char) for char in hidden}
+    assert kinds >= {"Cc", "Cf", "Cs", "Cn", "Co", "Zl", "Zp"}
+    assert {"\u00ad", "\u034f", "\u200b", "\u200d", "\u202e", "\u2066", "\ufeff"} <= {*hidden}
+    assert is_visible("Straße/北京 Ωμέγα 🚗 e\u0301 नमस्ते 'a' \\ \"b\"")
+
+
+def test_faults_and_errors_are_one_line_each() -> None:
+    found = fault(HOSTILE, HOSTILE).within(HOSTILE)
+    assert found.file == HOSTILE, "a program finds the file by it"
+    assert is_visible(str(found)) and len(str(found)) < 4 * LONGEST_LINE
+    assert len(str(InvalidInput([found, found])).splitlines()) == 2
+    assert is_visible(str(StateRepoError(f"cannot be read: {HOSTILE}")))
+
+
+def test_a_log_record_is_one_line_and_its_trace_is_indented(caplog: Any) -> None:
+    stream = io.StringIO()
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(OneLineFormatter("%(levelname)s: %(message)s"))
+    log = logging.Logger("of this test")
+    log.addHandler(handler)
+    log.error("refused: %s", HOSTILE)
+    log.error("%s", InvalidInput([fault("a", "one"), fault("b", "two")]))
+    try:
+        raise ValueError(HOSTILE[:300])
+    except ValueError:
+        log.exception("internal error")
+    told = stream.getvalue().removesuffix("\n").split("\n")
+    assert told[0].startswith("ERROR: refused: a; ERROR: forged; \\x1b[2J")
+    assert told[1] == "ERROR: a: one; b: two"
+    assert told[2] == "ERROR: internal error"
+    assert all(line.startswith("  ") for line in told[4:])
+    assert all(is_visible(line) for line in told)
+
+
+def test_commands_print_no_text_that_controls_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    table = Table("Summary", title=HOSTILE[:90])
+    table.add_row(HOSTILE[:90])
+    show("text", None, [HOSTILE[:90], table])
+    output.errors.print(HOSTILE[:90])
+    print_json({"summary": HOSTILE[:90]})
+    printed, told = capsys.readouterr()
+    assert all(is_visible(line) for line in (*printed.split("\n"), *told.split("\n")))
+    assert json.loads(printed[printed.index("{\n") :]) == {"summary": HOSTILE[:90]}
+
+
+def test_a_comment_has_no_text_that_ends_its_span() -> None:
+    assert is_visible(pull_request_comment.code(HOSTILE))
+    assert (
+        pull_request_comment.fence("a\u202e\n```\nb", "yaml")
+        == "````yaml\na\\u202e\n```\nb\n````\n"
+    )
+
+
+def test_the_problem_report_quotes_and_finds_its_problems_again() -> None:
+    found = [Fault("invalid", "a\u202e", HOSTILE, "overrides/a\n\u200b.yaml")]
+    first = problem_report.with_origins(found, (), lambda path: ("c" * 40, "Eve\u202e <e@x>"))
+    text = problem_report.write(first)
+    assert text and all(is_visible(line) for line in text.split("\n"))
+    again = problem_report.with_origins(found, problem_report.read(text), lambda path: None)
+    assert again == first
