@@ -15,7 +15,7 @@ from demandops.service import Ticket
 from demandops.staterepo.audit import verification
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import MAIN
-from demandops.staterepo.history.commit_log import PROPOSAL, trailers_of
+from demandops.staterepo.history.commit_log import PROPOSAL, entry_of
 
 from tests.kit.promises import claims_of, name_of
 from tests.model.leases import Goal, Promises, Subject
@@ -151,7 +151,7 @@ class Oracle:
         return [
             (operation, PROPOSAL in trailers)
             for each in reversed(commits)
-            if (trailers := trailers_of(each.message))
+            if (trailers := entry_of(each).trailers)
             for operation in trailers.get("Operation-Id", ())
         ]
 
