@@ -17,7 +17,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-packages e2e e2e-argocd coverage check format fuzz golden bench bench-audit load wheel clean
+.PHONY: help setup demo test test-packages e2e e2e-argocd coverage check format fuzz golden bench bench-audit load simulate wheel clean
 .PHONY: $(SYSTEM) go
 
 help:  ## Show what there is to make
@@ -108,6 +108,9 @@ load: setup  ## Four generators and a person write at once, 2,000 demands, conne
 fuzz: export FUZZ_S ?= 10
 fuzz: system-test setup  ## Try odd inputs at every parser and writer, FUZZ_S seconds for each (default 10)
 	@$(PY) -m tests.fuzz
+
+simulate: setup  ## Play histories of generators and people with faults, for SIMULATE_S=60 seconds from SEED
+	@$(PY) -m tests.simulation.run
 
 wheel: setup  ## Build the wheel into dist/
 	@$(PY) -m build --wheel --outdir dist .

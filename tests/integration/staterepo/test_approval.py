@@ -299,6 +299,16 @@ def test_a_release_right_behind_the_demand_leaves_no_branch(bare: Path, petra: P
             rig.receipt(held)
 
 
+TWO = """apiVersion: demandops/v1
+kind: Override
+reason: More for a test
+owner: perception-team
+select:
+  - services: ["*"]
+replicas: 2
+"""
+
+
 def put(demand: str, vehicle: int, who: str = "user", **more: Any) -> Any:
     name = f"vehicle{vehicle:02}"
     return goals.put(demand, who, topic=(f"/vehicles/{name}/ego_data", name), **more)
@@ -356,6 +366,33 @@ def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(
         with pytest.raises(Refused, match="contradicts an existing claim"):
             rig.receipt(two.ticket)
         rig.wait_until(lambda: gone not in branches(bare), "the branch is taken away")
+
+
+def test_what_was_merged_before_it_was_replaced_is_booked(bare: Path, petra: Person) -> None:
+    with rig.running(bare) as generator:
+        first, gate = Proposed(generator, put("d", 1), "op-1"), Gate()
+        branch = first.branch
+        generator.submit(put("d", 2), "op-2", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        petra.merge(branch)
+        gate.open.set()
+        assert first.outcome() == "booked"
+    rig.assert_sound(bare)
+
+
+def test_a_branch_that_cannot_be_rebuilt_can_still_be_merged(
+    bare: Path, url: str, petra: Person
+) -> None:
+    with rig.running(url, fetch_interval=0.1) as generator:
+        proposed = Proposed(generator, put("d", 1), "op-1")
+        branch = proposed.branch
+        rig.hook(bare, "update", 'case "$1" in refs/heads/demand/*) exit 1;; esac')
+        petra.override(two=TWO)
+        failed = f"rebuilding {branch}"
+        rig.wait_until(lambda: failed in generator.failures, "the push is denied")
+        petra.merge(branch)
+        assert proposed.outcome() == "booked"
+    assert rig.operations(bare) == ["op-1"]
 
 
 def test_a_policy_that_asks_no_more_lets_what_waits_through(bare: Path, petra: Person) -> None:

@@ -124,7 +124,7 @@ class Approvals:
             for proposal in [p for p in self._proposals.values() if releases(request, p.requests)]:
                 self._demands.withdraw_proposed(proposal.tickets, RELEASED)
                 self._delete_branch(proposal, self._branches.heads())
-                self._end(proposal, Withdrawn(RELEASED))
+                self._changed.append(proposal.branch)  # the check answers: it may be merged already
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
@@ -161,8 +161,9 @@ class Approvals:
             branch = branch_name(request.demand or request.id, ticket.operation)
             proposal = Proposal(key, ProposalRecord(branch), searched_to=ticket.base)
         elif isinstance(request, Put) and request not in proposal.requests:
-            replaced, proposal.tickets, proposal.requests = proposal.tickets, [], []
-            self._demands.fail(replaced, Withdrawn(REPLACED))
+            # the next check answers these: a person may have merged them meanwhile
+            self._demands.withdraw_proposed(proposal.tickets, REPLACED)
+            proposal.requests = []
         if not self._demands.propose(ticket, proposal.record):
             self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
             return
@@ -238,13 +239,11 @@ class Approvals:
             except BranchMoved as error:
                 log.info("%s; checking again", error)
                 self._changed.append(proposal.branch)
-            except SigningFailed as error:
-                if proposal.record.pushed:  # the existing branch can still be merged
-                    log.warning("%s; %s is not rebuilt", error, proposal.branch)
+            except (SigningFailed, PushDenied) as error:
+                if proposal.tickets and proposal.branch in heads.branches:  # it can be merged
+                    self._runtime.failed(f"rebuilding {proposal.branch}", error)
                 else:
                     self._end(proposal, error)
-            except PushDenied as error:
-                self._end(proposal, error)
         ended = self._runtime.monotonic()
         self._checked_at = str(snapshot.commit)
         self._rest_until = ended + _PAUSE_FACTOR * (ended - self._check_began)
