@@ -4,7 +4,7 @@ VENV   ?= .venv
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.setup-done
 # Each target first checks what the system must give for it.
-SYSTEM := system-demo system-test system-e2e system-e2e-argocd
+SYSTEM := system-demo system-test system-faults system-e2e system-e2e-argocd
 # Distributions have too old a Go, so the end-to-end tests bring this one unless PATH has it.
 GO     := 1.26
 GO_DIR := build/go-$(GO)
@@ -17,7 +17,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-packages e2e e2e-argocd coverage check format fuzz golden bench bench-audit load simulate wheel clean
+.PHONY: help setup demo test test-packages faults e2e e2e-argocd coverage check format fuzz golden bench bench-audit load simulate wheel clean
 .PHONY: $(SYSTEM) go
 
 help:  ## Show what there is to make
@@ -66,6 +66,10 @@ coverage: system-test setup  ## Report what the tests cover, then what the core'
 	@PYTEST_ADDOPTS="$$PYTEST_ADDOPTS --cov=demandops --cov=demandops_ros" $(MAKE) --no-print-directory test
 	@$(PY) -m pytest -n auto --dist worksteal $(CORE_TESTS) \
 	  $(addprefix --cov=demandops.,$(CORE)) --cov-fail-under=$(CORE_COVERAGE)
+
+# The long form tries every call: make faults FAULTS=--long
+faults: system-faults setup  ## Fail, kill, fill and cut off at each system call of a demand; three minutes
+	@$(PY) -m tests.faults $(FAULTS)
 
 # On a cluster that is there (E2E_KUBECONFIG) the tests start no programs of their own.
 e2e: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)

@@ -109,11 +109,15 @@ class Evaluator:
     def published_before(self, start: Snapshot, batch: list[Ticket]) -> dict[str, RecordedOutcome]:
         """Return the demands that are published but not answered, by operation id.
 
-        This happens if the connection or the process ends after the remote accepted the push.
+        This happens if the connection or the process ends after the remote accepted the push, or
+        if a sync failed. So what they rest on is written anew.
         """
         published: dict[str, RecordedOutcome] = {}
         for base in {ticket.base for ticket in batch if ticket.maybe_published}:
-            published |= operations_since(self._repository.objects, start.commit, base)
+            found = operations_since(self._repository.objects, start.commit, base)
+            if any(ticket.operation in found for ticket in batch):
+                self._repository.write_anew(base)
+            published |= found
         return published
 
 

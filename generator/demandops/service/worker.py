@@ -32,8 +32,8 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
-_TIDY_EVERY = 300
-"""After how many commits to pack the repository; each adds about twenty loose objects."""
+_TIDY_EVERY = 50
+"""After how many new packs to join them; a publication adds one, and a fetch too."""
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
 _FIRST_REST_S, _LONGEST_REST_S = 1.0, 60.0
@@ -71,7 +71,7 @@ class Worker:
         self._ahead = ReadAhead()
         self._batch_limit = LIMIT_EMBEDDED if repository.always_current else LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
-        self._commits_since_tidy = 0
+        self._packs_since_tidy = 0
         self._logged: frozenset[Fault] = frozenset()
         self._ends_soon = self._runtime.event()
         self._rest, self._rests_until = _FIRST_REST_S, self._runtime.monotonic()
@@ -110,11 +110,11 @@ class Worker:
                 self._publish(batch)
                 if self.snapshot.problems:  # a release may have made a change possible
                     self._try_to_carry_out_changes()
-                if self._commits_since_tidy >= _TIDY_EVERY:
-                    self._commits_since_tidy = 0
-                    self._repository.tidy()
             elif not self._rests:
                 self._follow()
+            if self._packs_since_tidy >= _TIDY_EVERY:
+                self._packs_since_tidy = 0
+                self._repository.tidy()
             if not self._rests:
                 self._check_proposals()
         except Exception as error:
@@ -272,7 +272,6 @@ class Worker:
                 return False
             self._record_reached(pushed=not commits.is_empty)
             self._set_snapshot(commits.head)
-            self._commits_since_tidy += len(results)
         final = [(ticket, result) for ticket, result in results if not isinstance(result, Decision)]
         self._demands.answer(final)
         for ticket, result in results:
@@ -377,6 +376,7 @@ class Worker:
     def _set_snapshot(self, snapshot: Snapshot) -> None:
         before, self.snapshot = self.snapshot, snapshot
         if snapshot.commit != before.commit:  # a merge may need no commit of the generator
+            self._packs_since_tidy += 1
             for listener in self.listeners:
                 listener(snapshot.state.config)
 

@@ -67,6 +67,7 @@ def _write(
 ) -> str:
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
+    repo.config["gc.auto"] = 0  # the generator joins the packs, beside its work
     objects = NewObjects(repo)
     tree = trees.write(objects, None, content)
     why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,8 +13,14 @@ from pygit2 import Oid, Repository
 
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
-from demandops.staterepo.git.new_objects import NewObjects
-from demandops.staterepo.git.repository import MAIN, StateRepository, Unavailable, disk_error
+from demandops.staterepo.git.new_objects import NewObjects, sync_folder
+from demandops.staterepo.git.repository import (
+    ENVIRONMENT,
+    MAIN,
+    StateRepository,
+    Unavailable,
+    disk_error,
+)
 
 _STALE_LOCK_S = 5.0
 """Git holds the lock of a branch for milliseconds; for so long only if its process was killed."""
@@ -34,7 +42,41 @@ class LocalRepository(StateRepository):
             raise StateRepoError(
                 f"{path} is not a Git repository; make one with `demandops init {path} --bare`"
             ) from None
+        borrowed = Path(self.objects.path) / "objects" / "info" / "alternates"
+        if borrowed.exists():
+            raise StateRepoError(
+                f"{path} borrows objects of another repository, which may remove them; copy them "
+                f"with `git -C {path} repack -a -d`, then remove {borrowed}"
+            )
         self.new = NewObjects(self.objects)
+        self.new.clean()
+        try:
+            self._require_branch(path)
+        except (pygit2.GitError, KeyError) as error:
+            raise disk_error(error, self.address) or self._damaged(str(error)) from None
+
+    def _damaged(self, what: str) -> StateRepoError:
+        return StateRepoError(
+            f"{self.address} is damaged: {what}; `git -C {self.address} fsck` lists what is "
+            "broken, restore it from a backup or from a clone"
+        )
+
+    def renew_if_damaged(self) -> bool:
+        """Raise StateRepoError if git finds it damaged: nobody can make it anew."""
+        checked = subprocess.run(
+            ["git", "fsck", "--no-dangling", "--no-progress"],
+            cwd=self.objects.path,
+            env=os.environ | ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+        )
+        if checked.returncode:
+            raise self._damaged((checked.stderr + checked.stdout).strip().partition("\n")[0])
+        return False
+
+    def _require_branch(self, path: Path) -> None:
         if MAIN not in self.objects.references:
             raise StateRepoError(
                 f"{path} has no branch '{MAIN_BRANCH}'; make a state repo with "
@@ -45,6 +87,7 @@ class LocalRepository(StateRepository):
                 f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
                 f"use a bare clone: git clone --bare {path} {path}.git"
             )
+        _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         """Return the tip, which is always current."""
@@ -67,6 +110,23 @@ class LocalRepository(StateRepository):
                 raise Unavailable(f"{self.address} cannot be written: {error}") from None
             return False  # another writer holds the lock or was first: evaluate again
         return True
+
+    def write_anew(self, since: str) -> None:
+        """Write the commits after ``since`` and the branch to new files, and sync these."""
+        branch = Path(self.objects.path) / MAIN
+        lock = branch.with_name(f"{branch.name}.lock")
+        try:
+            with self.new.packed_anew(self.tip(), since), lock.open("x") as file:
+                file.write(f"{self.tip()}\n")
+                file.flush()
+                os.fsync(file.fileno())
+                lock.replace(branch)
+                sync_folder(branch.parent)
+        except (pygit2.GitError, OSError) as error:
+            self._break_stale_lock()
+            raise disk_error(error, self.address) or Unavailable(
+                f"{self.address} cannot be written: {error}"
+            ) from None
 
     def _break_stale_lock(self) -> None:
         """Remove the branch's lock if a killed process left it.

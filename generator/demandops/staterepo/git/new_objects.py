@@ -7,10 +7,13 @@ has already: a loose object may not be on the disk yet, or about to be pruned.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -24,7 +27,8 @@ _LAST = 0
 
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
-_REASON = "demandops moves a reference to these objects\n"
+_INDEX = b"\xfftOc"
+"""The first bytes of the index of a pack."""
 
 Entries = dict[bytes, tuple[bytes, bytes]]
 """A folder: name → mode and the raw id of the object."""
@@ -55,27 +59,82 @@ class NewObjects(pygit2.OdbBackend):
         """Write the new objects that a commit needs as one pack, synced.
 
         Within the block git's housekeeping keeps the pack, although no reference leads to it yet.
-        The pack is placed before its index, because git removes an index without a pack.
         """
         needed = self._needed_by(commit)
         if not needed:
             yield
             return
-        packs = Path(self.repo.path) / "objects" / "pack"
-        with TemporaryDirectory(dir=self.repo.path, prefix=UNFINISHED) as folder:
-            built = self._build_pack(folder, needed)
+        with self._placed(lambda folder: self._build_pack(folder, needed)):
+            for oid in needed:
+                del self._known[oid]
+            yield
+
+    @contextmanager
+    def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
+        """Write the objects between two commits again, to a new pack, synced, like :meth:`packed`.
+
+        A sync may have failed for the files that have them; then reading these proves nothing.
+        """
+        with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n^{since}\n")):
+            yield
+
+    @contextmanager
+    def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
+        """Build a pack and place it before its index: git removes an index without a pack.
+
+        Its .keep is a link to the index, so it needs no sync and :meth:`clean` knows it.
+        """
+        packs = self._packs
+        with (
+            _locked(packs, fcntl.LOCK_SH),
+            TemporaryDirectory(
+                dir=self.repo.path, prefix=UNFINISHED, ignore_cleanup_errors=True
+            ) as folder,
+        ):
+            built = build(folder)
             placed = packs / built.name
             keep = placed.with_suffix(".keep")
-            keep.write_text(_REASON)
+            keep.unlink(missing_ok=True)
             try:
+                keep.hardlink_to(built.with_suffix(".idx"))
                 built.replace(placed)
                 built.with_suffix(".idx").replace(placed.with_suffix(".idx"))
                 sync_folder(packs)
-                for oid in needed:
-                    del self._known[oid]
                 yield
             finally:
-                keep.unlink(missing_ok=True)
+                with suppress(OSError):  # the next start removes it
+                    keep.unlink(missing_ok=True)
+
+    @property
+    def _packs(self) -> Path:
+        return Path(self.repo.path) / "objects" / "pack"
+
+    def clean(self) -> None:
+        """Remove what killed processes left, unless another process writes a pack now."""
+        with suppress(OSError), _locked(self._packs, fcntl.LOCK_EX | fcntl.LOCK_NB):
+            for folder in Path(self.repo.path).glob(f"{UNFINISHED}*"):
+                shutil.rmtree(folder, ignore_errors=True)
+            for keep in self._packs.glob("*.keep"):
+                with keep.open("rb") as file:
+                    is_ours = file.read(len(_INDEX)) == _INDEX
+                if is_ours:
+                    keep.unlink()
+
+    def _copy_to_pack(self, folder: str, revisions: str) -> Path:
+        """Have git read and write objects; it checks their content, and syncs the pack."""
+        done = subprocess.run(
+            ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
+             "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
+            cwd=self.repo.path,
+            input=revisions,
+            capture_output=True,
+            text=True,
+            check=False,
+        )  # fmt: skip
+        if done.returncode:
+            raise pygit2.GitError(done.stderr.strip())
+        (pack,) = Path(folder).glob("*.pack")
+        return pack
 
     def _build_pack(self, folder: str, needed: list[Oid]) -> Path:
         """Build a pack and its index; libgit2 syncs both, and raises if that fails."""
@@ -139,6 +198,17 @@ def entries_of(data: bytes) -> Entries:
         entries[data[space + 1 : end - 1]] = (data[start:space], data[end : end + 20])
         start = end + 20
     return entries
+
+
+@contextmanager
+def _locked(folder: Path, how: int) -> Iterator[None]:
+    """Hold a lock of a folder; whoever writes packs shares it."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, how)
+        yield
+    finally:
+        os.close(handle)
 
 
 def sync_folder(folder: Path) -> None:

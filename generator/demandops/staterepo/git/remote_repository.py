@@ -84,6 +84,7 @@ class RemoteRepository(StateRepository):
     def _open(self) -> None:
         self._git, self.objects = git.Repo(self._folder), Repository(str(self._folder))
         self.new = NewObjects(self.objects)
+        self.new.clean()
 
     def _is_usable(self) -> bool:
         try:
@@ -91,6 +92,8 @@ class RemoteRepository(StateRepository):
             commit = repo[repo.references[_REMOTE_MAIN].target]
             is_whole = isinstance(commit, pygit2.Commit) and bool(commit.tree.id)
             # git itself must find it: it reads more of the files than libgit2
+            head = (self._folder / "HEAD").read_text()
+            is_whole = is_whole and re.fullmatch(r"ref: refs/heads/\w+\n", head) is not None
             return is_whole and git.Repo(self._folder).remote("origin").url == self._url
         except Exception:  # whatever is wrong with it, a new one is not
             return False
@@ -117,6 +120,9 @@ class RemoteRepository(StateRepository):
         with git.Repo.init(partial, bare=True) as repo:
             with repo.config_writer() as config:
                 config.set_value('remote "origin"', "url", self._url)
+                config.set_value("gc", "auto", 0)
+                # a fetch keeps its pack, which git syncs: libgit2 hangs on half a loose object
+                config.set_value("fetch", "unpackLimit", 1)
             partial.joinpath("config").chmod(0o600)
             self._fetch(repo, timeout=_CLONE_TIMEOUT_S)
         if self._folder.exists():

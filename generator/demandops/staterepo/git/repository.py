@@ -57,6 +57,7 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NOT_ALLOWED = (errno.EACCES, errno.EPERM, errno.EROFS)
 _BROKEN = (errno.EIO, errno.EUCLEAN, errno.ENODEV, errno.ENXIO, errno.ESTALE)
 _TOLD = {os.strerror(number): number for number in (*_NO_ROOM, *_NOT_ALLOWED, *_BROKEN)}
+_TOLD["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objects/pack
 
 
 def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
@@ -120,6 +121,12 @@ class StateRepository(ABC):
 
         Raises Unavailable or PushDenied if it could not be published for another reason, and
         Unsound if nobody knows whether it was.
+        """
+
+    def write_anew(self, since: str) -> None:  # noqa: B027 - a remote's answer was its promise
+        """Make durable what was published after the commit ``since``, whatever became of it before.
+
+        Raises Unavailable, PushDenied or Unsound if that fails.
         """
 
     def includes(self, commit: str, other: str) -> bool:

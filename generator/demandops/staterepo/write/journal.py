@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from demandops.errors import StateRepoError, Unsound
+from demandops.staterepo.git.repository import disk_error
 
 _MOST_BYTES = 1 << 20
 _SEALED = re.compile(rb'(\{.*), "digest": "([0-9a-f]{64})"\}')
@@ -149,6 +150,7 @@ class Journal:
             if durably:
                 os.fdatasync(self._file.fileno())
         except OSError as error:
+            self._require_known(error)
             try:
                 self._file.truncate(self._size)
             except OSError:  # a restart may find what is refused here
@@ -187,11 +189,19 @@ class Journal:
         self._is_broken, self._chain, self._size = False, chain, len(text)
         self._limit = max(_MOST_BYTES, 2 * len(text))
 
+    def _require_known(self, error: OSError) -> None:
+        """Raise Unsound if nobody knows what is on the disk after an error."""
+        told = disk_error(error, f"the journal {self._path}")
+        if isinstance(told, Unsound):
+            self._unsound = told
+            raise told from None
+
     @contextmanager
     def _explained(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
+            self._require_known(error)
             raise StateRepoError(
                 f"the journal {self._path} cannot be written: {error.strerror or error}; check its "
                 "disk, then send the demand again"

@@ -1,0 +1,138 @@
+"""Inject faults into one demand and report what each did: ``make faults``.
+
+Writes ``build/faults.json`` and ends with exit code 1 if a promise was broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from multiprocessing import current_process, get_context
+from pathlib import Path
+from pkgutil import walk_packages
+from typing import Any
+
+import demandops
+
+from tests.faults import disk, injection, power_loss
+from tests.faults.injection import Result
+from tests.faults.rig import Rig
+
+WORKERS = 2
+OUT = Path(__file__).parents[2] / "build" / "faults.json"
+_RIGS: dict[tuple[bool, bool], Rig] = {}
+_FOLDER, _SHORT = Path(), True
+
+
+@dataclass(frozen=True)
+class _Task:
+    """One part of the work; ``what`` are the arguments of its function."""
+
+    part: str
+    remote: bool
+    what: tuple[Any, ...] = ()
+
+
+def main() -> int:
+    """Run the parts and return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--long", action="store_true", help="every call, and every fault at it")
+    parser.add_argument("--only", default="", help="only tasks whose text contains this")
+    chosen = parser.parse_args()
+    for module in walk_packages(demandops.__path__, "demandops."):  # none is imported under strace
+        import_module(module.name)
+    began = time.monotonic()
+    results: list[Result] = []
+    with tempfile.TemporaryDirectory(prefix="demandops-faults-") as folder:
+        tasks = [each for each in _tasks(Path(folder), chosen.long) if chosen.only in str(each)]
+        print(f"{len(tasks)} tasks", flush=True)
+        start = (Path(folder), not chosen.long)
+        with get_context("fork").Pool(WORKERS, _start, start) as pool:
+            for found in pool.imap_unordered(_run, tasks):
+                results += found
+    _report(results, time.monotonic() - began)
+    return int(any(result.problems for result in results))
+
+
+def _tasks(folder: Path, long: bool) -> Iterator[_Task]:
+    """Yield all that there is to do, the longest tasks first."""
+    mounts = disk.may_mount()
+    if not mounts:
+        print("a full disk is not tried: only root can mount a small one")
+    for remote in (False, True):
+        if long or not remote:
+            yield _Task("power", remote)
+        yield _Task("damage", remote)
+        for blocks in (range(0, 40, 2) if long else (0, 3, 6)) if mounts else ():
+            yield _Task("full", remote, ("home", blocks))
+            if not remote:
+                yield _Task("full", remote, ("state.git", blocks))
+        rig = Rig(folder / f"plan-{remote}", remote=remote)
+        sites = injection.sites(rig)
+        syncs = [each for each in sites if each.role == "demandops-writer" and each.kind == "fsync"]
+        if not remote:
+            yield from (_Task("failed sync", False, (each.n,)) for each in syncs if each.n > 1)
+        for job in injection.jobs(sites, remote=remote, short=not long):
+            yield _Task("injection", remote, (job,))
+
+
+def _start(folder: Path, short: bool) -> None:
+    global _FOLDER, _SHORT
+    _FOLDER, _SHORT = folder / current_process().name, short
+
+
+def _run(task: _Task) -> list[Result]:
+    try:
+        return _results(task)
+    except Exception as error:  # the other tasks' results must not be lost
+        traceback.print_exc()
+        return [Result(task.part, (str(task.what), "", ""), "", (f"not tried: {error!r}",))]
+
+
+def _results(task: _Task) -> list[Result]:
+    key = (task.part == "damage", task.remote)
+    if key not in _RIGS:
+        _RIGS[key] = Rig(_FOLDER / str(key), remote=task.remote)
+        if key[0]:
+            disk.interrupted(_RIGS[key])
+    rig = _RIGS[key]
+    match task.part:
+        case "power":
+            return list(power_loss.run(rig))
+        case "failed sync":
+            return [power_loss.failed_sync(rig, *task.what)]
+        case "damage":
+            return list(disk.damage(rig, short=_SHORT))
+        case "full":
+            name, blocks = task.what
+            return [disk.full(rig, rig.folder / name, blocks)]
+    return [injection.run(rig, *task.what)]
+
+
+def _report(results: list[Result], seconds: float) -> None:
+    by_class: dict[str, Counter[str]] = {}
+    for result in results:
+        name = " ".join((result.part, *result.where))
+        by_class.setdefault(name, Counter()).update(result.problems or ("sound",))
+    OUT.parent.mkdir(exist_ok=True)
+    OUT.write_text(json.dumps(by_class, indent=1, sort_keys=True))
+    for name, verdicts in sorted(by_class.items()):
+        told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
+        print(f"{name}: {told}")
+    for result in results:
+        for problem in result.problems:
+            print(f"VIOLATED {result.part} {' '.join(result.where)} {result.fault}: {problem}")
+    wrong = sum(bool(result.problems) for result in results)
+    print(f"{len(results)} faults and states, {wrong} with a violation, {seconds:.0f} s")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,102 @@
+"""What must hold after a fault: what was acknowledged is there, once, and nothing is half done."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.faults.rig import Ran, Rig, demands, includes
+
+DEMAND, NEXT = 1, 2
+_DONE, _REFUSED, _UNSOUND, _INTERRUPTED = 0, 1, 3, 130
+_LEFTOVERS = ("demandops-pack-*", "**/pack-*.keep", "**/*.lock", "**/*.partial")
+_OWN_FAULTS = ("fault of demandops", "internal error", "Traceback")
+
+
+def after_fault(ran: Ran, told: tuple[str, ...], *, unsound: bool) -> Iterator[str]:
+    """Yield what is wrong with how a process met a fault.
+
+    Args:
+        told: words of which its message must have one, if it did not book the demand.
+        unsound: a sync failed that the acknowledgement rests on.
+    """
+    if ran.hangs == "waits":
+        if not ran.err.strip():
+            yield "waits without a word"
+    elif ran.hangs:
+        yield ran.hangs
+    if ran.code < 0 or ran.hangs.startswith("does"):
+        return
+    if ran.code not in (_DONE, _REFUSED, _UNSOUND, _INTERRUPTED):
+        yield f"exit code {ran.code}"
+    if unsound and ran.code != _UNSOUND:
+        yield f"a sync failed, and the exit code is {ran.code}"
+    text = ran.err + ran.out
+    for words in _OWN_FAULTS:
+        if words in text:
+            yield f"blames itself: {words}"
+    if ran.code and not any(word in text for word in told):
+        yield "does not say what is wrong"
+
+
+def after_restart(
+    rig: Rig, ran: Ran, *, journaled: bool = False, clones: bool = True
+) -> Iterator[str]:
+    """Book another demand in a fresh process, and yield what is wrong with the state repo.
+
+    Args:
+        ran: the process that the fault met.
+        journaled: the demand is in the journal, so it must be booked.
+        clones: the clones must be whole too.
+    """
+    found = rig.book(NEXT, limit=15.0)
+    if not found.commit:
+        last = found.err.strip().splitlines()[-1:] or [found.out]
+        yield f"the next start fails: exit code {found.code} {found.hangs} {last[0]}"
+        return
+    booked = demands(rig)
+    times = len(booked.get(DEMAND, []))
+    if times > 1:
+        yield f"booked {times} times"
+    if journaled and not times:
+        yield "journaled and missing"
+    if ran.commit and not includes(rig, ran.commit):
+        yield "acknowledged and missing"
+    if times and '"refused"' in ran.out:
+        yield "refused and booked"
+    for number in (0, NEXT):
+        if len(booked.get(number, [])) != 1:
+            yield f"demand {number} is booked {len(booked.get(number, []))} times"
+    yield from _state(rig, set(booked), clones)
+
+
+def _state(rig: Rig, numbers: set[int], clones: bool) -> Iterator[str]:
+    books = rig.demandops("bookkeeping", "--state-repo", str(rig.state), "--output", "json")
+    if books.code:
+        yield f"bookkeeping: {books.err.strip()}"
+    else:
+        wrong = [n for n in range(NEXT + 1) if (f'"user{n}"' in books.out) != (n in numbers)]
+        if wrong or not isinstance(json.loads(books.out), dict | list):
+            yield f"the bookkeeping differs from the commits: {wrong}"
+    verified = rig.demandops("verify", "--state-repo", str(rig.state))
+    if verified.code:
+        yield f"verify: {(verified.out + verified.err).strip()}"
+    for folder in (rig.state, *(rig.home.rglob("clone.git") if clones else ())):
+        checked = subprocess.run(
+            ["git", "-C", folder, "fsck", "--strict", "--no-dangling", "--no-progress"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        lines = (checked.stdout + checked.stderr).splitlines()
+        told = [line for line in lines if not line.startswith("notice: ")]
+        if checked.returncode or told:
+            yield f"git fsck: {' '.join(told)}"
+        for pattern in _LEFTOVERS:
+            yield from (f"left over: {_named(path)}" for path in folder.glob(pattern))
+
+
+def _named(path: Path) -> str:
+    return path.name.replace(path.stem.partition("-")[2], "*") if "-" in path.stem else path.name

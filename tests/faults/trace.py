@@ -1,0 +1,156 @@
+"""The system calls that strace wrote down: who made them, on which class of file."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+_LINE = re.compile(r"(\d+) +(.*)")
+_CALL = re.compile(r"(\w+)\((.*)\) += (-?\d+|\?|0x[0-9a-f]+)(.*)", re.DOTALL)
+_TEXT = re.compile(r'"((?:[^"\\]|\\.)*)"')
+_FILE = re.compile(r"(?:AT_FDCWD|\d+)<((?:[^>\\]|\\.)*)>")
+_FORKS = ("clone", "clone3", "fork", "vfork")
+_RANDOM = (
+    (re.compile(r"\b[0-9a-f]{2}/[0-9a-f]{38}\b"), "??/*"),
+    (re.compile(r"(?<=/)[0-9a-f]{2}(?=/|$)"), "??"),
+    (re.compile(r"(pack_git2_)[0-9a-f]+?(idx|rev|$)"), r"\1*\2"),
+    (re.compile(r"(?<![a-z])[0-9a-f]{12,}"), "*"),
+    (re.compile(r"(demandops-pack-|tmp_\w+?_|incoming-)\w+"), r"\1*"),
+)
+
+
+@dataclass(frozen=True)
+class Call:
+    """One system call; ``n`` counts the calls of its name in its thread or process."""
+
+    process: int
+    role: str
+    kind: str
+    n: int
+    arguments: str
+    result: str
+    paths: tuple[str, ...]
+
+    @property
+    def failed(self) -> bool:
+        """Whether it returned an error, an injected one too."""
+        return self.result.startswith(("-1", "?"))
+
+    @property
+    def text(self) -> bytes:
+        """The bytes that it wrote."""
+        found = _TEXT.search(self.arguments)
+        return _decoded(found[1]) if found else b""
+
+
+def file_class(path: str, root: Path) -> str:
+    """Return what kind of file this is: its path in the folder, without what differs each time."""
+    name = path.removeprefix(f"{root}/")
+    for pattern, stands in _RANDOM:
+        name = pattern.sub(stands, name)
+    return name
+
+
+def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> list[Call]:
+    """Return the calls that touch a file below ``root``, in the order in which they ended.
+
+    ``roles`` names the threads; a process that executes a program is called after it. The first
+    process starts in ``folder``.
+    """
+    roles, folders, counts = dict(roles), dict[int, str](), dict[tuple[int, str], int]()
+    first = _LINE.match(text)
+    if first:
+        folders[int(first[1])] = folder
+    found = []
+    for process, line in _whole_lines(text, roles, folders):
+        match = _CALL.match(line)
+        if match is None:
+            continue
+        kind, arguments, result = match[1], match[2], match[3] + match[4]
+        if kind in _FORKS:
+            child = int(match[3]) if match[3].isdigit() else 0
+            if roles.get(child, "?") == "?":
+                roles[child] = f"{roles.get(process, '?')} > ?"
+                folders[child] = folders.get(process, "/")
+            continue
+        if "faults-begin" in arguments:
+            counts = {key: n for key, n in counts.items() if key[0] != process}
+        counts[process, kind] = n = counts.get((process, kind), 0) + 1
+        paths = [os.path.normpath(path) for path in _paths(arguments, folders.get(process, "/"))]
+        if kind == "execve" and result.startswith("0"):
+            roles[process] = _program(arguments, roles.get(process, ""))
+            if roles[process].startswith("git ") and " > " not in roles[process]:
+                counts = {key: n for key, n in counts.items() if key[0] != process}
+        elif kind == "chdir" and not result.startswith("-1"):
+            folders[process] = paths[0]
+        inside = tuple(path for path in paths if path.startswith(f"{root}/"))
+        if inside:
+            role = roles.get(process, "?")
+            found.append(Call(process, role, kind, n, arguments, result, inside))
+    return found
+
+
+def _whole_lines(
+    text: str, roles: dict[int, str], folders: dict[int, str]
+) -> Iterator[tuple[int, str]]:
+    """Yield process and call, with calls in one piece that others interrupted."""
+    begun: dict[int, str] = {}
+    for raw in text.splitlines():
+        match = _LINE.match(raw)
+        if match is None:
+            continue
+        process, line = int(match[1]), match[2]
+        if process not in folders:
+            parents = [p for p, part in begun.items() if part.startswith(_FORKS)]
+            folders[process] = folders.get(parents[-1], "/") if parents else "/"
+            roles.setdefault(process, roles.get(parents[-1], "?") + " > ?" if parents else "?")
+        if line.endswith("<unfinished ...>"):
+            begun[process] = line.removesuffix("<unfinished ...>").rstrip()
+            continue
+        resumed = re.match(r"<\.\.\. \w+ resumed>", line)
+        if resumed:
+            line = begun.pop(process, "") + line[resumed.end() :]
+        elif line.startswith("+++ killed") and process in begun:
+            yield process, begun.pop(process) + ") = ? (INJECTED)"
+        yield process, line
+
+
+def _program(arguments: str, before: str) -> str:
+    words = [_decoded(word).decode() for word in _TEXT.findall(arguments.partition("[")[2])]
+    names = [word for word in words if not word.startswith("-")]
+    name = names[0].rsplit("/", 1)[-1] if names else "?"
+    if name == "git" and len(names) > 1:
+        name = f"git {names[1]}"
+    command = before.partition(" > ")[0]
+    return f"{command} > {name}" if command.startswith("git ") else name
+
+
+def _paths(arguments: str, folder: str) -> list[str]:
+    """Return the paths of the files that a call names, by name or by number."""
+    annotated = [_decoded(each).decode(errors="replace") for each in _FILE.findall(arguments)]
+    named = [
+        _decoded(each).decode(errors="replace")
+        for each in _TEXT.findall(arguments)
+        if "\\0" not in each
+    ]
+    first = arguments.lstrip()
+    if first.startswith('"'):
+        return [each if each.startswith("/") else f"{folder}/{each}" for each in named[:2]]
+    if first.startswith("AT_FDCWD") or (re.match(r'\d+<[^>]*>, "', first) and _is_at(arguments)):
+        base = annotated[0] if annotated else folder
+        return [each if each.startswith("/") else f"{base}/{each}" for each in named[:2]]
+    return [each for each in annotated if each.startswith("/")]
+
+
+def _is_at(arguments: str) -> bool:
+    """Whether a text after a folder is a name in it, and not what is written or read."""
+    return "O_" in arguments or "AT_" in arguments
+
+
+def _decoded(text: str) -> bytes:
+    value: bytes = ast.literal_eval(f'b"{text}"')
+    return value

@@ -1,0 +1,99 @@
+"""What killed processes and failed syncs leave in a state repo, and repos that are refused."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from pathlib import Path
+
+import pytest
+from demandops.errors import StateRepoError, Unsound
+from demandops.staterepo.git.local_repository import LocalRepository
+from demandops.staterepo.write.journal import Journal, JournalEntry
+
+from tests.kit import rig
+from tests.kit.repo import git, tip
+
+
+def _leave(bare: Path) -> list[Path]:
+    """Leave what a process leaves that is killed while it places a pack."""
+    folder = bare / "demandops-pack-killed"
+    folder.mkdir()
+    (folder / "pack_git2_1").write_text("half of a pack")
+    index = next((bare / "objects" / "pack").glob("*.idx"))
+    keep = index.with_suffix(".keep")
+    keep.hardlink_to(index)
+    return [folder, keep]
+
+
+def test_a_start_removes_what_a_killed_process_left(bare: Path) -> None:
+    left = _leave(bare)
+    of_a_person = bare / "objects" / "pack" / "pack-1.keep"
+    of_a_person.write_text("")
+    with rig.running(bare):
+        assert [path for path in left if path.exists()] == []
+    assert of_a_person.exists()
+
+
+def test_a_start_removes_nothing_while_another_process_writes_a_pack(bare: Path) -> None:
+    left = _leave(bare)
+    handle = os.open(bare / "objects" / "pack", os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH)
+        with rig.running(bare):
+            assert [path for path in left if not path.exists()] == []
+    finally:
+        os.close(handle)
+
+
+def test_a_published_demand_without_an_answer_is_written_to_new_files(bare: Path) -> None:
+    with rig.running(bare) as generator:
+        before = tip(bare)
+        rig.receipt(generator.submit(rig.goal(1), "op-1"))
+        journal = generator._slot.folder / "outbox.jsonl"
+        folder = generator._slot.folder
+    branch, packs = bare / "refs/heads/main", bare / "objects" / "pack"
+    inodes = {path.name: path.stat().st_ino for path in (branch, *packs.iterdir())}
+    at = tip(bare)
+    again = Journal(journal)  # as if the answer had been lost
+    again.append([JournalEntry("op-1", rig.goal(1), "2026-03-01T00:00:00+00:00", before)])
+    again.close()
+    assert rig.restart(bare) is True
+    assert folder.exists()
+    assert (tip(bare), rig.operations(bare)) == (at, ["op-1"])
+    assert branch.stat().st_ino != inodes["main"]
+    assert any(path.stat().st_ino != inodes.get(path.name) for path in packs.glob("*.pack"))
+    rig.assert_sound(bare)
+
+
+def test_a_journal_whose_sync_fails_answers_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = Journal(tmp_path / "outbox.jsonl")
+    entry = JournalEntry("op-1", {}, "2026-03-01T00:00:00+00:00", "")
+
+    def fail(file: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fdatasync", fail)
+        with pytest.raises(Unsound, match="Input/output error; check its disk, then start again"):
+            journal.append([entry])
+    with pytest.raises(Unsound):
+        journal.append([entry])
+
+
+def test_a_repo_that_borrows_objects_is_refused(bare: Path, tmp_path: Path) -> None:
+    git(tmp_path, "clone", "--quiet", "--bare", "--shared", str(bare), "borrows.git")
+    with pytest.raises(StateRepoError, match="borrows objects of another repository"):
+        LocalRepository(tmp_path / "borrows.git")
+
+
+@pytest.mark.parametrize("text", ["", "x" * 40 + "\n"])
+def test_a_repo_whose_branch_is_damaged_is_called_so(bare: Path, text: str) -> None:
+    branch = bare / "refs/heads/main"
+    branch.parent.mkdir(exist_ok=True)
+    branch.write_text(text)
+    with pytest.raises(StateRepoError, match=r"state\.git is damaged: .*fsck"):
+        LocalRepository(bare)
