@@ -17,7 +17,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-packages faults e2e e2e-argocd coverage check format golden bench bench-audit load wheel clean
+.PHONY: help setup demo test test-packages faults e2e e2e-argocd coverage check format fuzz golden bench bench-audit load simulate wheel clean
 .PHONY: $(SYSTEM) go
 
 help:  ## Show what there is to make
@@ -107,6 +107,14 @@ bench-audit: setup  ## Measure what an auditor's questions cost after 10,000 com
 
 load: setup  ## Four generators and a person write at once, 2,000 demands, connections are cut
 	@DEMANDOPS_LOAD_DEMANDS=2000 DEMANDOPS_LOAD_FURTHER=1000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/staterepo/test_many_writers.py tests/integration/staterepo/test_people_in_the_loop.py
+
+# The gate gives each target 2 seconds. What it found before is tried again: build/fuzz/corpus.
+fuzz: export FUZZ_S ?= 10
+fuzz: system-test setup  ## Try odd inputs at every parser and writer, FUZZ_S seconds for each (default 10)
+	@$(PY) -m tests.fuzz
+
+simulate: setup  ## Play histories of generators and people with faults, for SIMULATE_S=60 seconds from SEED
+	@$(PY) -m tests.simulation.run
 
 wheel: setup  ## Build the wheel into dist/
 	@$(PY) -m build --wheel --outdir dist .

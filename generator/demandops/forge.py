@@ -121,8 +121,11 @@ class Forge(ABC):
         try:
             closed: PullRequestState = "merged" if self._is_merged(data) else "closed"
             state = "open" if closed == "closed" and data["state"] == "open" else closed
-            return PullRequest(int(data["number"]), str(data["html_url"]), state)
-        except (KeyError, TypeError, ValueError):
+            link = str(data["html_url"])
+            if not link.isprintable():
+                raise ValueError("the link is more than one line")
+            return PullRequest(int(data["number"]), link, state)
+        except (KeyError, TypeError, ValueError, OverflowError):
             message = f"the answer is not a pull request; check that this is {self.NAME}'s API"
             raise ForgeError(message) from None
 

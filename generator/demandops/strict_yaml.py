@@ -38,6 +38,8 @@ _NEEDS_CHECK = re.compile(r"[&*]|[-?:][ \t]+[-?][ \t]|^\?", re.MULTILINE)
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: a tag or number is not allowed there"
 
+_EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
+"""A text, or a JSON number like ``1e-09``: without a dot, YAML 1.1 reads text."""
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
@@ -221,7 +223,8 @@ def set_key(text: str, key: str, value: object) -> str:
     Raises:
         InvalidInput: if the file's form does not allow that.
     """
-    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    with _strict(""):
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
     current = next((value for name, value in pairs if name.value == key), None)
     if isinstance(current, yaml.ScalarNode):
@@ -246,7 +249,9 @@ def to_json(value: object) -> str:
 
     Characters that YAML cannot print become ``\\uXXXX``; the others stay readable.
     """
-    text = json.dumps(value, ensure_ascii=False, sort_keys=False, default=_unknown)
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, default=_unknown)
+    if "e-" in text or "e+" in text:
+        text = _EXPONENT.sub(lambda match: f"{match[1]}.0" if match[1] else match[0], text)
     return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 

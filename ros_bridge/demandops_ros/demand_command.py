@@ -63,7 +63,7 @@ def demand(
             lines = str(error).splitlines() or [error.code]
             faults = [fault("", line, code=error.code).within(file) for line in lines]
             raise InvalidInput(faults) from None
-        except (ValueError, TypeError, AssertionError, AttributeError) as error:
+        except (ValueError, TypeError, AssertionError, AttributeError, OverflowError) as error:
             raise InvalidInput([fault("", f"is not a demand: {error}").within(file)]) from None
 
 

@@ -74,7 +74,7 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
 
     Raises:
         ValueError: for an unknown field or word.
-        TypeError, AssertionError: for a value of the wrong type.
+        TypeError, AssertionError, AttributeError, OverflowError: for a value of the wrong type.
     """
     more = {"apiVersion", "kind", "lease", "operation", "answer", "applications", "connections"}
     goal = DemandMessage.Goal(**_fields(data, _DEMAND, more, "a demand"))

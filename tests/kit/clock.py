@@ -34,6 +34,11 @@ class Clock(Runtime):
         """Return a condition whose waits soon end, so that a moved clock is noticed."""
         return _Impatient()
 
+    @property
+    def offset(self) -> float:
+        """By how much the wall clock was set in all."""
+        return self._set
+
     def pass_(self, seconds: float) -> None:
         """Let time pass on both clocks."""
         self._passed += seconds

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from math import inf
 from typing import Any
 
@@ -52,6 +52,21 @@ class Turns(Clock):
             self._turn.switch()
             if self._turn.dead:  # the end of a thread leads to the main one
                 self._turn = self._next()
+
+    def stop(self, threads: Collection[greenlet]) -> None:
+        """Let no thread of these run again, as at the end of their process."""
+        for thread in threads:
+            self._waiting.pop(thread, None)
+        while getcurrent() in threads:
+            self._turn = self._next()
+            self._turn.switch()
+
+    def end(self, threads: Iterable[greenlet]) -> None:
+        """Unwind threads that were stopped, so that what they hold is released."""
+        self._waiting.clear()
+        for thread in threads:
+            self._turn = self._main
+            thread.throw()
 
     def _next(self) -> greenlet:
         """Return whose turn it is: by chance one that need not wait, else the first in time."""

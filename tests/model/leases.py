@@ -167,7 +167,7 @@ class Promises:
         self, request: str, who: frozenset[str], subject: Subject, topics: frozenset[str], now: int
     ) -> Outcome:
         this = (request, who, subject, topics)
-        if this in self.shutdowns and now - self.shutdowns[this] <= REPEATS_WITHIN_S:
+        if this in self.shutdowns and abs(now - self.shutdowns[this]) <= REPEATS_WITHIN_S:
             return "unchanged"
         own = by_message(request, who)
         around = [

@@ -103,6 +103,8 @@ class DemandGoal(FrozenModel):
 
 _DEEPEST = 50
 """The deepest nesting of a parameter's value; a claim's file may have 100 levels."""
+_LONGEST_KEY = 128
+"""The longest key in a parameter's value: YAML reads 1024 characters, escapes included."""
 _LISTS_OF_TEXT = ("requesters",)
 
 
@@ -223,6 +225,8 @@ def _value_problem(value: object, depth: int) -> str:
         return f"holds {value}, which is not a finite number; give one, or leave it out"
     if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
         return f"holds {quoted(value)}, which is not Unicode text; write whole characters"
+    if isinstance(value, dict) and (long := [key for key in value if len(key) > _LONGEST_KEY]):
+        return f"has the key {quoted(long[0])} of {len(long[0])} characters; at most {_LONGEST_KEY}"
     parts = [*value, *value.values()] if isinstance(value, dict) else value
     nested = parts if isinstance(parts, list) else ()
     return next(filter(None, (_value_problem(part, depth + 1) for part in nested)), "")

@@ -25,6 +25,7 @@ from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
 from demandops.errors import Fault, InvalidInput, fault
+from demandops.quoting import quoted
 from demandops.settings import LEDGER_API_VERSION
 from demandops.subject import Subject, SubjectKind, TopicKey
 
@@ -64,14 +65,25 @@ def parse_timestamp(text: str) -> datetime:
     """Return a time of a ledger file, in UTC; raise :class:`ValueError` if it is none."""
     try:
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
-    except ValueError:
-        raise ValueError(f"'{text}' is not a time like 2026-01-31T12:00:00.000000Z") from None
+        in_utc = moment.astimezone(timezone.utc)
+    except (ValueError, OverflowError):
+        message = f"{quoted(text)} is not a time like 2026-01-31T12:00:00.000000Z"
+        raise ValueError(message) from None
     if moment.tzinfo is None:
-        raise ValueError(f"'{text}' has no time zone; end it in Z")
-    return moment.astimezone(timezone.utc)
+        raise ValueError(f"{quoted(text)} has no time zone; end it in Z")
+    return in_utc
 
 
 Timestamp = Annotated[str, AfterValidator(_timestamp)]
+
+
+def _end_of_lease(text: str) -> str:
+    if parse_timestamp(text) >= UNSTARTED:
+        raise ValueError(f"{quoted(text)} is after the year 8999; write an earlier time")
+    return text
+
+
+_EndOfLease = Annotated[str, AfterValidator(_end_of_lease)]
 
 
 _Requesters = Annotated[tuple[str, ...], AfterValidator(lambda names: tuple(sorted(set(names))))]
@@ -97,7 +109,7 @@ def _plain_route(value: object) -> object:
 class _Lease(FrozenModel):
     seconds: int = Field(ge=1, le=LONGEST_S)
     slack: int = Field(default=0, ge=0, le=LONGEST_S)
-    until: Timestamp | None = None  # None: the lease starts with the approval
+    until: _EndOfLease | None = None  # None: the lease starts with the approval
 
     def lease(self) -> Lease:
         until = parse_timestamp(self.until) if self.until else UNSTARTED
@@ -264,7 +276,8 @@ def _connection_data(claim: Claim, connection: Connection) -> dict[str, Any]:
 
 def format_timestamp(moment: datetime) -> str:
     """Return a time as ledger files have it: in UTC, with microseconds."""
-    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    in_utc = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
+    return f"{in_utc.removesuffix('+00:00')}Z"
 
 
 def _topic(claim: Claim, role: str, topic: InputTopic) -> dict[str, Any]:

@@ -32,8 +32,8 @@ from demandops.errors import (
 from demandops.quoting import quoted
 from demandops.runtime import Runtime
 from demandops.service.fair_queue import FairQueue, requester_of
-from demandops.service.ticket import ProposalRecord, Receipt, State, Ticket, ticket_from_journal
-from demandops.staterepo.write.journal import Journal
+from demandops.service.ticket import Receipt, State, Ticket, ticket_from_journal
+from demandops.staterepo.write.journal import Journal, ProposalRecord
 
 log = logging.getLogger("demandops")
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
 from demandops.cluster.health.release_health import Target
 from demandops.decision import Decision, Outcome
 from demandops.ledger.ledger import ClaimChange
-from demandops.staterepo.write.journal import JournalEntry
+from demandops.staterepo.write.journal import JournalEntry, ProposalRecord
 
 log = logging.getLogger("demandops")
 
@@ -42,23 +42,6 @@ class Receipt:
     lease_s: int | None = None
     targets: tuple[Target, ...] = ()
     changes: tuple[ClaimChange, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class ProposalRecord:
-    """What the journal keeps of a proposal, enough to resume it.
-
-    ``commits`` are the past, current and next commits of the branch, the newest last; ``base`` is
-    the commit of main below the newest. ``pushed``: the branch existed once. ``link``: its web
-    address. ``withdrawn``: the reason to delete it, or empty.
-    """
-
-    branch: str
-    commits: tuple[str, ...] = ()
-    base: str = ""
-    pushed: bool = False
-    link: str = ""
-    withdrawn: str = ""
 
 
 @dataclass(eq=False)
@@ -106,8 +89,8 @@ class Ticket:
 
     def journal_entry(self, proposal: ProposalRecord | None = None) -> JournalEntry:
         """Return what the journal keeps of the demand."""
-        record = asdict(proposal) if proposal else None
-        return JournalEntry(self.operation, self.goal, self.received.isoformat(), self.base, record)
+        received = self.received.isoformat()
+        return JournalEntry(self.operation, self.goal, received, self.base, proposal)
 
 
 def receipt_of(
@@ -132,7 +115,6 @@ def ticket_from_journal(entry: JournalEntry) -> Ticket:
     ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
     ticket.mark_maybe_published(entry.base)
     if entry.proposal is not None:
-        record = entry.proposal
-        ticket.proposal = ProposalRecord(**{**record, "commits": tuple(record["commits"])})
+        ticket.proposal = entry.proposal
         ticket.state = "withdrawn" if ticket.proposal.withdrawn else "proposed"
     return ticket

@@ -17,13 +17,14 @@ import pytest
 import yaml
 from demandops.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
 from demandops.service import Ticket
+from demandops.service.approvals import approvals
 
 from tests.kit import goals, rig
 from tests.kit.generator import Proposed
 from tests.kit.git_over_http import Server
 from tests.kit.limits import files_end_at
 from tests.kit.repo import Person, branches
-from tests.kit.rig import Gate, git, goal, leave
+from tests.kit.rig import Gate, Goal, git, goal, leave
 
 
 def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_it(
@@ -96,6 +97,22 @@ def assert_rendered(bare: Path) -> None:
     stands = {path: text for path, text in stands.items() if path.endswith(".yaml")}
     wanted = {p: t for p, t in rendered_files(state).items() if p.startswith("clusters/")}
     assert stands == {path: text for path, text in wanted.items() if path.endswith(".yaml")}
+
+
+def test_a_requester_may_have_only_so_many_proposals(
+    bare: Path, petra: Person, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def of(who: str, name: str) -> Goal:
+        link = {"id": name, "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
+        return {"kind": "Demand", "demand": name, "requesters": [who], "connections": [link]}
+
+    monkeypatch.setattr(approvals, "PROPOSAL_LIMIT", 1)
+    with rig.running(bare) as generator:
+        branch = Proposed(generator, of("vehicle00", "first")).branch
+        with pytest.raises(Refused, match=r"^1 demands of 'vehicle00' await approval already"):
+            rig.receipt(generator.submit(of("vehicle00", "second")))
+        other = Proposed(generator, of("vehicle01", "third"))
+        assert sorted([branch, other.branch]) == branches(bare)
 
 
 def test_a_deleted_branch_turns_the_demand_down(url: str, bare: Path, petra: Person) -> None:
@@ -282,6 +299,16 @@ def test_a_release_right_behind_the_demand_leaves_no_branch(bare: Path, petra: P
             rig.receipt(held)
 
 
+TWO = """apiVersion: demandops/v1
+kind: Override
+reason: More for a test
+owner: perception-team
+select:
+  - services: ["*"]
+replicas: 2
+"""
+
+
 def put(demand: str, vehicle: int, who: str = "user", **more: Any) -> Any:
     name = f"vehicle{vehicle:02}"
     return goals.put(demand, who, topic=(f"/vehicles/{name}/ego_data", name), **more)
@@ -339,6 +366,33 @@ def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(
         with pytest.raises(Refused, match="contradicts an existing claim"):
             rig.receipt(two.ticket)
         rig.wait_until(lambda: gone not in branches(bare), "the branch is taken away")
+
+
+def test_what_was_merged_before_it_was_replaced_is_booked(bare: Path, petra: Person) -> None:
+    with rig.running(bare) as generator:
+        first, gate = Proposed(generator, put("d", 1), "op-1"), Gate()
+        branch = first.branch
+        generator.submit(put("d", 2), "op-2", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        petra.merge(branch)
+        gate.open.set()
+        assert first.outcome() == "booked"
+    rig.assert_sound(bare)
+
+
+def test_a_branch_that_cannot_be_rebuilt_can_still_be_merged(
+    bare: Path, url: str, petra: Person
+) -> None:
+    with rig.running(url, fetch_interval=0.1) as generator:
+        proposed = Proposed(generator, put("d", 1), "op-1")
+        branch = proposed.branch
+        rig.hook(bare, "update", 'case "$1" in refs/heads/demand/*) exit 1;; esac')
+        petra.override(two=TWO)
+        failed = f"rebuilding {branch}"
+        rig.wait_until(lambda: failed in generator.failures, "the push is denied")
+        petra.merge(branch)
+        assert proposed.outcome() == "booked"
+    assert rig.operations(bare) == ["op-1"]
 
 
 def test_a_policy_that_asks_no_more_lets_what_waits_through(bare: Path, petra: Person) -> None:

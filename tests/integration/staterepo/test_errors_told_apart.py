@@ -13,6 +13,7 @@ import pytest
 from demandops.errors import StateRepoError, Unsound
 from demandops.runtime import Runtime
 from demandops.service import Generator
+from demandops.staterepo import reader
 from demandops.staterepo.git.repository import DiskFull, PushDenied, disk_error
 
 from tests.kit import rig
@@ -101,24 +102,27 @@ def test_a_lock_that_is_no_file_is_told_and_not_waited_for_in_silence(bare: Path
 # ---- a tip that cannot be read ----
 
 
-def _with_nonsense_encoding(bare: Path) -> None:
+def _commit_by_hand(
+    bare: Path, tree: pygit2.Oid | None = None, time: int = 1_770_000_000, more: str = ""
+) -> None:
+    """Commit what no library would write."""
     repo, parent = pygit2.Repository(str(bare)), tip(bare)
-    people = "Petra <petra@example.org> 1770000000 +0000"
+    people = f"Petra <petra@example.org> {time} +0000"
     text = (
-        f"tree {repo[parent].peel(pygit2.Tree).id}\nparent {parent}\nauthor {people}\n"
-        f"committer {people}\nencoding nonsense-7\n\nHello\n"
+        f"tree {tree or repo[parent].peel(pygit2.Tree).id}\nparent {parent}\nauthor {people}\n"
+        f"committer {people}\n{more}\nHello\n"
     )
     made = repo.write(pygit2.enums.ObjectType.COMMIT, text.encode())
     repo.references["refs/heads/main"].set_target(made)
 
 
-def _with_entry_in_overrides(bare: Path, name: bytes, blob: pygit2.Oid) -> None:
+def _with_entry_in_overrides(bare: Path, name: bytes, blob: pygit2.Oid) -> pygit2.Oid:
+    """Return main's tree with ``overrides/`` replaced by one entry."""
     repo = pygit2.Repository(str(bare))
     tree = repo.TreeBuilder(repo[tip(bare)].peel(pygit2.Tree))
     made = repo.write(pygit2.enums.ObjectType.TREE, b"100644 %s\0%s" % (name, blob.raw))
     tree.insert("overrides", made, pygit2.enums.FileMode.TREE)
-    by = pygit2.Signature("Petra", "petra@example.org", 1_770_000_000, 0)
-    repo.create_commit("refs/heads/main", by, by, "By hand", tree.write(), [tip(bare)])
+    return tree.write()
 
 
 def test_a_tip_that_cannot_be_read_is_told_once_and_tried_again_with_pauses(
@@ -127,7 +131,8 @@ def test_a_tip_that_cannot_be_read_is_told_once_and_tried_again_with_pauses(
     with rig.running(bare, fetch_interval=0.01) as generator:
         rig.book(generator, goal(1))
         good = tip(bare)
-        _with_entry_in_overrides(bare, b"gone.yaml", pygit2.Oid(raw=b"\x11" * 20))
+        missing = pygit2.Oid(raw=b"\x11" * 20)
+        _commit_by_hand(bare, _with_entry_in_overrides(bare, b"gone.yaml", missing))
         rig.wait_until(lambda: generator.failures, "the failure is shown")
         assert list(generator.failures) == ["writer"]
         with pytest.raises(StateRepoError, match="internal error of the generator: KeyError"):
@@ -142,14 +147,27 @@ def test_a_tip_that_cannot_be_read_is_told_once_and_tried_again_with_pauses(
 def test_a_commit_in_an_unknown_encoding_is_like_any_other(bare: Path) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
-        _with_nonsense_encoding(bare)
+        _commit_by_hand(bare, more="encoding nonsense-7\n")
         assert rig.book(generator, goal(2))[0].outcome == "booked"
+
+
+@pytest.mark.parametrize("time", [-62_000_000_000, 254_000_000_000, 2**62])
+def test_a_commit_of_an_impossible_time_holds_back_its_files_alone(bare: Path, time: int) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        blob = pygit2.Repository(str(bare)).create_blob(b"x")
+        _commit_by_hand(bare, _with_entry_in_overrides(bare, b"a.yaml", blob), time)
+        assert rig.book(generator, goal(2))[0].outcome == "booked"
+        assert {fault.file for fault in generator.snapshot.problems} == {"overrides/a.yaml"}
+    with reader.opened(str(bare)) as opened:
+        assert len(list(opened.log())) == 5
 
 
 def test_a_file_whose_name_is_no_text_holds_back_itself_alone(bare: Path, person: Person) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
-        _with_entry_in_overrides(bare, b"\xff.yaml", pygit2.Repository(str(bare)).create_blob(b"x"))
+        blob = pygit2.Repository(str(bare)).create_blob(b"x")
+        _commit_by_hand(bare, _with_entry_in_overrides(bare, b"\xff.yaml", blob))
         assert rig.book(generator, goal(2))[0].outcome == "booked"
         assert {fault.file for fault in generator.snapshot.problems} == {"overrides/\\xff.yaml"}
 

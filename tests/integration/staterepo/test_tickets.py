@@ -173,6 +173,29 @@ def test_a_full_queue_takes_no_more_and_takes_again_when_there_is_room(bare: Pat
     assert rig.books(bare) == rig.books_after(map(goal, range(5)))
 
 
+def test_a_requester_may_have_only_so_many_demands_waiting(bare: Path) -> None:
+    gate = Gate()
+    with rig.running(bare, requester_limit=2) as generator:
+        first = generator.submit(goal(1), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        second = generator.submit(goal(1), "again")
+        with pytest.raises(QueueFull, match=r"^2 demands of 'user1' .* requester_queue_limit$"):
+            generator.submit(goal(1), "op-3")
+        other = generator.submit(goal(2))
+        gate.open.set()
+        for ticket in (first, second, other):
+            rig.receipt(ticket)
+        assert rig.book(generator, goal(1))[0].outcome == "unchanged"
+
+
+def test_demands_are_counted_while_others_come_and_go(bare: Path) -> None:
+    with rig.running(bare) as generator:
+        tickets = [generator.submit(goal(number % 9), f"op-{number}") for number in range(200)]
+        while not all(ticket.future.done() for ticket in tickets):
+            assert 0 <= generator.unpublished <= 200
+        assert generator.unpublished == 0
+
+
 # ---- callers that misbehave ----
 
 

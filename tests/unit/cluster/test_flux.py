@@ -6,7 +6,13 @@ from typing import Any
 
 import pytest
 from demandops.cluster.health import health_reader
-from demandops.cluster.health.release_health import ClusterDomain, Health, Target, worst
+from demandops.cluster.health.release_health import (
+    ClusterDomain,
+    Health,
+    Target,
+    deployment_health,
+    worst,
+)
 
 from tests.kit.cluster import Letters, condition, deployment
 
@@ -142,3 +148,10 @@ def test_since_when_is_the_cluster_s_to_say() -> None:
 )
 def test_levels_are_in_order(state: Any, level: Any, reached: bool) -> None:
     assert Health(state).reaches(level) is reached
+
+
+def test_numbers_that_the_api_gives_as_null_are_those_that_it_leaves_out() -> None:
+    found = deployment("mqtt-a", updatedReplicas=None, availableReplicas=None)
+    found["metadata"]["generation"] = found["spec"]["replicas"] = None
+    health = deployment_health(found)
+    assert (health.state, health.reason) == ("reconciled", "0 of 1 replicas are available")

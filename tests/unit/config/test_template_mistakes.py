@@ -286,6 +286,14 @@ class TestSchema:
         (found,) = self.faults(schema)
         assert found.startswith(f"{CHART}/values.schema.json: is nested too deeply or applies too")
 
+    @pytest.mark.parametrize("pattern", ["^(a+)+$", "^(a|a)*$", "^(?=(a+)+b)"])
+    def test_a_pattern_ends_soon_on_any_text(self, pattern: str) -> None:
+        schema = {"properties": {"podLabels": {"propertyNames": {"pattern": pattern}}}}
+        path, labels = f"{CHART}/values.schema.json", f"podLabels: {{'{'a' * 900}!': x}}\n"
+        books = MemoryRepo({path: json.dumps(schema), TEMPLATE: skeleton()[TEMPLATE] + labels})
+        with pytest.raises(InvalidInput, match=r"values\.podLabels"):
+            books.send(perception())
+
     def test_a_schema_may_refer_to_itself_for_parts(self) -> None:
         tree = {"properties": {"image": {"$ref": "#"}, "ros": {"$ref": "#top"}}, "$anchor": "top"}
         for schema in (tree, doubling(3)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,10 +11,12 @@ import pytest
 from demandops.config.load import load
 from demandops.config.repo_settings import Proposals
 from demandops.errors import InvalidInput
-from demandops.forge import Forge, ForgeError, PullRequest, forge_for
+from demandops.forge import Forge, ForgeError, Gitea, PullRequest, forge_for
+from demandops.service.approvals.forge_worker import ForgeWorker
 
 from tests.kit.config import configuration
-from tests.kit.http import serving
+from tests.kit.http import Answer, serving
+from tests.kit.turns import Turns
 from tests.unit.forge.replaying import TOKEN, Replay, replaying
 
 BRANCH = "demand/one-0123456789ab"
@@ -127,6 +130,19 @@ def test_a_token_file_that_is_none_is_told(tmp_path: Path, write: Write, message
     assert str(error.value) == f"the token file {file}{message}"
 
 
+def test_a_forge_that_is_asked_too_often_is_left_alone_for_a_minute(tmp_path: Path) -> None:
+    (tmp_path / "token").write_text(TOKEN)
+    turns = Turns(1)
+    with serving(lambda call: Answer.json({"message": "slow down"}, 429)) as server:
+        at = {"forge": "github", "url": "https://github.com/a/b", "api": server.url}
+        worker = ForgeWorker(tmp_path / "token", lambda branch: None, turns)
+        worker.open(Proposals.model_validate(at), "demand/x", "x", "x")
+        turns.sleep(59)
+        assert len(server.calls) == 1
+        turns.sleep(2)
+        assert len(server.calls) == 2
+
+
 def test_no_token_file_is_told_with_the_remedy() -> None:
     configured = Proposals.model_validate({"forge": "gitea", "url": "https://x.org/a/b"})
     with pytest.raises(ForgeError, match="DEMANDOPS_FORGE_TOKEN_FILE"):
@@ -180,3 +196,12 @@ def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> No
         load(config)
     faults = [str(found) for found in error.value.faults]
     assert any(message in found for found in faults), faults
+
+
+@pytest.mark.parametrize(
+    ("number", "link"), [("1e999", "https://x"), ("null", "https://x"), ("1", r"https://x\nA: b")]
+)
+def test_an_answer_with_an_odd_number_or_link_is_no_pull_request(number: str, link: str) -> None:
+    answer = f'{{"number": {number}, "html_url": "{link}", "merged": false, "state": "open"}}'
+    with pytest.raises(ForgeError, match="is not a pull request; check that this is Gitea's API"):
+        Gitea("https://x", "token", "owner", "name")._read(json.loads(answer))

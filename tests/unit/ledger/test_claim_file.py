@@ -205,6 +205,32 @@ def test_the_first_schema_has_no_action_and_the_demand_id_tells_it(
     assert written(claim, ("ledger/v2", "ledger/v1")) == replace(claim, joined=joined)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "problem"),
+    [
+        ("booked", "0001-01-01T00:00:00+23:59", "is not a time like 2026-01-31T12:00:00.000000Z"),
+        ("booked", "2026-01-31", "has no time zone; end it in Z"),
+        ("until", "9999-12-31T23:59:59Z", "is after the year 8999; write an earlier time"),
+    ],
+)
+def test_a_time_that_cannot_be_reckoned_with_is_refused(
+    field: str, value: str, problem: str
+) -> None:
+    at = datetime(2026, 1, 31, tzinfo=timezone.utc)
+    held = Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"),))
+    booked, until = claim_file.format_timestamp(at), claim_file.format_timestamp(at.replace(day=30))
+    claim = Claim(held, "d", "r", ("c",), at, Lease(1, LONGEST_S, at.replace(day=30)))
+    with pytest.raises(InvalidInput) as error:
+        written(claim, (booked if field == "booked" else until, value))
+    assert error.value.faults[0].message == f"'{value}' {problem}"
+
+
+def test_a_claim_of_any_year_survives_its_file() -> None:
+    held = Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"),))
+    claim = Claim(held, "d", "r", ("c",), datetime(7, 1, 31, tzinfo=timezone.utc))
+    assert written(claim) == claim
+
+
 def test_a_topic_names_requesters_of_the_claim_only() -> None:
     inputs = {"point_cloud": (InputTopic("/a", "v"), InputTopic("/b", "v"))}
     claims = [

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import timedelta
-from itertools import combinations
 from random import Random
 from typing import Any
 
 from demandops.config.load import load
 from demandops.decision import Decision, State
-from demandops.demand.application import Application
-from demandops.demand.claim import Claim, demand_id
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.recent_shutdowns import RecentShutdowns
@@ -23,7 +20,8 @@ from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
 from tests.kit.memory import ledger_in
-from tests.model.leases import Goal, Promises, Subject, by_message
+from tests.kit.promises import Maker, claims_of, name_of
+from tests.model.leases import Promises
 from tests.scenarios import running
 
 SLACK_S = 30
@@ -35,136 +33,7 @@ DOMAIN = {
 }
 FILES = running.configuration((), {"policy/access-domains.yaml": {"domains": [DOMAIN]}})
 EMPTY = State.of(load(FILES), Ledger())
-DEMANDS = ("d0", "d1", "D1", "d/2")
-PEOPLE = ("vehicle00", "vehicle01", "station00")
-LEASES = (None, 10, 60, 90)
 PAUSES = (1, 1, 2, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 900, 3600)
-
-
-class Maker:
-    """Makes requests by chance: few demands, people and subjects, so that they meet."""
-
-    def __init__(self, random: Random) -> None:
-        self._random = random
-        self._puts: list[Goal] = []
-        self._shutdowns: list[Goal] = []
-
-    def any(self) -> Goal:
-        kind = self._random.randrange(20)
-        if self._puts and kind < 9:
-            return self._of_known(kind)
-        if kind < 14:
-            self._puts.append(self.put())
-            return self._puts[-1]
-        if kind < 16:
-            return self._named("release" if kind == 14 else "renew")
-        if kind == 19 and self._shutdowns:
-            return self._random.choice(self._shutdowns[-2:])
-        return self._message(shutdown=kind > 17)
-
-    def _of_known(self, kind: int) -> Goal:
-        """Return a renewal of what was put, the same again, the same with another lease."""
-        known = self._random.choice(self._puts[-2:])
-        if kind < 3:
-            return {key: known[key] for key in ("kind", "demand", "requesters")} | {
-                "operation": "renew"
-            }
-        return known if kind < 6 else known | {"lease": self._random.choice(LEASES[1:])}
-
-    def put(self) -> Goal:
-        made = self._named("put")
-        lease = self._random.choice(LEASES)
-        if lease is not None:
-            made["lease"] = lease
-        made["applications"] = [self._application(id) for id in self._some("ab")]
-        made["connections"] = [self._connection(id) for id in self._some("xy")]
-        return made
-
-    def _named(self, operation: str) -> Goal:
-        people = self._some(PEOPLE) or [self._random.choice(PEOPLE)]
-        return {
-            "kind": "Demand",
-            "operation": operation,
-            "demand": self._random.choice(DEMANDS),
-            "requesters": people,
-        }
-
-    def _some(self, of: Any) -> list[Any]:
-        return [one for one in of if self._random.randrange(2)]
-
-    def _application(self, id: str) -> dict[str, Any]:
-        topics = [{"topic": f"/ego{number}", "source": "vehicle00"} for number in self._some("12")]
-        return {
-            "id": id,
-            "type": "object-detection-fusion",
-            # mostly the same: else all contradict each other
-            "node": self._random.choice(["edge", "edge", "edge", "cloud"]),
-            "connect": "none",
-            "inputs": {"ego_data": topics or [{"topic": "/ego3", "source": "vehicle00"}]},
-        }
-
-    def _connection(self, id: str) -> dict[str, Any]:
-        topics = [{"source": f"/{name}"} for name in self._some("pq")]
-        if not self._random.randrange(6):
-            topics = [{"source": "/p", "target": "/elsewhere"}]
-        source = "station00" if not self._random.randrange(6) else "vehicle00"
-        topics = topics or [{"source": "/r"}]
-        return {"id": id, "source": source, "target": "edge", "topics": topics}
-
-    def _message(self, *, shutdown: bool) -> Goal:
-        topics = [f"/{name}" for name in self._some("pq")]
-        topics = topics if shutdown else topics or ["/p"]
-        item = {
-            "id": self._random.choice("xy"),
-            "type": 1,
-            "requester_ids": self._some(PEOPLE) or [PEOPLE[0]],
-            "source_node_id": "vehicle00",
-            "target_node_id": "edge",
-            "source_topics": topics,
-            "target_topics": topics,
-        }
-        request = self._random.choice(["m0", "m1"])
-        made = {"id": request, "shutdown": shutdown, "connections": [item]}
-        if shutdown:
-            self._shutdowns.append(made)
-        return made
-
-
-Name = tuple[str, Subject]
-
-
-MESSAGES = {
-    demand_id(request, who): by_message(request, who)
-    for request in ("m0", "m1")
-    for count in (1, 2, 3)
-    for who in combinations(PEOPLE, count)
-}
-
-
-def name_of(claim: Claim) -> Name:
-    """Return what the model knows a claim by."""
-    demand = MESSAGES.get(claim.demand, claim.demand)
-    return demand, (claim.subject.kind.value, claim.subject.id)
-
-
-def claims_of(world: running.World) -> dict[Name, tuple[dict[str, Any], frozenset[str]]]:
-    found = {}
-    for claim in world.state.ledger:
-        what: dict[str, Any]
-        held = claim.held
-        if isinstance(held, Application):
-            inputs = {
-                role: frozenset((topic.source, topic.topic) for topic in topics)
-                for role, topics in held.inputs.items()
-            }
-            what = {"type": held.appdef, "node": held.node, "inputs": inputs}
-            what["parameters"] = dict(held.parameters)
-        else:
-            topics = {route.source: route.target for route in held.topics}
-            what = {"source": held.source, "target": held.target, "topics": topics}
-            what["holds"] = {one: frozenset(claim.holders((one,))) for one in topics}
-        found[name_of(claim)] = what, frozenset(claim.requesters)
-    return found
 
 
 def restart(world: running.World, random: Random) -> None:
@@ -178,10 +47,10 @@ def restart(world: running.World, random: Random) -> None:
 
 def assert_released(world: running.World, promises: Promises, now: int) -> None:
     """Look at the leases: what must go goes, what may not does not, one commit a demand."""
-    before = set(claims_of(world))
+    before = set(claims_of(world.state.ledger))
     demands = world.look()
     assert len(demands) == len(set(demands))
-    released = before - set(claims_of(world))
+    released = before - set(claims_of(world.state.ledger))
     assert promises.must_go(now) <= released <= promises.may_go(now)
     assert {demand for demand, _ in released} == set(demands)
     promises.gone(released)
@@ -227,7 +96,7 @@ def test_what_was_promised_is_kept(random: Random, length: int) -> None:
         expected = promises.take(goal, now)
         taken = world.take(goal)
         assert_outcome(taken, expected, promises)
-        assert claims_of(world) == promises.claims()
+        assert claims_of(world.state.ledger) == promises.claims()
         assert_recorded(world, promises)
         if isinstance(taken, Decision) and taken.request.adds_claims:
             again = world.take(goal)

@@ -201,9 +201,16 @@ def test_a_written_text_is_read_back_by_every_parser(text: str) -> None:
 
 
 def test_numbers_and_truths_stay_numbers_and_truths() -> None:
-    data = {"a": [1, -1, 0, 1.5, 1e30, 10**20, True, False, None]}
-    written = strict_yaml.dump(data)
-    assert both(written) == [data], written
+    numbers = [1, -1, 0, 1.5, 1e30, -1e-09, 2.5e-300, 10**20, True, False, None]
+    data = {"a": [*numbers, '"1e-09', "e+1e-09"]}
+    for written in (strict_yaml.dump(data), strict_yaml.to_json(data)):
+        assert both(written) == [data], written
+
+
+@pytest.mark.parametrize("number", [float("inf"), float("-inf"), float("nan")])
+def test_a_number_that_json_lacks_is_not_written_as_text(number: float) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        strict_yaml.to_json({"a": [number]})
 
 
 @pytest.mark.parametrize("text", [text for text in UNSEEN if ord(text[0]) < 0xFEFF])
@@ -228,3 +235,9 @@ def test_a_file_that_is_too_long_is_not_parsed() -> None:
     text = "a: [" + "x, " * (strict_yaml.MAX_LENGTH // 3) + "]"
     with pytest.raises(InvalidInput, match="at most 4000000 are allowed"):
         strict_yaml.load(text)
+
+
+@pytest.mark.parametrize("text", ["a: *b\n", "a: [", "a: \x00", "a: b: c"])
+def test_no_key_is_set_in_what_is_no_yaml(text: str) -> None:
+    with pytest.raises(InvalidInput, match="not valid YAML"):
+        strict_yaml.set_key(text, "key", 1)

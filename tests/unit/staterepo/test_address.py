@@ -79,6 +79,10 @@ SCHEME = "a state repo's address cannot start with '{}'; use https, ssh, git or 
         ("-oProxyCommand=touch@x:y", ""),
         ("--upload-pack=touch@x:y", ""),
         ("-x:y", ""),
+        # what no folder can be called
+        ("a" * 5000, f"'{'a' * 79}…' cannot be opened: File name too long"),
+        ("~nobody-of-that-name/x", "'~nobody-of-that-name/x' cannot be opened: Could not"),
+        ("~\0/x", "'~\\x00/x' cannot be opened: embedded null byte"),
         ("HTTPS://user:secret@example.org/x.git", ""),
         ("https://user:se/cret@example.org/x.git", ""),
     ],

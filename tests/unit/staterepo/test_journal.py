@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import json
+import os
+import stat
 from pathlib import Path
 
 import pytest
 from demandops.errors import StateRepoError
-from demandops.staterepo.write.journal import DamagedJournal, Journal, JournalEntry, parse, read
+from demandops.staterepo.write.journal import (
+    DamagedJournal,
+    Journal,
+    JournalEntry,
+    ProposalRecord,
+    parse,
+    read,
+)
+from demandops.staterepo.write.slot import Slot
 
 from tests.kit.limits import files_end_at
 
-PROPOSAL = {"branch": "demand/x", "commits": ["a"]}
+PROPOSAL = ProposalRecord("demand/x", ("a",))
 
 
 def entry(name: str, goal: object = "wish") -> JournalEntry:
@@ -45,6 +55,16 @@ def test_what_was_written_is_read(path: Path, text: bytes) -> None:
     assert found["op-c"].proposal == PROPOSAL
     assert Journal(path).pending == found
     assert len(path.read_bytes().splitlines()) == 2, "what is done is left out at a start"
+
+
+def test_only_its_owner_reads_a_journal(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        Slot(tmp_path / "data" / "repo").close()
+    finally:
+        os.umask(before)
+    for folder in (tmp_path / "data" / "repo", tmp_path / "data" / "repo" / "slot-0"):
+        assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IRWXU
 
 
 def test_a_torn_last_entry_is_dropped(path: Path, text: bytes) -> None:
@@ -162,8 +182,10 @@ def of_the_first_version(*records: dict[str, object]) -> bytes:
     return b"".join(json.dumps(record).encode() + b"\n" for record in records)
 
 
-WAITING = {"operation": "op-1", "goal": {"id": 1}, "received": "2026-01-31T12:00:00", "base": ""}
-PROPOSED = {**WAITING, "operation": "op-2", "proposal": PROPOSAL}
+_AT = "2026-01-31T12:00:00"
+WAITING = {"operation": "op-1", "goal": {"id": 1}, "received": f"{_AT}+00:00", "base": ""}
+PROPOSED = {**WAITING, "operation": "op-2", "proposal": {"branch": "demand/x", "commits": ["a"]}}
+NOT_PROPOSED = ({"branch": "demand/x"}, {"branch": "demand/x", "commits": [], "brunch": ""}, "x")
 
 
 def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:
@@ -178,7 +200,9 @@ def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:
 
 @pytest.mark.parametrize(
     "line",
-    [b"42", b"null", b"{}", b"\x00\xff", b'{"done": []}', b'{"operation": "x"}', b"[" * 9999],
+    [b"42", b"null", b"{}", b"\x00\xff", b'{"done": []}', b'{"operation": "x"}', b"[" * 9999]
+    + [json.dumps(PROPOSED | {"proposal": one}).encode() for one in NOT_PROPOSED]
+    + [json.dumps(WAITING | {"received": _AT}).encode()],
 )
 def test_a_line_that_the_first_version_did_not_write_is_damage(path: Path, line: bytes) -> None:
     with pytest.raises(DamagedJournal, match="line 2 is not what"):

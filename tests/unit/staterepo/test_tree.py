@@ -5,14 +5,16 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 
 import pygit2
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.new_objects import NewObjects
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
-from tests.kit.repo import write_tree
+from tests.kit.repo import git, write_tree
 
 Files = dict[str, str]
 
@@ -144,3 +146,18 @@ def test_a_submodule_has_no_text_and_is_told_as_a_difference(repo: pygit2.Reposi
     tree = repo[builder.write()].peel(pygit2.Tree)
     assert trees.texts(tree, ("top",)) == {"top/f": "x"}
     assert [path for path, _ in trees.differences(None, tree)] == ["top/f", "top/sub"]
+
+
+def test_housekeeping_keeps_a_pack_that_no_reference_leads_to_yet(tmp_path: Path) -> None:
+    repo = pygit2.init_repository(tmp_path, bare=True)
+    new = NewObjects(repo)
+    tree = new.add(pygit2.enums.ObjectType.TREE, b"")
+    people = "A <a@example.org> 1770000000 +0000"
+    text = f"tree {tree}\nauthor {people}\ncommitter {people}\n\nx\n"
+    commit = new.add(pygit2.enums.ObjectType.COMMIT, text.encode())
+    with new.packed(commit):
+        git(tmp_path, "gc", "--prune=now", "--quiet")
+        assert git(tmp_path, "cat-file", "-p", str(commit)) == text.rstrip("\n")
+        repo.references.create("refs/heads/main", commit)
+    git(tmp_path, "gc", "--prune=now", "--quiet")
+    git(tmp_path, "fsck", "--strict")

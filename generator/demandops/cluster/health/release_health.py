@@ -201,9 +201,10 @@ def deployment_health(deployment: Object) -> Health:
     """Return whether all replicas of a Deployment are available with its current spec."""
     metadata, status = deployment["metadata"], deployment.get("status") or {}
     name = name_of(("Deployment", metadata.get("namespace"), metadata.get("name")))
-    wanted = (deployment.get("spec") or {}).get("replicas", 1)
-    current = status.get("observedGeneration", 0) >= metadata.get("generation", 0)
-    updated, available = status.get("updatedReplicas", 0), status.get("availableReplicas", 0)
+    replicas = (deployment.get("spec") or {}).get("replicas")
+    wanted = 1 if replicas is None else replicas
+    current = (status.get("observedGeneration") or 0) >= (metadata.get("generation") or 0)
+    updated, available = status.get("updatedReplicas") or 0, status.get("availableReplicas") or 0
     if current and updated >= wanted and available >= wanted:
         return Health("healthy")
     for kind, bad in (("ReplicaFailure", "True"), ("Progressing", "False")):

@@ -36,7 +36,7 @@ from demandops.service.approvals.proposal import (
 )
 from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
-from demandops.service.ticket import ProposalRecord, Receipt, Ticket, receipt_of
+from demandops.service.ticket import Receipt, Ticket, receipt_of
 from demandops.settings import PROPOSAL_LIMIT
 from demandops.staterepo.git.repository import PushDenied, StateRepository
 from demandops.staterepo.git.signing import SigningFailed
@@ -44,6 +44,7 @@ from demandops.staterepo.history import commit_log
 from demandops.staterepo.history.commit_log import RecordedOutcome
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.write.commit_batch import CommitBatch
+from demandops.staterepo.write.journal import ProposalRecord
 from demandops.staterepo.write.proposal_branch import (
     BranchHeads,
     BranchMoved,
@@ -123,7 +124,7 @@ class Approvals:
             for proposal in [p for p in self._proposals.values() if releases(request, p.requests)]:
                 self._demands.withdraw_proposed(proposal.tickets, RELEASED)
                 self._delete_branch(proposal, self._branches.heads())
-                self._end(proposal, Withdrawn(RELEASED))
+                self._changed.append(proposal.branch)  # the check answers: it may be merged already
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
@@ -160,8 +161,9 @@ class Approvals:
             branch = branch_name(request.demand or request.id, ticket.operation)
             proposal = Proposal(key, ProposalRecord(branch), searched_to=ticket.base)
         elif isinstance(request, Put) and request not in proposal.requests:
-            replaced, proposal.tickets, proposal.requests = proposal.tickets, [], []
-            self._demands.fail(replaced, Withdrawn(REPLACED))
+            # the next check answers these: a person may have merged them meanwhile
+            self._demands.withdraw_proposed(proposal.tickets, REPLACED)
+            proposal.requests = []
         if not self._demands.propose(ticket, proposal.record):
             self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
             return
@@ -237,13 +239,11 @@ class Approvals:
             except BranchMoved as error:
                 log.info("%s; checking again", error)
                 self._changed.append(proposal.branch)
-            except SigningFailed as error:
-                if proposal.record.pushed:  # the existing branch can still be merged
-                    log.warning("%s; %s is not rebuilt", error, proposal.branch)
+            except (SigningFailed, PushDenied) as error:
+                if proposal.tickets and proposal.branch in heads.branches:  # it can be merged
+                    self._runtime.failed(f"rebuilding {proposal.branch}", error)
                 else:
                     self._end(proposal, error)
-            except PushDenied as error:
-                self._end(proposal, error)
         ended = self._runtime.monotonic()
         self._checked_at = str(snapshot.commit)
         self._rest_until = ended + _PAUSE_FACTOR * (ended - self._check_began)

@@ -18,8 +18,9 @@ from demandops.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
 from demandops.forge import PullRequest
 from demandops.quoting import one_line
 from demandops.render.changes.changeset import FileReader
-from demandops.service.ticket import ProposalRecord, Ticket
+from demandops.service.ticket import Ticket
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.write.journal import ProposalRecord
 
 Key = tuple[str, ...]
 Decided: TypeAlias = list[tuple[Ticket, Decision]]

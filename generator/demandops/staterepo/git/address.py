@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from demandops.errors import StateRepoError
+from demandops.quoting import quoted
 from demandops.staterepo.git.local_repository import LocalRepository
 from demandops.staterepo.git.remote_repository import HAS_PASSWORD, Notify, RemoteRepository
 from demandops.staterepo.git.repository import StateRepository
@@ -17,7 +18,11 @@ _ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
 
 def is_url(address: str) -> bool:
     """Return whether this is a Git URL (``https://…``, ``ssh://…``, ``user@host:path``)."""
-    return not Path(address).exists() and bool(_SCHEME.match(address) or _SCP.match(address))
+    try:
+        exists = Path(address).exists()
+    except OSError:  # it is too long for a name, or in a folder that this user cannot read
+        exists = False
+    return not exists and bool(_SCHEME.match(address) or _SCP.match(address))
 
 
 def connect(
@@ -35,8 +40,15 @@ def connect(
     if is_url(address):
         _check_url(address)
         return RemoteRepository(address, folder / "clone.git", notify, allow_offline)
-    path = Path(address).expanduser()
-    if not path.is_dir():
+    try:
+        path = Path(address).expanduser()
+        is_folder = path.is_dir()
+    except (OSError, ValueError, RuntimeError) as error:  # ~x without a user x
+        reason = getattr(error, "strerror", None) or str(error)
+        raise StateRepoError(
+            f"{quoted(address)} cannot be opened: {reason}; name the folder of a state repo"
+        ) from None
+    if not is_folder:
         raise StateRepoError(
             f"{address} does not exist; make a state repo with `demandops init {address} --bare`"
         )

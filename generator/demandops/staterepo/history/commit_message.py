@@ -37,12 +37,14 @@ _MAX_SUBJECT = 90
 _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 
 
+_CRUD = " .,:;\"'\\"  # Git removes these at both ends, and refuses what is empty then
+
+
 def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
     """Return a person and a time, without the characters that Git does not accept."""
-    email = one_line(_UNFIT.sub("", email), _MAX_AUTHOR) or GENERATOR_EMAIL
+    address = one_line(_UNFIT.sub("", email), _MAX_AUTHOR).strip(_CRUD) or GENERATOR_EMAIL
     plain = one_line(name.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
-    plain = plain.strip(" .,:;\"'\\") or "unnamed"
-    return pygit2.Signature(plain, email, int(time.timestamp()), 0)
+    return pygit2.Signature(plain.strip(_CRUD) or "unnamed", address, int(time.timestamp()), 0)
 
 
 def generator_signature(time: datetime) -> pygit2.Signature:

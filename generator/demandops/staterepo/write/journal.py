@@ -17,7 +17,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,23 @@ class DamagedJournal(StateRepoError):
 
 
 @dataclass(frozen=True, slots=True)
+class ProposalRecord:
+    """What the journal keeps of a proposal, enough to resume it.
+
+    ``commits`` are the past, current and next commits of the branch, the newest last; ``base`` is
+    the commit of main below the newest. ``pushed``: the branch existed once. ``link``: its web
+    address. ``withdrawn``: the reason to delete it, or empty.
+    """
+
+    branch: str
+    commits: tuple[str, ...] = ()
+    base: str = ""
+    pushed: bool = False
+    link: str = ""
+    withdrawn: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class JournalEntry:
     """An accepted demand: operation id, goal, time received, and the tip known then.
 
@@ -51,14 +68,13 @@ class JournalEntry:
     goal: Any
     received: str
     base: str
-    proposal: dict[str, Any] | None = None
+    proposal: ProposalRecord | None = None
 
     def record(self) -> dict[str, Any]:
         """Return its content, without copying the goal, which may be deep."""
         record = {field.name: getattr(self, field.name) for field in fields(self)}
-        if self.proposal is None:
-            del record["proposal"]
-        return record
+        del record["proposal"]
+        return record | ({"proposal": asdict(self.proposal)} if self.proposal else {})
 
 
 class Journal:
@@ -271,10 +287,13 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         if record.keys() == {"done"}:
             pending.pop(record["done"], None)
             return
-        entry = JournalEntry(**record)
-        datetime.fromisoformat(entry.received)
+        if proposal := record.pop("proposal", None):
+            proposal = ProposalRecord(**{**proposal, "commits": tuple(proposal["commits"])})
+        entry = JournalEntry(**record, proposal=proposal)
+        if datetime.fromisoformat(entry.received).tzinfo is None:
+            raise ValueError("a time without a zone")
         pending[entry.operation] = entry
-    except (TypeError, AttributeError, RecursionError) as error:
+    except (TypeError, LookupError, AttributeError, RecursionError) as error:
         raise ValueError("not an entry") from error
 
 

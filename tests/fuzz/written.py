@@ -1,0 +1,252 @@
+"""Every place where text becomes something else: the real reader reads the same value back."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import subprocess
+import tempfile
+from datetime import datetime
+from functools import cache
+from pathlib import PurePosixPath
+from random import Random
+from typing import Any
+
+import pygit2
+import pyjson5
+import yaml
+from demandops import naming, strict_yaml
+from demandops.config.load import load
+from demandops.decision import State, try_configuration
+from demandops.demand.claim import ClaimKey
+from demandops.demand.demand_goal import _value_problem
+from demandops.errors import InvalidInput
+from demandops.identifiers import topic_problem
+from demandops.ledger import claim_file
+from demandops.ledger.ledger import Ledger
+from demandops.service.approvals import proposal
+from demandops.staterepo.history import commit_log, commit_message
+from demandops.staterepo.write.proposal_branch import branch_name
+from demandops.subject import Subject, SubjectKind
+from hypothesis import strategies as st
+
+from tests.fuzz import Target
+from tests.kit import rich
+from tests.kit.config import FAST
+from tests.kit.memory import NOW, MemoryRepo
+from tests.unit.ledger.test_claim_file import TRICKY, claims, joined_claims, values
+from tests.unit.ledger.test_claim_file import (
+    test_every_claim_survives_its_file as claim_is_read_back,
+)
+from tests.unit.render.test_inert import TRAPS, UNSEEN
+from tests.unit.render.test_inert import (
+    test_a_written_text_is_read_back_by_every_parser as text_is_read_back,
+)
+from tests.unit.staterepo.conftest import Desk
+from tests.unit.staterepo.test_trailers import IDS
+from tests.unit.staterepo.test_trailers import (
+    test_every_id_is_read_back_by_git_and_by_us_as_it_was as message_is_read_back,
+)
+
+_SOME = [
+    *TRAPS,
+    *UNSEEN,
+    *TRICKY,
+    "../x",
+    "/x",
+    ".git",
+    "a.lock",
+    "-x",
+    "--x=y",
+    "@{",
+    "a~b",
+    "a" * 300,
+]
+TEXT = st.text(st.characters(codec="utf-8"), max_size=40) | st.sampled_from(_SOME)
+_LABEL = re.compile(r"([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?")
+_LABEL_KEY = re.compile(
+    r"([a-z0-9][a-z0-9.-]{0,252}/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?"
+)
+_SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
+_NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
+_LAUNCH = re.compile(r"node_name:=[a-z0-9_]+|__node:=[a-z0-9_]+")
+
+
+def _yaml(text: str) -> Any:
+    return yaml.load(text, Loader=FAST)  # noqa: S506 - derives from SafeLoader
+
+
+def text_in_yaml(text: str) -> None:
+    text_is_read_back(text)
+
+
+def value_in_yaml(value: Any) -> None:
+    written = strict_yaml.dump({"a": value})
+    assert strict_yaml.load(written) == _yaml(written) == {"a": value}
+    assert _yaml(f"a: {strict_yaml.to_json(value)}") == {"a": value}
+    assert pyjson5.decode(strict_yaml.to_json(value)) == value
+
+
+def claim_in_its_file(claim: Any) -> None:
+    claim_is_read_back.hypothesis.inner_test(claim)
+
+
+# ---- rendered files ----
+
+
+def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
+    """Return a rich configuration and a goal in which some texts are others."""
+    seed, texts = given
+    random, files, goal = Random(seed), rich.rich(), rich.own_goal()
+    name = random.choice([path for path in files if path.startswith(("inventory", "registry"))])
+    data = _yaml(files[name])
+    renamed = {old: random.choice(texts) for old in ("vehicle00", "edge") if random.random() < 0.3}
+    for holder, key in _strings(data) + _strings(goal):
+        if random.random() < 0.05:
+            holder[key] = random.choice(texts)
+    files[name] = yaml.safe_dump(data, allow_unicode=True)
+    for old, new in renamed.items():  # an id, everywhere
+        goal = json.loads(json.dumps(goal).replace(json.dumps(old), json.dumps(new)))
+        for path in files:
+            if path.startswith("inventory/"):
+                whole = _yaml(files[path])
+                whole = json.loads(json.dumps(whole).replace(json.dumps(old), json.dumps(new)))
+                files[path] = yaml.safe_dump(whole, allow_unicode=True)
+    goal["connections"][0]["type"] = random.choice(["mqtt", "zenoh", "ros"])
+    return files, goal
+
+
+def _strings(data: Any) -> list[tuple[Any, Any]]:
+    found: list[tuple[Any, Any]] = []
+    for key, value in list(data.items() if isinstance(data, dict) else enumerate(data)):
+        if isinstance(value, str):
+            found.append((data, key))
+        elif isinstance(value, dict | list):
+            found += _strings(value)
+    return found
+
+
+def rendered_file(given: tuple[dict[str, str], Any]) -> None:
+    files, goal = given
+    state = State.of(load(files), Ledger())
+    try_configuration(state)
+    books = MemoryRepo(state=state)
+    for asked in (goal, {**_only(goal, "connections"), "demand": "b"}):
+        try:
+            books.send(asked)
+        except InvalidInput:
+            continue
+    for path, text in books.files.items():
+        _below_its_folder(path)
+        for document in yaml.load_all(text, Loader=FAST):
+            _fits_kubernetes(document)
+
+
+def _only(goal: Any, kept: str) -> Any:
+    return {**copy.deepcopy(goal), "applications": [], kept: copy.deepcopy(goal[kept])}
+
+
+def _fits_kubernetes(document: Any) -> None:
+    metadata = document.get("metadata") or {}
+    pod = (document.get("spec") or {}).get("template") or {}
+    for labels in (metadata.get("labels"), (pod.get("metadata") or {}).get("labels")):
+        for key, value in (labels or {}).items():
+            assert _LABEL_KEY.fullmatch(key) and _LABEL.fullmatch(value), (key, value)
+    if "name" in metadata and document.get("kind") != "ClusterRoleBinding":
+        assert _SUBDOMAIN.fullmatch(metadata["name"]), metadata["name"]
+    for name, content in (document.get("data") or {}).items():
+        if name.endswith((".yaml", ".json5")):
+            assert isinstance(_yaml(content), dict), content
+        if name.endswith(".json5"):
+            assert pyjson5.decode(content) == json.loads(content)
+    for container in (pod.get("spec") or {}).get("containers") or ():
+        for word in container.get("args") or ():
+            assert isinstance(word, str) and word.isprintable(), word
+            assert ":=" not in word or _LAUNCH.fullmatch(word) or word.startswith("params_file"), (
+                word
+            )
+
+
+def _below_its_folder(path: str) -> None:
+    parts = PurePosixPath(path).parts
+    assert str(PurePosixPath(path)) == path and path.isascii() and path.isprintable(), path
+    assert not {"..", ".", ".git", "/"} & {part.lower() for part in parts}, path
+    assert all(len(part) <= 255 for part in parts), path
+
+
+def ledger_path(ids: tuple[str, str]) -> None:
+    for kind in SubjectKind:
+        path = claim_file.path_of(ClaimKey(Subject(kind, ids[0]), ids[1]))
+        _below_its_folder(path)
+        assert claim_file.kind_of(path) is kind, path
+
+
+def name_of_object(ids: tuple[str, str]) -> None:
+    for name in (naming.object_name("od", *ids), naming.object_name("", ids[0])):
+        assert _NAME.fullmatch(name) and len(name) <= naming.MAX_NAME, name
+        assert not topic_problem(f"/{naming.topic_part(*ids)}"), ids
+
+
+# ---- Git and forges ----
+
+
+@cache
+def _repo() -> pygit2.Repository:
+    folder = tempfile.mkdtemp(prefix="demandops-fuzz-")
+    return pygit2.init_repository(folder, bare=True, initial_head="main")
+
+
+def message_in_git(words: tuple[list[str], str, str]) -> None:
+    names, request, application = words
+    inner = message_is_read_back.hypothesis.inner_test
+    inner(Desk(now=NOW), _repo(), names=names, request=request, application=application)
+
+
+def author_in_git(words: tuple[str, str, datetime]) -> None:
+    name, email, time = words
+    repo, who = _repo(), commit_message.signature(name, email, time)
+    oid = repo.create_commit(None, who, who, "x", repo.TreeBuilder().write(), [])
+    lines = repo[oid].read_raw().split(b"\n\n")[0].split(b"\n")
+    assert [line.split(b" ")[0] for line in lines] == [b"tree", b"author", b"committer"]
+    assert re.fullmatch(rb"author [^<>\0]+ <[^<>\0 ]+> -?\d+ [+-]\d{4}", lines[1]), lines[1]
+    assert commit_log.author_of(repo[oid]) == (who.name, who.email)
+
+
+def branch(words: tuple[str, str]) -> None:
+    name = branch_name(*words)
+    command = ["git", "check-ref-format", "--branch", name]
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 0, name
+
+
+def pull_request(words: tuple[str, list[str]]) -> None:
+    message, reasons = words
+    options = proposal.push_options(message, reasons, reasons)
+    assert all("\n" not in one for one in options)
+    body = proposal.pull_request_body(message, reasons)
+    head = body.partition("`" * 3)[0]
+    inside = body[len(head) :].split("\n")
+    closing = [number for number, line in enumerate(inside) if line == inside[-2]]
+    assert closing == [len(inside) - 2], body
+
+
+_PAIR = st.tuples(TEXT, TEXT)
+
+TARGETS = (
+    Target(text_in_yaml, values=TEXT),
+    Target(value_in_yaml, values=values.filter(lambda value: not _value_problem(value, 0))),
+    Target(claim_in_its_file, values=claims | joined_claims()),
+    Target(
+        rendered_file,
+        values=st.tuples(st.integers(), st.lists(TEXT, min_size=1, max_size=3)).map(_filled),
+    ),
+    Target(ledger_path, values=_PAIR),
+    Target(name_of_object, values=_PAIR),
+    Target(
+        message_in_git,
+        values=st.tuples(st.lists(IDS, min_size=1, max_size=3, unique=True), IDS, IDS),
+    ),
+    Target(author_in_git, values=st.tuples(TEXT, TEXT, st.datetimes())),
+    Target(branch, values=_PAIR),
+    Target(pull_request, values=st.tuples(TEXT, st.lists(IDS, max_size=2))),
+)

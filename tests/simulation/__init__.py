@@ -1,0 +1,1 @@
+"""Generators in one thread by a seed, with people and faults: ``make simulate``."""

@@ -1,0 +1,244 @@
+"""One history by a seed: about thirty things that happen, then all is healed and must be right."""
+
+from __future__ import annotations
+
+import shutil
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+
+import pygit2
+import yaml
+from demandops.service.timing.expiry import LONGEST_WAIT_S
+from demandops.staterepo.git.repository import MAIN
+
+from tests.kit import repo
+from tests.kit.promises import Maker, name_of
+from tests.kit.repo import POLICY, GitRepo
+from tests.model.leases import Goal
+from tests.simulation.oracle import SLACK_S, VISITOR, Oracle
+from tests.simulation.world import World
+
+STEPS = 30
+MEMORY = "/dev/shm"
+_RULES = [
+    {"name": "visitors", "requesters": [f"{VISITOR}*"], "approval": "required"},
+    {"name": "residents", "requesters": ["vehicle*", "station*"]},
+]
+_OVERRIDE = """apiVersion: demandops/v1
+kind: Override
+reason: More for a test
+owner: perception-team
+select:
+  - services: ["*"]
+replicas: 2
+"""
+_LONGEST_LEASE_S = 90
+
+
+@lru_cache(maxsize=1)
+def template() -> Path:
+    """Return a state repo in memory with leases and approval; copy it."""
+    path = repo.init(Path(mkdtemp(dir=MEMORY, prefix="simulation-")) / "template.git")
+    policy = yaml.safe_load(GitRepo(path).files()[POLICY])
+    policy["domains"][0] |= {"rules": _RULES, "leases": {"slack": f"{SLACK_S}s"}}
+    GitRepo(path).commit({POLICY: yaml.safe_dump(policy)})
+    repo.git(path, "repack", "-adq")
+    return path
+
+
+class History:
+    """What happens in a world."""
+
+    def __init__(self, world: World) -> None:
+        self.world, self.oracle = world, Oracle(world)
+        self.chance, self.turns = world.turns.chance, world.turns
+        self._maker = Maker(self.chance)
+        self._latest = 0.0
+        self._sent: list[Goal] = []
+
+    def run(self, steps: int) -> None:
+        """Let things happen, then heal everything and check the end."""
+        things = (
+            [self.demand] * 15 + [self.wait] * 4 + [self.edit] * 3 + [self.decide] * 2
+            + [self.crash] * 2 + [self.spoil_network] * 3 + [self.set_clocks]
+        )  # fmt: skip
+        self.turns.sleep(1)
+        for _ in range(steps):
+            self.chance.choice(things)()
+            self.turns.sleep(self.chance.choice([0, 0, 0.01, 0.2, 3]))
+            for machine in self.world.machines:
+                if not machine.is_up and self.chance.randrange(2):
+                    machine.start()
+            self.oracle.check()
+        self.heal()
+        self.oracle.check_end()
+
+    def heal(self) -> None:
+        """Mend everything, decide every proposal, and wait until every lease is over."""
+        for machine in self.world.machines:
+            machine.is_cut_off, machine.delay = False, 0.0
+            machine.crashes_in = machine.losses = machine.rejections = 0
+            if not machine.is_up:
+                machine.start()
+        self.turns.sleep(2 * LONGEST_WAIT_S)
+        self.world.set_clocks(self._latest - self.turns.offset)
+        self.turns.sleep(60)
+        self.oracle.check()
+        for _ in range(3):
+            while self._branches():
+                self.decide()
+            self.turns.sleep(30)
+        self.turns.sleep(3 * (_LONGEST_LEASE_S + SLACK_S) + 120)
+
+    # ---- what happens ----
+
+    def demand(self) -> None:
+        ready = [machine for machine in self.world.machines if machine.generator]
+        if not ready:
+            return
+        machine = self.chance.choice(ready)
+        for _ in range(self.chance.choice([1, 1, 1, 2, 4])):
+            self._sent.append(self._goal())
+            self.oracle.ask(machine, self._sent[-1])
+
+    def _goal(self) -> Goal:
+        kind = self.chance.randrange(8)
+        if kind == 0:
+            return self._visitor()
+        if kind == 1 and self._sent:  # as who waited in vain for an answer
+            return self.chance.choice(self._sent[-6:])
+        if kind == 2:
+            return self._maker._message(shutdown=bool(self.chance.randrange(2)))
+        return self._maker.any()
+
+    def _visitor(self) -> Goal:
+        number = self.chance.randrange(3)
+        made = self._maker.put()
+        made |= {"demand": f"visit{number}", "requesters": [f"{VISITOR}{number}"]}
+        if not self.chance.randrange(4):
+            named = {key: made[key] for key in ("kind", "demand", "requesters")}
+            return named | {"operation": self.chance.choice(["release", "renew"])}
+        topics = [{"topic": f"/ego{self.chance.randrange(3)}", "source": "vehicle00"}]
+        made["applications"] = [
+            {
+                "id": f"visit{number}",
+                "type": "object-detection-fusion",
+                "node": "edge",
+                "connect": "none",
+                "inputs": {"ego_data": topics},
+            }
+        ]
+        return made | {"connections": []}
+
+    def wait(self) -> None:
+        self.turns.sleep(self.chance.choice([0.1, 1, 10, 31, 61, 100, 200, 1000]))
+
+    def crash(self) -> None:
+        machine = self.chance.choice(self.world.machines)
+        if machine.is_up and self.chance.randrange(3):
+            machine.crashes_in = self.chance.randrange(1, 15)
+        elif machine.is_up:
+            machine.crash()
+
+    def spoil_network(self) -> None:
+        machine = self.chance.choice(self.world.machines)
+        kind = self.chance.randrange(7)
+        if kind < 3:
+            machine.losses += self.chance.randrange(1, 4)
+        elif kind == 2:
+            machine.rejections += 1
+        elif kind == 3:
+            machine.is_cut_off = True
+        elif kind == 4:
+            machine.delay = self.chance.choice([0.02, 0.5, 5])
+        else:
+            machine.is_cut_off, machine.delay = False, 0.0
+
+    def set_clocks(self) -> None:
+        """Set the clocks; once set back, not forward again before every machine has seen it.
+
+        Who saw neither may end a lease early that another recorded in between.
+        """
+        self.oracle.check()
+        sign = self.chance.choice([-1, 1]) if self.turns.offset == self._latest else -1
+        self.world.set_clocks(sign * self.chance.choice([60, 600, 4000]))
+        self._latest = max(self._latest, self.turns.offset)
+
+    # ---- people ----
+
+    def edit(self) -> None:
+        edits = (self._override, self._inventory, self._delete_claim, self._delete_claim)
+        self.chance.choice((*edits, self._edit_generated))()
+
+    def _commit(self, changed: dict[str, str | None]) -> str:
+        who = ("Petra Platform", "petra@example.org", int(self.turns.now().timestamp()))
+        return GitRepo(Path(self.world.remote.path)).commit(changed, "By hand\n", who)
+
+    def _files(self, under: str) -> dict[str, str]:
+        return GitRepo(Path(self.world.remote.path)).files(under)
+
+    def _override(self) -> None:
+        path = "overrides/more.yaml"
+        self._commit({path: None if path in self._files("overrides/") else _OVERRIDE})
+
+    def _inventory(self) -> None:
+        path = "inventory/nodes.yaml"
+        data = yaml.safe_load(self._files(path)[path])
+        added = {"id": f"car{len(data['nodes'])}", "type": "vehicle", "cluster": "c-its"}
+        data["nodes"].append(added)
+        self._commit({path: yaml.safe_dump(data)})
+
+    def _delete_claim(self) -> None:
+        self.oracle.check()
+        found = sorted(self.oracle.claims().items())
+        if found:
+            path, claim = self.chance.choice(found)
+            demand, subject = name_of(claim)
+            commit = self._commit({path: None})
+            self.oracle.edits[commit] = lambda books: books._drop(demand, subject)
+
+    def _edit_generated(self) -> None:
+        found = sorted(path for path in self._files("clusters/") if path.endswith(".yaml"))
+        path = self.chance.choice(found)
+        self._commit({path: self.chance.choice([None, "hand: made\n"])})
+
+    def _branches(self) -> list[str]:
+        return sorted(b for b in self.world.remote.branches.local if b.startswith("demand/"))
+
+    def decide(self) -> None:
+        """Merge a proposal, or delete its branch."""
+        if not (branches := self._branches()):
+            return
+        remote, branch = self.world.remote, self.chance.choice(branches)
+        self.oracle.check()
+        ours, theirs = remote.references[MAIN].target, remote.branches[branch].target
+        base = remote.merge_base(ours, theirs)
+        if self.chance.randrange(3):
+            if base == ours:
+                remote.references.create(MAIN, theirs, force=True)
+            elif base != theirs:
+                index = remote.merge_trees(base, ours, theirs)
+                if not index.conflicts:
+                    time = int(self.turns.now().timestamp())
+                    by = pygit2.Signature("Petra Platform", "petra@example.org", time, 0)
+                    tree = index.write_tree(remote)
+                    remote.create_commit(MAIN, by, by, "Merge\n", tree, [ours, theirs])
+            self.oracle.check()
+        remote.branches.delete(branch)
+
+
+def play(seed: int, steps: int = STEPS) -> tuple[str, int, int]:
+    """Play a history; return its last commit, and how many demands and commits it had."""
+    with TemporaryDirectory(dir=MEMORY, prefix="simulation-") as folder:
+        world = World(seed, template(), Path(folder), machines=1 + seed % 3)
+        history = History(world)
+        with world.running():
+            history.run(steps)
+            return world.tip, len(history.oracle.asked), history.oracle.commits
+
+
+def clean_up() -> None:
+    """Remove the template."""
+    shutil.rmtree(template().parent)
+    template.cache_clear()

@@ -1,0 +1,255 @@
+"""What must be so of a history: every commit of main is held against the independent model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import pygit2
+from demandops.demand.claim import Claim
+from demandops.errors import InvalidInput
+from demandops.ledger import claim_file
+from demandops.service import Ticket
+from demandops.staterepo.audit import verification
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.repository import MAIN
+from demandops.staterepo.history.commit_log import PROPOSAL, entry_of
+
+from tests.kit.promises import claims_of, name_of
+from tests.model.leases import Goal, Promises, Subject
+from tests.simulation.world import Machine, World
+
+SLACK_S = 30
+LONGEST_AWAY_S = 600
+VISITOR = "visitor"
+"""Begins the names of those whose demands need approval."""
+
+
+@dataclass(eq=False)
+class Asked:
+    """A demand that was sent, when, and after how many commits of main."""
+
+    goal: Goal
+    machine: Machine
+    ticket: Ticket
+    time: float
+    place: int
+    number: int
+    is_answered: bool = False
+    is_lost: bool = False
+
+    @property
+    def needs_approval(self) -> bool:
+        return any(name.startswith(VISITOR) for name in self.goal.get("requesters", ()))
+
+    @property
+    def subjects(self) -> set[Subject]:
+        """What it is about, the demand by its name too: such demands keep their order."""
+        found = {("demand", self.goal["demand"])} if "demand" in self.goal else set()
+        kinds = ("applications", "connections")
+        return found | {(kind, each["id"]) for kind in kinds for each in self.goal.get(kind, ())}
+
+
+class Oracle:
+    """Follows main and the answers, and fails when one is not as the model says."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.asked: dict[str, Asked] = {}
+        self.edits: dict[str, Callable[[Promises], object]] = {}
+        """What people's commits change of what is booked."""
+        self.commits = 0
+        self._seen = world.tip
+        self._books = Promises(SLACK_S)
+        self._models = [deepcopy(self._books)]
+        self._place: dict[str, int] = {}
+        self._parsed: dict[pygit2.Oid, Claim] = {}
+        self._last: dict[Any, int] = {}
+        self._claims: dict[Any, Any] = {}
+        world.on_start = self._check_resumed
+        world.on_push = lambda: self._guard(self._follow_main)
+
+    def ask(self, machine: Machine, goal: Goal) -> Asked:
+        """Send a demand to a machine and watch for its answer."""
+        turns = self.world.turns
+        turns.pass_(0.001)
+        assert machine.generator is not None
+        ticket = machine.generator.submit(goal)
+        is_ours = goal.get("kind") == "Demand"
+        time = turns.monotonic() if is_ours else self.world.time_of(ticket.received)
+        place, number = len(self._models) - 1, len(self.asked)
+        asked = Asked(goal, machine, ticket, time, place, number)
+        self.asked[ticket.operation] = asked
+        self._watch(asked)
+        return asked
+
+    def check(self) -> None:
+        """Fail if anything that happened should not have."""
+        self._guard(self._follow_main)
+        if self.world.failure is not None:
+            raise self.world.failure
+
+    def claims(self, revision: str = MAIN) -> dict[str, Claim]:
+        """Return the claims of a commit by their files."""
+        tree = trees.commit_of(self.world.remote, revision).tree
+        found = {}
+        for path, blob in trees.blobs(tree, ["ledger"]):
+            if claim_file.kind_of(path):
+                if blob.id not in self._parsed:
+                    self._parsed[blob.id] = claim_file.read(trees.text_of(blob), path)
+                found[path] = self._parsed[blob.id]
+        return found
+
+    # ---- commits ----
+
+    def _follow_main(self) -> None:
+        commit, new = trees.commit_of(self.world.remote, self.world.tip), []
+        by: tuple[Machine, float, float] | None = None
+        while str(commit.id) != self._seen:
+            by = self.world.pushed_by.get(str(commit.id), by)
+            new.append((commit, by))
+            commit = commit.parents[0]
+        self._seen = self.world.tip
+        for commit, by in reversed(new):
+            self._book(commit, by)
+
+    def _book(self, commit: pygit2.Commit, by: tuple[Machine, float, float] | None) -> None:
+        self.commits += 1
+        claims = claims_of(self.claims(str(commit.id)).values())
+        if str(commit.id) in self.edits:
+            self.edits[str(commit.id)](self._books)
+        for operation, is_proposed in self._operations(commit):
+            assert operation not in self._place, f"{operation} is booked twice"
+            self._place[operation] = len(self._models)
+            asked = self.asked.get(operation)
+            if asked is None:
+                assert by is not None
+                self._end_leases(self._claims.keys() - claims.keys(), *by)
+                continue
+            if not asked.needs_approval:
+                self._assert_in_order(asked)
+            time = self.world.turns.monotonic() if is_proposed else asked.time
+            outcome = self._books.take(asked.goal, time)  # type: ignore[arg-type]
+            assert outcome != "refused", f"{operation} is booked, but the model refuses it"
+        expected = self._books.claims()
+        assert claims == expected, f"after {commit.message}\n{claims}\nbut expected\n{expected}"
+        self._claims = claims
+        self._models.append(deepcopy(self._books))
+
+    def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
+        """Return the demands of a commit and of all that it merges, and whether each was proposed.
+
+        The lease of a demand that was proposed starts when it is merged, which is now.
+        """
+        commits = [commit]
+        if len(commit.parents) > 1:
+            walker = self.world.remote.walk(commit.parents[1].id)
+            walker.hide(commit.parents[0].id)
+            commits += walker
+        return [
+            (operation, PROPOSAL in trailers)
+            for each in reversed(commits)
+            if (trailers := entry_of(each).trailers)
+            for operation in trailers.get("Operation-Id", ())
+        ]
+
+    def _end_leases(self, gone: Any, machine: Machine, started: float, time: float) -> None:
+        assert gone, "an operation that nobody asked for"
+        for demand, subject in gone:
+            held, jump = self._books.held[demand][subject], self.world.last_jump
+            assert held.promised is not None and held.seconds is not None, f"{demand}: no lease"
+            # after a jump every lease gets its full term, from those who saw the jump
+            full_term = jump + held.seconds if started < jump else jump
+            least = held.promised if jump < 0 else min(held.promised, full_term)
+            # a known gap: who waited to publish an end that it saw before the clock was set back
+            waited = self.world.last_set_back + LONGEST_AWAY_S > time
+            assert waited or time >= least, f"the lease of {demand} ended {least - time} s early"
+        self._books.gone(gone)
+
+    def _assert_in_order(self, asked: Asked) -> None:
+        for subject in asked.subjects:
+            last = self._last.get((asked.machine, subject), -1)
+            assert last < asked.number, f"{asked.ticket.operation} overtook another on {subject}"
+            self._last[asked.machine, subject] = asked.number
+
+    # ---- answers ----
+
+    def _watch(self, asked: Asked) -> None:
+        asked.ticket.future.add_done_callback(
+            lambda future: self._guard(lambda: self._check_answer(asked))
+        )
+
+    def _guard(self, check: Callable[[], object]) -> None:
+        """Keep a failure for the next check: generators and futures survive most errors."""
+        try:
+            check()
+        except Exception as error:
+            self.world.failure = self.world.failure or error
+
+    def _check_answer(self, asked: Asked) -> None:
+        self._follow_main()
+        asked.is_answered = True
+        operation, error = asked.ticket.operation, asked.ticket.future.exception()
+        place = self._place.get(operation)
+        if error is not None:
+            assert "internal error" not in str(error), error
+            assert place is None, f"{operation} is booked, but was answered {error}"
+            if isinstance(error, InvalidInput) and not asked.needs_approval:
+                self._assert_possible(asked, "refused")
+            return
+        outcome = asked.ticket.future.result().outcome
+        if outcome == "unchanged":
+            self._assert_possible(asked, "unchanged")
+            if deepcopy(self._books).take(asked.goal, asked.time) == "unchanged":  # type: ignore[arg-type]
+                self._books.take(asked.goal, asked.time)  # type: ignore[arg-type]
+        elif asked.needs_approval and place is None:  # taken back, or main had its claims already
+            if outcome != "released":
+                self._assert_possible(asked, "unchanged")
+        else:
+            assert place is not None, f"{operation} is acknowledged, but not on main"
+            if not asked.needs_approval:
+                assert self._last.get(asked.machine, 0) <= place, "acknowledged in another order"
+                self._last[asked.machine] = place
+
+    def _assert_possible(self, asked: Asked, outcome: str) -> None:
+        """Fail unless the model says so in some state between the question and the answer."""
+        states = [*self._models[asked.place :], self._books]
+        said = {deepcopy(state).take(asked.goal, asked.time) for state in states}  # type: ignore[arg-type]
+        assert outcome in said, f"{asked.goal} was answered {outcome}, but the model says {said}"
+
+    # ---- machines ----
+
+    def _check_resumed(self, machine: Machine) -> None:
+        """Fail if a machine forgot a demand at a crash; watch for the other answers."""
+        self._last.pop(machine, None)
+        assert machine.generator is not None
+        tickets = machine.generator._demands._tickets
+        for operation, asked in self.asked.items():
+            if asked.machine is not machine or asked.is_answered or asked.is_lost:
+                continue
+            if operation in tickets:
+                asked.ticket = tickets[operation]
+                self._watch(asked)
+            else:
+                assert asked.ticket.state in ("arrived", "done"), f"{operation} is forgotten"
+                asked.is_lost = True
+
+    def check_end(self) -> None:
+        """Fail unless all is answered and in effect, long after everything was healed."""
+        self.check()
+        tip = self.world.tip
+        left = [op for op, one in self.asked.items() if not (one.is_answered or one.is_lost)]
+        assert not left, f"not answered: {left}"
+        for machine in self.world.machines:
+            assert machine.generator is not None
+            assert machine.generator.operations == (), "the journal has demands"
+            assert str(machine.generator.snapshot.commit) == tip, f"{machine.name} is behind"
+        for asked in self.asked.values():
+            error = asked.is_answered and asked.ticket.future.exception()
+            assert not error or asked.ticket.operation not in self._place, "booked, but refused"
+        leased = [name_of(claim) for claim in self.claims().values() if claim.lease]
+        assert not leased, f"leases did not end: {leased}"
+        (verdict,) = verification.verify(self.world.remote, [tip])
+        assert verdict.holds, verdict

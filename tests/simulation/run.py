@@ -1,0 +1,66 @@
+"""``make simulate``: plays histories for ``SIMULATE_S`` seconds, from ``SEED`` or any.
+
+A history that fails is told with the command that plays it again, and the run goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import random
+import sys
+import time
+import traceback
+from collections import Counter
+from pathlib import Path
+
+from tests.kit import sync
+from tests.kit.repo import NO_GIT_CONFIG
+from tests.simulation.history import clean_up, play
+
+RESULTS = Path("build/simulate.json")
+
+
+def main() -> int:
+    """Play one history if ``HISTORIES=1``, else as many as there is time for; add them up."""
+    os.environ.update(NO_GIT_CONFIG)
+    logging.disable(logging.CRITICAL)
+    sync.force(False)
+    seed = int(os.environ.get("SEED") or random.SystemRandom().randrange(10**9))
+    most = int(os.environ.get("HISTORIES") or 10**9)
+    end = time.monotonic() + float(os.environ.get("SIMULATE_S") or 60)
+    counts = Counter[str](histories=0, demands=0, commits=0, failures=0)
+    try:
+        while time.monotonic() < end and counts["histories"] < most:
+            try:
+                tip, demands, commits = play(seed)
+                counts.update(demands=demands, commits=commits)
+            except Exception:
+                traceback.print_exc(limit=-6)
+                print(f"\nfailed; again: make simulate SEED={seed} HISTORIES=1\n", flush=True)
+                counts["failures"] += 1
+            else:
+                if most == 1:
+                    print(f"the last commit is {tip}")
+            counts["histories"] += 1
+            seed += 1
+    finally:
+        clean_up()
+    before = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    total = Counter(before) + counts
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps(total, indent=2) + "\n")
+    print("this run:", told(counts))
+    print("all runs:", told(total))
+    return 1 if counts["failures"] else 0
+
+
+def told(counts: Counter[str]) -> str:
+    """Return counts as a person reads them."""
+    names = ("histories", "demands", "commits", "failures")
+    return ", ".join(f"{counts[name]} {name}" for name in names)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,179 @@
+"""The simulation is exact, passes, and finds ten faults that are planted for the purpose."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from demandops.decision import Decision
+from demandops.demand.lease import Lease
+from demandops.ledger import claim_file
+from demandops.ledger.recent_shutdowns import RecentShutdowns
+from demandops.service import Receipt
+from demandops.service.approvals.approvals import Approvals
+from demandops.service.evaluation import Evaluator
+from demandops.service.timing.expiry import LeaseExpiry
+from demandops.service.worker import Worker
+from demandops.staterepo.git.remote_repository import RemoteRepository
+from demandops.staterepo.write import journal
+from demandops.staterepo.write.commit_batch import CommitBatch
+
+from tests.simulation.history import clean_up, play
+
+ROOT = Path(__file__).parents[2]
+SEEDS = range(40)
+"""One of these finds each planted fault; most need fewer than five."""
+
+Patch = Callable[[Any, str, Any], None]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cleaned() -> Iterator[None]:
+    yield
+    clean_up()
+
+
+def test_a_seed_decides_all_and_the_told_command_plays_it_again(tmp_path: Path) -> None:
+    (tip, demands, commits), again, other = play(7), play(7), play(8)
+    assert again == (tip, demands, commits) != other
+    assert commits > demands // 3 > 3
+    environment = {"SEED": "7", "HISTORIES": "1", "PYTHONHASHSEED": "3"}
+    paths = os.pathsep.join([str(ROOT), *sys.path])
+    ran = subprocess.run(
+        [sys.executable, "-m", "tests.simulation.run"],
+        cwd=tmp_path,
+        env=os.environ | environment | {"PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert f"the last commit is {tip}\n" in ran.stdout
+    assert '"histories": 1' in (tmp_path / "build" / "simulate.json").read_text()
+
+
+# ---- planted faults ----
+
+
+def acknowledge_before_publishing(patch: Patch) -> None:
+    publish = Worker._publish_commits
+
+    def early(worker: Worker, commits: CommitBatch, results: list[Any]) -> bool:
+        worker._demands.answer([pair for pair in results if isinstance(pair[1], Receipt)])
+        return publish(worker, commits, results)
+
+    patch(Worker, "_publish_commits", early)
+
+
+def forget_the_journal(patch: Patch) -> None:
+    patch(journal, "read", lambda path: {})
+
+
+def leave_the_journal_in_memory(patch: Patch) -> None:
+    write = journal.Journal._write
+    patch(
+        journal.Journal,
+        "_write",
+        lambda made, records, *, durably: write(made, records, durably=False),
+    )
+
+
+def skip_the_search_for_operations(patch: Patch) -> None:
+    patch(Evaluator, "published_before", lambda *_: {})
+
+
+def take_a_repeat_for_another_shutdown(patch: Patch) -> None:
+    patch(RecentShutdowns, "earlier", lambda *_: None)
+
+
+def end_leases_by_the_wall_clock(patch: Patch) -> None:
+    patch(LeaseExpiry, "_has_ended", lambda expiry, claim, now: claim.lease is not None)
+
+
+def follow_nothing(patch: Patch) -> None:
+    def follow(batch: CommitBatch, advance: Any, before: object, now: object) -> None:
+        batch.head = advance.snapshot
+
+    patch(CommitBatch, "follow", follow)
+
+
+def push_on_any_tip(patch: Patch) -> None:
+    publish = RemoteRepository.publish
+    patch(
+        RemoteRepository,
+        "publish",
+        lambda made, expected, commit: publish(made, made.refresh(), commit),
+    )
+
+
+def lose_renewals(patch: Patch) -> None:
+    patch(Lease, "renewed", lambda lease, term, now: lease)
+
+
+def book_again_what_was_approved(patch: Patch) -> None:
+    receipt = Approvals._receipt
+
+    def twice(made: Approvals, ticket: Any, decision: Any, snapshot: Any, recorded: Any) -> Receipt:
+        if isinstance(decision, Decision):
+            batch = CommitBatch(made._repository, snapshot)
+            text = f"Again\n\nOperation-Id: {ticket.operation}\nRender-Version: 2\n"
+            author = batch._objects[snapshot.commit].author
+            batch.commit_files(decision.files, decision.state, text, author, made._runtime.now())
+            batch.publish()
+        return receipt(made, ticket, decision, snapshot, recorded)
+
+    patch(Approvals, "_receipt", twice)
+
+
+def bring_back_what_was_deleted(patch: Patch) -> None:
+    follow = CommitBatch.follow
+
+    def undo(batch: CommitBatch, advance: Any, before: Any, now: Any) -> None:
+        ledger, files = advance.snapshot.state.ledger, {}
+        for claim in before.state.ledger:
+            if ledger.get(claim.key) is None:
+                ledger = ledger.replace(claim.key, claim)
+                files[claim_file.path_of(claim.key)] = claim_file.text_of(claim)
+        follow(batch, advance, before, now)
+        if files:
+            author = batch._objects[advance.snapshot.commit].author
+            state = replace(batch.head.state, ledger=ledger)
+            batch.commit_files(files, state, "Undo\n\nRender-Version: 2\n", author, now)
+
+    patch(CommitBatch, "follow", undo)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        acknowledge_before_publishing,
+        forget_the_journal,
+        leave_the_journal_in_memory,
+        skip_the_search_for_operations,
+        take_a_repeat_for_another_shutdown,
+        end_leases_by_the_wall_clock,
+        follow_nothing,
+        push_on_any_tip,
+        lose_renewals,
+        book_again_what_was_approved,
+        bring_back_what_was_deleted,
+    ],
+    ids=lambda fault: fault.__name__,
+)
+def test_a_planted_fault_is_found(
+    fault: Callable[[Patch], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault(monkeypatch.setattr)
+    for seed in SEEDS:
+        try:
+            play(seed)
+        except AssertionError as error:
+            print(f"found with seed {seed}: {str(error).splitlines()[0]}")
+            return
+    pytest.fail(f"not found with {len(SEEDS)} seeds")

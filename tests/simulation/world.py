@@ -1,0 +1,309 @@
+"""Machines with generators, a remote, and a network and disks that fail, all in one thread.
+
+Generators are the production code. Replaced are only: clock, chance and threads (``Turns``), the
+call of git (a push or a fetch moves a reference, because all clones share one folder of objects),
+and the calls that force a write (a crash keeps of a journal what a disk may have kept).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime, timedelta
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import git
+import pygit2
+from demandops.errors import DemandOpsError, StateRepoError
+from demandops.runtime import Runtime
+from demandops.service import Generator, generator
+from demandops.staterepo.git.remote_repository import RemoteRepository
+from demandops.staterepo.git.repository import MAIN, FetchInterrupted
+from greenlet import getcurrent
+
+from tests.kit.turns import Turns
+
+FETCH_INTERVAL_S = 30.0
+_JOURNAL = "outbox.jsonl"
+
+
+class Machine(Runtime):
+    """A machine with one generator, which may die and start again."""
+
+    def __init__(self, world: World, name: str) -> None:
+        super().__init__()
+        self.world, self.name, self.turns = world, name, world.turns
+        self.now, self.monotonic = self.turns.now, self.turns.monotonic  # type: ignore[method-assign]
+        self.uniform, self.fresh_id = self.turns.uniform, self.turns.fresh_id  # type: ignore[method-assign]
+        self.sleep, self.event = self.turns.sleep, self.turns.event  # type: ignore[method-assign]
+        self.condition = self.turns.condition  # type: ignore[method-assign]
+        self.when_unsound = self.crash
+        self.generator: Generator | None = None
+        self.is_up = False
+        self.threads: list[Any] = []
+        self.folder = world.folder / f"{name}-0"
+        self.disk = Disk(self)
+        self.started_at = 0.0
+        self.crashes_in = self.losses = self.rejections = 0
+        self.is_cut_off, self.delay = False, 0.0
+
+    def start_thread(self, name: str, target: Callable[[], object]) -> Any:
+        self.threads.append(self.turns.start_thread(name, target))
+        return self.threads[-1]
+
+    def start(self) -> None:
+        """Start the generator, as soon as the remote is there if it needs it."""
+        self.is_up = True
+        self.start_thread("start", self._start)
+
+    def _start(self) -> None:
+        while True:
+            try:
+                made = Generator(
+                    self.name, data=self.folder, runtime=self, fetch_interval=FETCH_INTERVAL_S
+                )
+                break
+            except StateRepoError as error:
+                assert "cannot be fetched" in str(error), error
+                self.sleep(5)
+        self.generator, self.started_at = made, self.monotonic()
+        self.world.on_start(self)
+
+    def failed(self, name: str, error: Exception) -> None:
+        """Note what no fault of this world explains."""
+        super().failed(name, error)
+        if not isinstance(error, DemandOpsError):
+            self.world.failure = self.world.failure or error
+
+    def may_crash(self) -> None:
+        """Crash if it is time; then the calling thread never goes on."""
+        if self.crashes_in and getcurrent() in self.threads:
+            self.crashes_in -= 1
+            if not self.crashes_in:
+                self.crash()
+
+    def crash(self) -> None:
+        """Lose all but what the disk keeps, which is moved out of the reach of the dead."""
+        self.world.dead += self.threads
+        self.is_up, self.generator, self.crashes_in = False, None, 0
+        old, self.folder = (
+            self.folder,
+            self.world.folder / f"{self.name}-{next(self.world.numbers)}",
+        )
+        slot = self.folder / "slot-0"
+        slot.mkdir(parents=True)
+        if (text := self.disk.left_of(old / "slot-0")) is not None:
+            slot.joinpath(_JOURNAL).write_bytes(text)
+        clone = old / "slot-0" / "clone.git"
+        if clone.exists() and self.turns.chance.randrange(4):
+            clone.rename(slot / "clone.git")
+        self.disk = Disk(self)
+        self.disk.sync_all(slot)
+        threads, self.threads = self.threads, []
+        self.turns.stop(threads)
+
+
+class Disk:
+    """What a disk kept of a journal: names and contents as of the last forced write."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        self._names: dict[str, int] = {}
+        self._contents: dict[int, bytes] = {}
+
+    def sync(self, path: Path) -> None:
+        """Note what a forced write of a file or a folder made durable; a crash may come around."""
+        self._machine.may_crash()
+        if path.is_dir():
+            self._names = {found.name: found.stat().st_ino for found in path.iterdir()}
+        else:
+            self._contents[path.stat().st_ino] = path.read_bytes()
+        self._machine.may_crash()
+
+    def sync_all(self, folder: Path) -> None:
+        """Note that all in a folder is durable."""
+        for path in (*folder.glob(_JOURNAL), folder):
+            self.sync(path)
+
+    def left_of(self, folder: Path) -> bytes | None:
+        """Return a journal after a crash of the process or of the machine."""
+        chance, path = self._machine.turns.chance, folder / _JOURNAL
+        now = {_JOURNAL: path.stat().st_ino} if path.exists() else {}
+        if chance.randrange(2):  # the process alone: all that was written stays
+            return path.read_bytes() if now else None
+        inode = chance.choice([now, self._names]).get(_JOURNAL)
+        synced = self._contents.get(inode or 0, b"")
+        if inode is None:
+            return None
+        if inode != now.get(_JOURNAL):
+            return synced
+        text = path.read_bytes()
+        if text.startswith(synced):
+            return text[: len(synced) + chance.randrange(len(text) - len(synced) + 1)]
+        return chance.choice([text, synced])
+
+
+class Clone(RemoteRepository):
+    """A clone whose git is a few lines here, on a network that fails."""
+
+    def __init__(self, machine: Machine, folder: Path, allow_offline: bool) -> None:
+        self._machine = machine
+        super().__init__(machine.name, folder, lambda text: None, allow_offline)
+
+    def tidy(self) -> None:
+        """Leave the shared objects alone."""
+
+    def _clone(self, notify: Callable[[str], None]) -> None:
+        shutil.rmtree(self._folder, ignore_errors=True)
+        partial = self._folder.with_name("partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.joinpath("refs").mkdir(parents=True)
+        partial.joinpath("HEAD").write_text("ref: refs/heads/main\n")
+        partial.joinpath("config").write_text(
+            "[core]\n\trepositoryformatversion = 0\n\tbare = true\n"
+            f'[remote "origin"]\n\turl = {self._url}\n'
+        )
+        partial.joinpath("objects").symlink_to(Path(self._machine.world.remote.path) / "objects")
+        with git.Repo(partial) as repo:
+            self._fetch(repo)
+        partial.rename(self._folder)
+
+    def _run_git(
+        self,
+        repo: git.Repo,
+        *command: str,
+        urgent: Callable[[], bool] = lambda: False,
+        timeout: float = 0,
+    ) -> tuple[str, str]:
+        machine, verb = self._machine, command[0]
+        self._wait(urgent, machine.delay)
+        if self._aborted or machine.is_cut_off:
+            raise _failed(command, "fatal: unable to access the remote: Connection refused")
+        if verb == "push" and machine.rejections:
+            machine.rejections -= 1
+            raise _failed(command, "! [remote rejected] (pre-receive hook declined)")
+        if verb == "fsck":
+            return "", ""
+        machine.may_crash()
+        out = getattr(self, f"_{verb.replace('-', '_')}_there")(repo, *command[1:])
+        machine.may_crash()
+        self._wait(urgent, machine.delay)
+        if machine.losses:
+            machine.losses -= 1
+            raise _failed(command, "fatal: the remote end hung up unexpectedly")
+        return out, ""
+
+    def _wait(self, urgent: Callable[[], bool], seconds: float) -> None:
+        end = self._machine.monotonic() + seconds
+        while not self._aborted:
+            if urgent():
+                raise FetchInterrupted("the fetch was interrupted by a demand")
+            left = end - self._machine.monotonic()
+            self._machine.sleep(min(max(left, 0), 0.5))
+            if left <= 0:
+                return
+
+    def _fetch_there(self, repo: git.Repo, *arguments: str) -> str:
+        source, target = arguments[-1].removeprefix("+").split(":")
+        tip = self._machine.world.remote.references[source].target
+        pygit2.Repository(repo.git_dir).references.create(target, tip, force=True)
+        return ""
+
+    def _ls_remote_there(self, repo: git.Repo, *arguments: str) -> str:
+        references = self._machine.world.remote.references
+        wanted = [each.rstrip("*") for each in arguments[2:]]
+        found = [name for name in references if any(name.startswith(each) for each in wanted)]
+        return "\n".join(f"{references[name].target}\t{name}" for name in sorted(found))
+
+    def _push_there(self, repo: git.Repo, *arguments: str) -> str:
+        references = self._machine.world.remote.references
+        (lease,) = [each for each in arguments if each.startswith("--force-with-lease=")]
+        reference, _, expected = lease.partition("=")[2].partition(":")
+        commit = arguments[-1].split(":")[0]
+        now = str(references[reference].target) if reference in references else ""
+        if now != expected:
+            raise _failed(arguments, f"! [rejected] {reference} (stale info)")
+        if not commit:
+            references.delete(reference)
+            return ""
+        if reference == MAIN:
+            if not self._machine.world.remote.descendant_of(commit, now):
+                self._machine.world.failure = AssertionError("history was rewritten")
+            self._machine.world.pushed_by[commit] = (
+                self._machine,
+                self._machine.started_at,
+                self._machine.monotonic(),
+            )
+        references.create(reference, commit, force=True)
+        self._machine.world.on_push()
+        return ""
+
+
+def _failed(command: tuple[str, ...], text: str) -> git.GitCommandError:
+    return git.GitCommandError(list(command), 128, text.encode())
+
+
+class World:
+    """Machines that share a remote; everything in it follows from the seed."""
+
+    def __init__(self, seed: int, template: Path, folder: Path, machines: int) -> None:
+        self.turns, self.folder, self.numbers = Turns(seed), folder, count(1)
+        self.remote = pygit2.Repository(str(shutil.copytree(template, folder / "remote.git")))
+        self.pushed_by: dict[str, tuple[Machine, float, float]] = {}
+        """Who pushed a tip of main, when it had started, and when it did."""
+        self.dead: list[Any] = []
+        self.on_start: Callable[[Machine], object] = lambda machine: None
+        self.failure: Exception | None = None
+        """What must not happen, if it did."""
+        self.on_push: Callable[[], object] = lambda: None
+        self.machines = [Machine(self, f"machine{number}") for number in range(machines)]
+        self.last_set_back = -1000.0
+        self.last_jump = -1.0
+        """When the clocks were set forward the last time."""
+
+    @property
+    def tip(self) -> str:
+        """The newest commit of main."""
+        return str(self.remote.references[MAIN].target)
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Let the machines run, with the doors of this world."""
+        by_name = {machine.name: machine for machine in self.machines}
+
+        def connect(address: str, folder: Path, notify: object, *, allow_offline: bool) -> Clone:
+            return Clone(by_name[address], folder / "clone.git", allow_offline)
+
+        def sync(handle: int) -> None:
+            path = Path(f"/proc/self/fd/{handle}").readlink()
+            for machine in self.machines:
+                if path.is_relative_to(machine.folder / "slot-0") and "clone.git" not in path.parts:
+                    machine.disk.sync(path)
+
+        before = generator.connect, os.fsync, os.fdatasync
+        generator.connect, os.fsync, os.fdatasync = connect, sync, sync  # type: ignore[assignment]
+        try:
+            for machine in self.machines:
+                machine.start()
+            yield
+        finally:
+            generator.connect, os.fsync, os.fdatasync = before
+            for machine in self.machines:
+                self.dead += machine.threads
+            self.turns.end(self.dead)
+
+    def set_clocks(self, seconds: float) -> None:
+        """Set the wall clock of all machines, as one time server does."""
+        self.turns.set_by(seconds)
+        if seconds > 0:
+            self.last_jump = self.turns.monotonic()
+        else:
+            self.last_set_back = self.turns.monotonic()
+
+    def time_of(self, moment: datetime) -> float:
+        """Return the seconds of a wall clock's time, to be compared only."""
+        return (moment - datetime(2026, 1, 1, tzinfo=moment.tzinfo)) / timedelta(seconds=1)
