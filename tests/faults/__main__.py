@@ -123,7 +123,10 @@ def _report(results: list[Result], seconds: float) -> None:
         name = " ".join((result.part, *result.where))
         by_class.setdefault(name, Counter()).update(result.problems or ("sound",))
     OUT.parent.mkdir(exist_ok=True)
-    OUT.write_text(json.dumps(by_class, indent=1, sort_keys=True))
+    in_all = json.loads(OUT.read_text()) if OUT.exists() else {}  # runs add up
+    for name, verdicts in by_class.items():
+        in_all[name] = Counter(in_all.get(name, {})) + verdicts
+    OUT.write_text(json.dumps(in_all, indent=1, sort_keys=True))
     for name, verdicts in sorted(by_class.items()):
         told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
         print(f"{name}: {told}")
