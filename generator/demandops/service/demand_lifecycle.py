@@ -57,7 +57,7 @@ class Demands:
     """
 
     def __init__(
-        self, journal: Journal, limit: int, requester_limit: int, runtime: Runtime
+        self, journal: Journal, limit: int, requester_limit: int | None, runtime: Runtime
     ) -> None:
         self._journal = journal
         self._limit, self._requester_limit = limit, requester_limit
@@ -66,7 +66,7 @@ class Demands:
         resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
         self._arrived: list[Ticket] = []
-        self._waiting = FairQueue()
+        self._waiting = FairQueue(in_order=requester_limit is None)
         for ticket in resumed:
             if ticket.proposal is None:
                 self._enqueue(ticket)
@@ -168,9 +168,10 @@ class Demands:
                     f"{self._limit} demands are waiting already{why}; send it again later"
                 )
             who = requester_of(ticket.goal)
-            if self._of_requester[who] >= self._requester_limit:
+            limit = self._requester_limit
+            if limit is not None and self._of_requester[who] >= limit:
                 raise QueueFull(
-                    f"{self._requester_limit} demands of {quoted(who)} have no answer yet; send it "
+                    f"{limit} demands of {quoted(who)} have no answer yet; send it "
                     "again later, or raise the node's parameter requester_queue_limit"
                 )
             self._of_requester[who] += 1

@@ -1,9 +1,10 @@
 """The queue of waiting demands: requesters take turns, and what belongs together keeps its order.
 
 A demand belongs to its first requester. Demands that share an application, a connection or a demand
-id keep their order. So if the turn comes to a demand that must follow another one, that one is
-taken in its place. A rollback or a decommission may touch anything: nothing overtakes it, and it
-overtakes nothing.
+id keep their order, and so do goals of the reference's action that share a requester: whether a
+shutdown repeats another depends on what was joined in between. If the turn comes to a demand that
+must follow another one, that one is taken in its place. A rollback or a decommission may touch
+anything: nothing overtakes it, and it overtakes nothing.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ class _Place:
 
 
 class FairQueue:
-    """Demands that wait; not thread-safe."""
+    """Demands that wait; not thread-safe. With ``in_order`` all keep their order."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, in_order: bool = False) -> None:
+        self._in_order = in_order
         self._places: dict[Ticket, _Place] = {}
         self._lanes: dict[str, deque[_Place]] = {}
         self._subjects: dict[tuple[str, str], deque[_Place]] = {}
@@ -48,7 +50,8 @@ class FairQueue:
         self._arrived += 1
         place = _Place(self._arrived, ticket, subjects_of(ticket.goal))
         self._places[ticket] = place
-        self._lanes.setdefault(requester_of(ticket.goal), deque()).append(place)
+        lane = "" if self._in_order else requester_of(ticket.goal)
+        self._lanes.setdefault(lane, deque()).append(place)
         for subject in place.subjects or ():
             self._subjects.setdefault(subject, deque()).append(place)
         if place.subjects is None:
@@ -112,14 +115,17 @@ def _first(places: deque[_Place]) -> _Place | None:
 def requester_of(goal: Any) -> str:  # noqa: ANN401 - plain data
     """Return the first requester in a goal, which may be invalid, or an empty text."""
     fields = goal if isinstance(goal, dict) else {}
-    bodies = (app.get("object_detection_fusion_app") for app in _items(fields, "apps"))
-    named = [
-        fields.get("requesters"),
-        *(body.get("requester_ids") for body in bodies if isinstance(body, dict)),
-        *(each.get("requester_ids") for each in _items(fields, "connections")),
-    ]
-    lists = (names for names in named if isinstance(names, list))
-    return next((name for names in lists for name in names if isinstance(name, str)), "")
+    own = fields.get("requesters")
+    names = own if isinstance(own, list) else _requesters(fields)
+    return next((name for name in names if isinstance(name, str)), "")
+
+
+def _requesters(goal: dict[str, Any]) -> Iterator[Any]:
+    """Yield the requesters of a goal of the reference's action."""
+    bodies = (app.get("object_detection_fusion_app") for app in _items(goal, "apps"))
+    for item in (*bodies, *_items(goal, "connections")):
+        names = item.get("requester_ids") if isinstance(item, dict) else None
+        yield from names if isinstance(names, list) else ()
 
 
 def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401 - plain data
@@ -131,6 +137,7 @@ def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401
     found += [("application", each.get("id")) for each in headers if isinstance(each, dict)]
     for kind in ("application", "connection"):
         found += [(kind, each.get("id")) for each in _items(goal, f"{kind}s")]
+    found += [("requester", name) for name in _requesters(goal)]
     return frozenset((kind, id) for kind, id in found if isinstance(id, str))
 
 

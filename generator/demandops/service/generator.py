@@ -42,7 +42,7 @@ class Generator:
         *,
         data: Path | None = None,
         queue_limit: int = settings.QUEUE_LIMIT,
-        requester_limit: int = settings.REQUESTER_QUEUE_LIMIT,
+        requester_limit: int | None = settings.REQUESTER_QUEUE_LIMIT,
         start_offline: bool = True,
         with_targets: bool = False,
         fetch_interval: float = 0.0,
@@ -56,7 +56,8 @@ class Generator:
             state_repo: a folder with a bare repository, or a URL that git clones.
             data: the folder for journal and clone; by default :func:`settings.data_home`.
             queue_limit: how many demands may be queued.
-            requester_limit: how many of them may be of one requester.
+            requester_limit: how many of them may be of one requester; None if there is one client,
+                whose demands keep their order.
             start_offline: whether to start from the last fetch if the remote cannot be reached.
             with_targets: whether receipts list the releases that a demand needs.
             fetch_interval: seconds between two fetches while no demand comes; 0: never, except

@@ -134,7 +134,7 @@ def test_a_tip_that_cannot_be_read_is_told_once_and_tried_again_with_pauses(
         missing = pygit2.Oid(raw=b"\x11" * 20)
         _commit_by_hand(bare, _with_entry_in_overrides(bare, b"gone.yaml", missing))
         rig.wait_until(lambda: generator.failures, "the failure is shown")
-        assert list(generator.failures) == ["writer"]
+        assert "writer" in generator.failures
         with pytest.raises(StateRepoError, match="internal error of the generator: KeyError"):
             rig.receipt(generator.submit(goal(2)))
         assert caplog.text.count("Traceback") == 1

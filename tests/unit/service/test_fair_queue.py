@@ -43,6 +43,23 @@ def test_the_turn_goes_to_what_a_demand_must_follow() -> None:
     assert order(*waiting) == ["a0", "a2", "a1", "b0"]
 
 
+def reference(name: str, subject: str, *who: str) -> Ticket:
+    connection = {"id": subject, "requester_ids": list(who)}
+    return Ticket(name, {"id": name, "connections": [connection]}, NOW)
+
+
+def test_goals_of_the_reference_that_share_a_requester_keep_their_order() -> None:
+    waiting = (reference("a0", "x", "a"), reference("a1", "y", "a", "b"), reference("b0", "z", "b"))
+    assert order(*waiting) == ["a0", "a1", "b0"]
+
+
+def test_demands_of_one_client_keep_their_order() -> None:
+    queue = FairQueue(in_order=True)
+    for each in (ticket("a0", "a", "x"), ticket("a1", "a", "y"), ticket("b0", "b", "z")):
+        queue.append(each)
+    assert [queue.popleft().operation for _ in range(3)] == ["a0", "a1", "b0"]
+
+
 def test_nothing_overtakes_what_may_touch_anything() -> None:
     everything = Ticket("all", {"kind": "Decommission", "name": "vehicle01"}, NOW)
     waiting = (ticket("a0", "a", "x"), ticket("a1", "a", "y"), everything, ticket("b0", "b", "z"))

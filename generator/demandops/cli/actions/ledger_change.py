@@ -13,7 +13,6 @@ from demandops.cli.views.diff import release_lines
 from demandops.decision import Decision
 from demandops.errors import Fault
 from demandops.service import Generator
-from demandops.settings import QUEUE_LIMIT
 
 
 @contextmanager
@@ -26,7 +25,7 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
         with progress("reading the ledger") as report:
             generator = Generator(
                 state_repo,
-                requester_limit=QUEUE_LIMIT,  # there is no other client
+                requester_limit=None,
                 start_offline=False,
                 signing_key=signing_key,
                 progress=report,
