@@ -145,9 +145,11 @@ class Oracle:
         """
         commits = [commit]
         if len(commit.parents) > 1:
-            walker = self.world.remote.walk(commit.parents[1].id)
-            walker.hide(commit.parents[0].id)
-            commits += walker
+            remote, main = self.world.remote, commit.parents[0].id
+            walker = remote.walk(commit.parents[1].id)
+            walker.hide(main)
+            # libgit2 does not hide all of them if a clock was set back in between
+            commits += [one for one in walker if not remote.descendant_of(main, one.id)]
         return [
             (operation, PROPOSAL in trailers)
             for each in reversed(commits)
