@@ -108,6 +108,7 @@ def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
 
 def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, further: int) -> None:
     files = configuration()
+    files["demandops.yaml"] += "limits: {demandItems: 100000, fileBytes: 10000000}\n"
     files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster, vehicles + further)
     regions = sorted({_region(number, edges_per_cluster) for number in range(edges)})
     clusters = [{"name": region} for region in regions]

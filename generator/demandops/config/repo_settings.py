@@ -105,7 +105,7 @@ class Limits(CamelModel):
     Kubernetes stores no object above 1.5 MB.
     """
 
-    demand_items: Positive = 10_000
+    demand_items: Positive = 20_000
     parameter_bytes: Positive = 100_000
     file_bytes: Positive = 1_000_000
 
