@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 
-from demandops.quoting import quoted
+from demandops.quoting import is_visible, quoted
 
 MAX_ID = 1024
 """The longest id, in characters; file and object names are shortened and hashed."""
@@ -45,9 +45,9 @@ def id_problem(value: str) -> str:
         return f"{quoted(value)} holds '..'; choose an id without it"
     if value != value.strip():
         return f"{quoted(value)} starts or ends with white space; remove it"
-    control = control_character(value)
-    if control:
-        return f"{quoted(value)} holds the control character {control}; choose an id without it"
+    if not is_visible(value):
+        char = next(char for char in value if not is_visible(char))
+        return f"{quoted(value)} holds U+{ord(char):04X}, which nobody sees; choose an id without it"
     return ""
 
 

@@ -30,7 +30,7 @@ TRAPS = [
     "2026-01-31", "2026-01-31T12:00:00Z", "<<", "=", "-", "?", ":", "- a", "? a", "a: b", "a #b",
     "#a", "&a", "*a", "!a", "%a", "@a", "`a", "|", ">", "[a", "]a", "{a", "}a", ",a", "'", '"',
     "'a'", '"a"', "---", "--- a", "\\", "\\n", "{{ a }}", "{% a %}", "{# a #}", "${a}", "$(a)",
-    "é", "车辆", "🚗", "a\u00a0b", "a\u200bb", "\u00ad", "a\ufeffb", "\ufffd", "e\u0301", "מכונית",
+    "é", "车辆", "🚗", "\ufffd", "e\u0301", "מכונית",
     """it's "quoted" `so`""", "`touch /tmp/x`", "{% for i in range(9) %}x{% endfor %}",
     '{{ .Values.image }}{{ fail "x" }}', "${HOME}${undefined}", "!!python/object/apply:os.system",
     "[a, {b: c}]", "\\n\\u0041\\x41", "%s%n{0}", "[red]a[/red]", ":car:", "--upload-pack=touch",
@@ -40,7 +40,8 @@ TRAPS = [
 UNSEEN = [
     "...", "\u2028", "\u2029", "\u0085", "\x7f", "\x0b", "\x0c", "\x1c", "\x1e", "\b", "\0",
     "\t", "\r", "\n", "\r\n", "a\u2028b\n", "a\nb\n", "a\n\nb\n", " a\n b\n", "a \n", "\na",
-    "a\n\n", "\ufeff", "\ufffe", "\uffff", "\x9f", "\U0010ffff",
+    "a\n\n", "\ufffe", "\uffff", "\x9f", "\U0010ffff", "a\u00a0b", "a\u200bb", "\u00ad",
+    "a\ufeffb", "a\u3164b",
 ]  # fmt: skip
 
 
@@ -213,7 +214,7 @@ def test_a_number_that_json_lacks_is_not_written_as_text(number: float) -> None:
         strict_yaml.to_json({"a": [number]})
 
 
-@pytest.mark.parametrize("text", [text for text in UNSEEN if ord(text[0]) < 0xFEFF])
+@pytest.mark.parametrize("text", UNSEEN[1:])
 def test_what_no_reader_would_see_is_refused_in_an_id(text: str) -> None:
     assert MemoryRepo().faults(goal([], [connection(f"a{text.strip('ab ')}b")]))
 

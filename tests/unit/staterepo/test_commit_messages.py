@@ -9,7 +9,6 @@ import pygit2
 import pytest
 from demandops.errors import fault
 from demandops.identifiers import id_problem
-from demandops.quoting import escaped, is_visible
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.staterepo.history import commit_log, commit_message
 
@@ -147,7 +146,7 @@ def test_a_subject_line_stays_short_however_long_the_ids(desk: Any) -> None:
 NASTY = [
     *("<script>", "Ada <ada@example.org>", ">", "<>", ".", ". . .", ",", ";:,.", "'", '"', "\\"),
     *("\\\\", '"\\\'"', "-", "--author=x", "#1", "日本 電気", "Ωμέγα", "🚗🚙", "e\u0301", "\u00e9"),
-    *("\u200bx", "\u00ad", "a\u00a0b", "x" * 300, "ü" * 300, "🚗" * 300, "a, b", "key: value"),
+    *("x" * 300, "ü" * 300, "🚗" * 300, "a, b", "key: value"),
     *("Requester: somebody else", "(cherry picked from commit 12ab)", "---", "diff --git a/x b/x"),
     *("%H", "$(touch /tmp/x)", "{{ 7 * 7 }}", "station00/a b", "vehicle_00", "Signed-off-by"),
     *("a  b", "%(trailers)"),
@@ -182,10 +181,7 @@ def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly
     fsck = subprocess.run(command, capture_output=True, text=True, check=False)
     form = "--format=%(trailers:key=Requester,valueonly)%x1e"
     read_back = git(repo.path, "log", "--reverse", form).split("\n\x1e\n")
-    unlike = {name: f'"{escaped(name)}"' for name in commits if not is_visible(name)}
-    assert list(unlike) == ["\u200bx", "\u00ad", "a\u00a0b"]
-    wanted = [unlike.get(name, name) for name in commits]
-    assert [name.removesuffix("\n\x1e") for name in read_back] == wanted
+    assert [name.removesuffix("\n\x1e") for name in read_back] == commits
     assert (fsck.returncode, fsck.stdout, fsck.stderr) == (0, "", "")
     assert failed == []
 
