@@ -47,7 +47,9 @@ def id_problem(value: str) -> str:
         return f"{quoted(value)} starts or ends with white space; remove it"
     if not is_visible(value):
         char = next(char for char in value if not is_visible(char))
-        return f"{quoted(value)} holds U+{ord(char):04X}, which nobody sees; choose an id without it"
+        return (
+            f"{quoted(value)} holds U+{ord(char):04X}, which nobody sees; choose an id without it"
+        )
     return ""
 
 

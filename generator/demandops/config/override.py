@@ -1,7 +1,7 @@
 """Overrides: a person's declared deviations, one file each in ``overrides/``.
 
 This module has the model and the rules for one override. Conflicts between two are in
-:mod:`demandops.config.cross_check`, effects on releases and claims in ``plan/overrides``.
+:mod:`demandops.config.override_conflicts`, effects on releases and claims in ``plan/overrides``.
 """
 
 from __future__ import annotations

@@ -10,14 +10,14 @@ from itertools import product
 from typing import Any
 
 from demandops.config.config import Config
-from demandops.config.cross_check import (
+from demandops.config.load import load
+from demandops.config.override import Override, OverrideFile, Selector, merge_patch
+from demandops.config.override_conflicts import (
     can_meet,
     contested_effects,
     patches_commute,
     patterns_overlap,
 )
-from demandops.config.load import load
-from demandops.config.override import Override, OverrideFile, Selector, merge_patch
 from demandops.config.policy import matches
 from demandops.plan.overrides.claim_overrides import Traits, fits
 from demandops.plan.overrides.release_overrides import apply_effects, effects_on
