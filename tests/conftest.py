@@ -20,7 +20,7 @@ from tests.kit.generator import running
 from tests.kit.processes import Drivers
 from tests.kit.repo import GitRepo, Person
 
-_LIMIT_S = 30.0
+_LIMIT_S = 600.0
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -72,7 +72,7 @@ def git_environment(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv(name, value)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def limited(request: pytest.FixtureRequest) -> Iterator[None]:
     """Turn a deadlock into a failure, with the stack of every thread."""
     marker = request.node.get_closest_marker("limit")

@@ -16,6 +16,11 @@ from tests.kit.ros import reserved
 pytest.register_assert_rewrite("tests.e2e.common.answers", "tests.e2e.common.steps")
 
 
+@pytest.fixture(autouse=True)
+def limited() -> None:
+    """Set no limit: each wait here has its own."""
+
+
 @pytest.fixture(scope="session")
 def say(request: pytest.FixtureRequest) -> Report:
     return uncaptured(request.config)

@@ -12,8 +12,8 @@ from tests.kit.repo import Person
 
 
 @pytest.fixture(autouse=True)
-def _isolated(git_environment: None, limited: None) -> None:
-    """Apply both to every test."""
+def _isolated(git_environment: None) -> None:
+    """Commit as Petra in every test."""
 
 
 @pytest.fixture

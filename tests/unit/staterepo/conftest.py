@@ -46,5 +46,5 @@ def repo(tmp_path: Path) -> pygit2.Repository:
 
 
 @pytest.fixture(autouse=True)
-def _isolated(git_environment: None, limited: None) -> None:
+def _isolated(git_environment: None) -> None:
     """Use git as Petra, and end within a limit."""
