@@ -47,4 +47,4 @@ def repo(tmp_path: Path) -> pygit2.Repository:
 
 @pytest.fixture(autouse=True)
 def _isolated(git_environment: None) -> None:
-    """Use git as Petra, and end within a limit."""
+    """Commit as Petra in every test."""
