@@ -5,8 +5,6 @@ proven before it. The second way relies on object ids, and on plans and files th
 input only. It does not trust which releases the generator considered affected: it plans and renders
 every release again if any input of its plan changed (:mod:`demandops.plan.traced_plan`), and
 compares every file that differs in Git. The first and the last commit are proven whole.
-
-A commit may change generated files and the claims that its message names, and no others.
 """
 
 from __future__ import annotations
@@ -18,11 +16,9 @@ import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.config.config import CONFIG_ROOTS
-from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, rendered_files
-from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.errors import InvalidInput, StateRepoError
-from demandops.ledger import claim_file, ended_override_file, recent_shutdowns
+from demandops.ledger import ended_override_file
 from demandops.ledger.ledger import ClaimChange
 from demandops.ledger.world import World
 from demandops.plan.release import Release
@@ -32,18 +28,12 @@ from demandops.render import release_file
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
+from demandops.staterepo.audit.permitted_changes import disallowed_files
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import PROPOSAL, LogEntry, entry_of
 from demandops.staterepo.load import ledger_files, state_in_effect
 
 _CHARTS = "/_charts/"
-_OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
-_RECORDING = ("shutdown", "join", "rollback")
-"""Operations that may record or forget recent shutdowns."""
-_REWRITING = ("follow", "upgrade")
-"""Operations that may write a claim anew: its lease starts, or its schema changes."""
-_ENDING = ("follow", "upgrade", "expire-override")
-"""Operations that may add or remove the marker of an ended override."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +138,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         if verdict.skipped:
             yield verdict
             continue
-        verdict = replace(verdict, touched=tuple(sorted(_disallowed_files(commit, entry))))
+        verdict = replace(verdict, touched=tuple(sorted(disallowed_files(commit, entry))))
         before, proof = proof, None  # it stays None if the commit cannot be read
         try:
             if whole or place == len(commits) or entry.first("In-Force"):
@@ -218,57 +208,3 @@ def _generated_files(tree: Tree) -> dict[str, Oid]:
 
 def _blob(text: str) -> Oid:
     return pygit2.hash(text.encode())
-
-
-def _disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
-    """Yield the files that a commit changed although its message does not account for them.
-
-    These are files that people write, claims of demands that the message does not name, and claims
-    that are not formatted as the generator writes them.
-    """
-    if not commit.parents:
-        return
-    before, operation = commit.parents[0].tree, entry.first("Operation")
-    named = _named(entry)
-    for path, blob in trees.differences(before, commit.tree):
-        root = path.split("/", 1)[0]
-        if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
-            continue
-        if root != claim_file.LEDGER_ROOT:
-            yield path
-        elif path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
-            text = trees.read_text(commit.tree, path) or ""
-            if operation not in _ENDING or (blob and not ended_override_file.read({path: text})):
-                yield path
-        elif path.startswith(f"{recent_shutdowns.SHUTDOWNS_ROOT}/"):
-            if operation not in _RECORDING:
-                yield path
-        elif path.rsplit("/", 1)[-1] in named:
-            if blob and not _is_canonical(commit, path):
-                yield path
-        elif operation not in _REWRITING or not _only_rewrites(commit, path):
-            yield path
-
-
-def _named(entry: LogEntry) -> set[str]:
-    demands = {*entry.trailers.get("Demand-Id", ())}
-    for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
-        demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
-    return {f"{claim_file.segment(demand)}.yaml" for demand in demands}
-
-
-def _only_rewrites(commit: Commit, path: str) -> bool:
-    """Return whether a claim changed only its schema, or its lease started after approval."""
-    before, after = (
-        ledger_files.valid_claim_at(one.tree, path) for one in (commit.parents[0], commit)
-    )
-    if before is None or after is None:
-        return False
-    if before.lease and after.lease and after.lease.has_started > before.lease.has_started:
-        before = replace(before, lease=replace(before.lease, until=after.lease.until))
-    return before == after and _is_canonical(commit, path)
-
-
-def _is_canonical(commit: Commit, path: str) -> bool:
-    claim = ledger_files.valid_claim_at(commit.tree, path)
-    return claim is not None and claim_file.text_of(claim) == trees.read_text(commit.tree, path)

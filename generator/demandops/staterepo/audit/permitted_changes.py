@@ -1,0 +1,78 @@
+"""Which files a commit of the generator may change: generated ones and what its message names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from pygit2 import Commit
+
+from demandops.config.repo_settings import ROOT_FILE
+from demandops.demand.claim import OVERRIDE_PREFIX
+from demandops.ledger import claim_file, ended_override_file, recent_shutdowns
+from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.history.commit_log import LogEntry
+from demandops.staterepo.load import ledger_files
+
+_OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
+_RECORDING = ("shutdown", "join", "rollback")
+"""Operations that may record or forget recent shutdowns."""
+_REWRITING = ("follow", "upgrade")
+"""Operations that may write a claim anew: its lease starts, or its schema changes."""
+_ENDING = ("follow", "upgrade", "expire-override")
+"""Operations that may add or remove the marker of an ended override."""
+
+
+def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
+    """Yield the files that a commit changed although its message does not account for them.
+
+    These are files that people write, claims of demands that the message does not name, and claims
+    that are not formatted as the generator writes them.
+    """
+    if not commit.parents:
+        return
+    before, operation = commit.parents[0].tree, entry.first("Operation")
+    named = _named(entry)
+    for path, blob in trees.differences(before, commit.tree):
+        root = path.split("/", 1)[0]
+        if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
+            continue
+        if root != claim_file.LEDGER_ROOT:
+            yield path
+        elif path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
+            text = trees.read_text(commit.tree, path) or ""
+            if operation not in _ENDING or (blob and not ended_override_file.read({path: text})):
+                yield path
+        elif path.startswith(f"{recent_shutdowns.SHUTDOWNS_ROOT}/"):
+            if operation not in _RECORDING:
+                yield path
+        elif path.rsplit("/", 1)[-1] in named:
+            if blob and not _is_canonical(commit, path):
+                yield path
+        elif operation not in _REWRITING or not _only_rewrites(commit, path):
+            yield path
+
+
+def _named(entry: LogEntry) -> set[str]:
+    demands = {*entry.trailers.get("Demand-Id", ())}
+    for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
+        demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
+    return {f"{claim_file.segment(demand)}.yaml" for demand in demands}
+
+
+def _only_rewrites(commit: Commit, path: str) -> bool:
+    """Return whether a claim changed only its schema, or its lease started after approval."""
+    before, after = (
+        ledger_files.valid_claim_at(one.tree, path) for one in (commit.parents[0], commit)
+    )
+    if before is None or after is None:
+        return False
+    if before.lease and after.lease and after.lease.has_started > before.lease.has_started:
+        before = replace(before, lease=replace(before.lease, until=after.lease.until))
+    return before == after and _is_canonical(commit, path)
+
+
+def _is_canonical(commit: Commit, path: str) -> bool:
+    claim = ledger_files.valid_claim_at(commit.tree, path)
+    return claim is not None and claim_file.text_of(claim) == trees.read_text(commit.tree, path)
