@@ -100,8 +100,8 @@ class ObjectCache:
         for selector in wanted:
             self._read(selector)
 
-    def why_unavailable(self, namespace: str, deployment: str) -> str:
-        """Return why a Deployment's pods do not run; empty if that is not known.
+    def pods(self, namespace: str, deployment: str) -> list[Any]:
+        """Return a Deployment's pods, read now.
 
         Raises:
             Exception: by the library, if the cluster does not answer.
@@ -110,21 +110,12 @@ class ObjectCache:
 
         item = self.objects().get(("Deployment", namespace, deployment)) or {}
         labels = ((item.get("spec") or {}).get("selector") or {}).get("matchLabels") or {}
-        pods = client.CoreV1Api(self._api().api_client).list_namespaced_pod(
+        listed = client.CoreV1Api(self._api().api_client).list_namespaced_pod(
             namespace,
             label_selector=",".join(f"{key}={value}" for key, value in labels.items()),
             _request_timeout=(_CONNECT_S, _CONNECT_S),
         )
-        for pod in pods.items:
-            for container in pod.status.container_statuses or ():
-                waiting = container.state.waiting if container.state else None
-                if waiting and waiting.reason not in (None, "ContainerCreating"):
-                    message = f": {waiting.message}" if waiting.message else ""
-                    return f"container {container.name}: {waiting.reason}{message}"
-            for condition in pod.status.conditions or ():
-                if condition.type == "PodScheduled" and condition.status == "False":
-                    return f"not scheduled: {condition.message}"
-        return ""
+        return list(listed.items)
 
     def close(self) -> None:
         """Stop all watches."""

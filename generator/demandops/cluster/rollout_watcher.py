@@ -22,6 +22,7 @@ from demandops.cluster.health.release_health import (
     Level,
     Objects,
     Target,
+    why_unavailable,
     worst,
 )
 from demandops.cluster.object_cache import ObjectCache
@@ -186,7 +187,7 @@ class RolloutWatcher:
                 for domain in rollout.domains:
                     if domain.namespace == namespace:
                         cache = self._caches[domain.cluster]
-                        reason = cache.why_unavailable(namespace, deployment)
+                        reason = why_unavailable(cache.pods(namespace, deployment))
                         if reason:
                             health = replace(health, reason=f"{health.reason}; {reason}")
                             break

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -213,6 +213,20 @@ def deployment_health(deployment: Object) -> Health:
             message = str(problem.get("message", ""))
             return Health("reconciled", message, name, failing=True)
     return Health("reconciled", f"{available} of {wanted} replicas are available", name)
+
+
+def why_unavailable(pods: Iterable[Any]) -> str:
+    """Return why pods do not run: a container that waits, or no node; empty if not known."""
+    for pod in pods:
+        for container in pod.status.container_statuses or ():
+            waiting = container.state.waiting if container.state else None
+            if waiting and waiting.reason not in (None, "ContainerCreating"):
+                message = f": {waiting.message}" if waiting.message else ""
+                return f"container {container.name}: {waiting.reason}{message}"
+        for found in pod.status.conditions or ():
+            if found.type == "PodScheduled" and found.status == "False":
+                return f"not scheduled: {found.message}"
+    return ""
 
 
 def condition(status: Object, kind: str) -> Object:

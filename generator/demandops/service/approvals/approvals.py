@@ -263,17 +263,17 @@ class Approvals:
         ]
         self._demands.answer(booked)
         proposal.drop(booked)
-        if not verdict.rebuild and (not booked or head in proposal.record.commits):
+        if not verdict.waiting and (not booked or head in proposal.record.commits):
             self._delete_branch(proposal, heads)
         self._demands.answer(verdict.failed)
         self._demands.requeue(verdict.free)
-        proposal.wait_for(verdict.rebuild)
-        if not verdict.rebuild:
+        proposal.wait_for(verdict.waiting)
+        if not verdict.waiting:
             self._forget(proposal, close=not booked)
             return
         if booked and not head:  # only a part was merged
             proposal.record = replace(proposal.record, pushed=False)
-        if self._update(proposal, verdict.rebuild, snapshot, head):
+        if self._update(proposal, verdict.waiting, snapshot, head):
             proposal.checked_at = tip
         else:
             self._changed.append(proposal.branch)
@@ -304,7 +304,7 @@ class Approvals:
             if not proposal.edited:
                 log.info("%s has commits by a person and stays unchanged", proposal.branch)
             proposal.edited = True
-        elif not self._rebuild(proposal, left, snapshot, head):
+        elif not self._bring_up_to_date(proposal, left, snapshot, head):
             return False
         forge = snapshot.state.config.repo_settings.proposals
         if forge.forge in ("github", "gitea"):
@@ -319,7 +319,9 @@ class Approvals:
             ticket.notify("proposed", waiting_text(proposal.branch, link, proposal.reasons))
         return True
 
-    def _rebuild(self, proposal: Proposal, left: Decided, snapshot: Snapshot, head: str) -> bool:
+    def _bring_up_to_date(
+        self, proposal: Proposal, left: Decided, snapshot: Snapshot, head: str
+    ) -> bool:
         """Commit the demands on main and push the branch, unless it is up to date."""
         commits = CommitBatch(self._repository, snapshot)
         steps, failed = decide_in_turn(left, snapshot.state, commits.read)

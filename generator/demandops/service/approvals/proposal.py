@@ -34,14 +34,13 @@ class Verdict:
     """The verdict on the demands of a proposal, some with their decision on the current main.
 
     ``booked``: main has their claims. ``failed``: they were withdrawn or turned down, or can no
-    longer be booked. ``free``: they no longer need approval. ``rebuild``: they still wait for
-    approval.
+    longer be booked. ``free``: they no longer need approval. ``waiting``: they still do.
     """
 
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
     failed: Failed = field(default_factory=list)
     free: list[Ticket] = field(default_factory=list)
-    rebuild: Decided = field(default_factory=list)
+    waiting: Decided = field(default_factory=list)
 
 
 @dataclass(eq=False)
@@ -108,7 +107,7 @@ class Proposal:
             elif isinstance(decision, InvalidInput):
                 verdict.failed.append((ticket, decision))
             elif decision.approval:
-                verdict.rebuild.append((ticket, decision))
+                verdict.waiting.append((ticket, decision))
             else:
                 verdict.free.append(ticket)
         why_not = ""
@@ -117,8 +116,8 @@ class Proposal:
         elif pull_request is not None and pull_request.state == "closed":
             why_not = f"was turned down: {pull_request.link} was closed"
         if why_not and not verdict.booked:
-            verdict.failed.extend((ticket, TurnedDown(why_not)) for ticket, _ in verdict.rebuild)
-            verdict.rebuild.clear()
+            verdict.failed.extend((ticket, TurnedDown(why_not)) for ticket, _ in verdict.waiting)
+            verdict.waiting.clear()
         return verdict
 
     def drop(self, answered: Iterable[tuple[Ticket, object]]) -> None:
