@@ -37,8 +37,16 @@ _TYPES = ("auto", "mqtt", "zenoh", "ros", "none")
 ANSWER_LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
 
 # the fields of a document, by the message's names
-_DEMAND = {"demand": "demand_id", "request": "request_id", "requesters": "requester_ids"}
+_DEMAND = {
+    "demand": "demand_id",
+    "request": "request_id",
+    "requesters": "requester_ids",
+    "priority": "priority",
+}
 _APPLICATION = {"id": "id", "type": "type", "node": "node_id", "version": "version"}
+_PLACE = {"role": "role", "labels": "labels", "capabilities": "capabilities"}
+_DELIVERY = {"output": "output", "node": "node_id", "topic": "topic_name"}
+_POSITION = {"node": "node_id", "x": "x", "y": "y"}
 _INPUT = {"topic": "topic_name", "source": "source_node_id", "type": "type"}
 _CONNECTION = {
     "id": "id",
@@ -62,6 +70,7 @@ def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
         **_data(goal, _DEMAND),
         "applications": [_application(app) for app in goal.applications],
         "connections": [_connection(connection) for connection in goal.connections],
+        "positions": [_data(position, _POSITION) for position in goal.positions],
         "answer": _word(ANSWER_LEVELS, goal.answer),
     }
     if goal.lease.sec or goal.lease.nanosec:  # a part of a second counts as a whole one
@@ -76,7 +85,8 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
         ValueError: for an unknown field or word.
         TypeError, AssertionError, AttributeError, OverflowError: for a value of the wrong type.
     """
-    more = {"apiVersion", "kind", "lease", "operation", "answer", "applications", "connections"}
+    more = {"apiVersion", "kind", "lease", "operation", "answer"}
+    more |= {"applications", "connections", "positions"}
     goal = DemandMessage.Goal(**_fields(data, _DEMAND, more, "a demand"))
     goal.operation = _number(_OPERATIONS, data.get("operation", "put"), "operation")
     goal.answer = _number(ANSWER_LEVELS, data.get("answer", "pushed"), "answer")
@@ -85,6 +95,10 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     goal.lease = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
     goal.applications = [_application_message(app) for app in data.get("applications", ())]
     goal.connections = [_connection_message(item) for item in data.get("connections", ())]
+    goal.positions = [
+        messages.Position(**_fields(position, _POSITION, set(), "a position"))
+        for position in data.get("positions", ())
+    ]
     return goal
 
 
@@ -97,15 +111,22 @@ def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
         "inputs": inputs,
         "parameters_json": {parameter.name: parameter.value_json for parameter in app.parameters},
         "connect": _word(_TYPES, app.connect),
+        "place": _data(app, _PLACE),
+        "deliver": [_data(delivery, _DELIVERY) for delivery in app.deliver],
     }
 
 
 def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    more = {"inputs", "parameters", "parameters_json", "connect"}
+    more = {"inputs", "parameters", "parameters_json", "connect", "place", "deliver"}
     values = {name: json.dumps(value) for name, value in data.get("parameters", {}).items()}
     values |= data.get("parameters_json", {})
     return messages.Application(
         **_fields(data, _APPLICATION, more, "an application"),
+        **_fields(data.get("place", {}), _PLACE, set(), "a place"),
+        deliver=[
+            messages.Delivery(**_fields(delivery, _DELIVERY, set(), "a delivery"))
+            for delivery in data.get("deliver", ())
+        ],
         inputs=[
             messages.Input(role=role, **_fields(topic, _INPUT, set(), "an input"))
             for role, topics in data.get("inputs", {}).items()

@@ -38,6 +38,30 @@ class GoalTopic(FrozenModel):
     type: str = ""
 
 
+class GoalPlace(FrozenModel):
+    """What the node of an application must have, if the goal names none."""
+
+    role: str = ""
+    labels: list[str] = Field(default_factory=list)
+    capabilities: list[str] = Field(default_factory=list)
+
+
+class GoalDelivery(FrozenModel):
+    """An output of an application, and the node that it is brought to."""
+
+    output: str = ""
+    node: str = ""
+    topic: str = ""
+
+
+class GoalPosition(FrozenModel):
+    """Where a node is, in metres in the map frame of the inventory."""
+
+    node: str = ""
+    x: float = 0.0
+    y: float = 0.0
+
+
 class GoalApplication(FrozenModel):
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
@@ -54,6 +78,8 @@ class GoalApplication(FrozenModel):
     parameters_json: dict[str, str] = Field(default_factory=dict)
     version: str = ""
     connect: Annotated[str, type_word("auto", after=("none",))] = "auto"
+    place: GoalPlace = GoalPlace()
+    deliver: list[GoalDelivery] = Field(default_factory=list)
 
 
 class GoalRoute(RouteOptions):
@@ -98,6 +124,8 @@ class DemandGoal(FrozenModel):
     lease: Lease = None
     applications: list[GoalApplication] = Field(default_factory=list)
     connections: list[GoalConnection] = Field(default_factory=list)
+    priority: int = 0
+    positions: list[GoalPosition] = Field(default_factory=list)
     answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
 
 
@@ -127,6 +155,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         "own_requesters": requesters,
     }
     lease_s = _lease(goal.lease, faults)
+    faults += _not_supported(goal)
     if goal.operation != "put":
         faults += _not_of_a_put(goal, lease_s)
         return (Release if goal.operation == "release" else Renew)(**head), faults
@@ -163,6 +192,21 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
             f"a {goal.operation} names only its demand; to release a part, put the demand without "
             "it",
         )
+
+
+def _not_supported(goal: DemandGoal) -> Iterator[Fault]:
+    """Yield the fields of the goal that this version cannot carry out."""
+    for name in ("priority", "positions"):
+        if getattr(goal, name):
+            yield fault(name, "is not supported, for this version places nothing; leave it out")
+    for index, app in enumerate(goal.applications):
+        where = f"applications[{index}]"
+        if app.place != GoalPlace():
+            message = "is not supported, for this version places nothing; name the node"
+            yield fault(f"{where}.place", message)
+        if app.deliver:
+            message = "is not supported by this version; list a connection that carries the output"
+            yield fault(f"{where}.deliver", message)
 
 
 def form_faults(data: dict[str, Any]) -> list[Fault]:
