@@ -19,6 +19,8 @@ from tests.model.goals import summary
 TIMES = int(os.environ.get("DEMANDOPS_EXAMPLES", "1"))
 
 chances = st.randoms(use_true_random=False)
+visible = st.characters(exclude_categories=["C", "Z"], include_characters=" ")
+"""A character that may stand in an id."""
 
 
 def examples(count: int) -> Callable[[Any], Any]:

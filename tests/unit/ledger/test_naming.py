@@ -15,7 +15,7 @@ from demandops.demand.demand_request import id_problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.chance import examples, told
+from tests.kit.chance import examples, told, visible
 from tests.kit.goals import EGO, application, connection, goal
 from tests.kit.memory import MemoryRepo
 
@@ -41,7 +41,7 @@ long = st.builds(
     st.sampled_from([54, 300, 1000]),
     st.sampled_from(["", "a", "b", "-", "_a"]),
 )
-anything = st.text(min_size=1, max_size=12)
+anything = st.text(visible, min_size=1, max_size=12)
 ids = st.one_of(words, close, hashed, long, anything).filter(lambda text: not id_problem(text))
 topics = st.from_regex(r"(/[ab_][a0_]{0,3}){1,3}", fullmatch=True) | st.builds(
     lambda part, count: f"/{part}" * count, st.sampled_from(["a", "b_0", "a_"]), st.integers(50, 60)

@@ -13,7 +13,7 @@ from demandops.staterepo.history.message_format import compose, parse
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.chance import examples
+from tests.kit.chance import examples, visible
 from tests.kit.repo import git
 
 
@@ -48,9 +48,7 @@ def test_a_commit_that_a_person_picked_is_not_taken_for_the_generators() -> None
     assert parse(text).trailers == {}
 
 
-IDS = st.text(
-    st.characters(exclude_categories=["Cs", "Cc", "Zl", "Zp"]), min_size=1, max_size=60
-).filter(lambda text: not id_problem(text))
+IDS = st.text(visible, min_size=1, max_size=60).filter(lambda text: not id_problem(text))
 
 
 @given(names=st.lists(IDS, min_size=1, max_size=3, unique=True), request=IDS, application=IDS)
