@@ -1,95 +1,174 @@
-"""Holds are counted as the reference counts requesters: a list for each topic.
+"""Holds are counted as the reference's operators count requesters.
 
-A join extends the lists; a shutdown removes one entry of each requester that it names. The
-reference counts a join that is sent again twice and we do not, so none is.
+A recorded run of those operators shows that the model of them is right, and what is different here.
 """
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
-from collections.abc import Iterator
+from copy import deepcopy
 from datetime import datetime, timedelta, timezone
+from pathlib import Path
 from random import Random
-from types import MappingProxyType
+from typing import Any
 
-from demandops.connections.connection import Connection
-from demandops.connections.mqtt import MQTT
-from demandops.connections.route import Route
-from demandops.demand.application import Application, InputTopic
+import yaml
+from demandops.demand import deployment_request_goal
 from demandops.demand.claim import ClaimKey, demand_id
-from demandops.demand.demand_request import Demanded, Join, Shutdown
-from demandops.errors import Refused
+from demandops.demand.demand_request import DemandRequest, Join
+from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
-from demandops.ledger.operations.join import join
-from demandops.ledger.operations.shutdown import shut_down
 from demandops.ledger.recent_shutdowns import REMEMBERED
-from demandops.subject import Subject, TopicKey
 
 from tests.kit.chance import TIMES
+from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, Goal, application, connection, goal
+from tests.kit.memory import NOW, MemoryRepo
+from tests.model.operators import Operators
 
-PEOPLE = ("station00", "vehicle00", "vehicle01")
-Lists = dict[tuple[Subject, TopicKey], list[str]]
+ROOT = Path(__file__).parents[3]
+RUN = yaml.safe_load((ROOT / "tests" / "fixtures" / "reference-run.yaml").read_text())
+ROW = re.compile(r"^\| `([\w-]+)` \|", re.MULTILINE)
+FURTHER_CLOUD = re.compile(r"^/([a-z]+\d\d)_.+(_local_objectlist)$")
 
-
-def some(random: Random, among: str | tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(random.sample(among, random.randint(1, len(among))))
-
-
-def demanded(random: Random) -> Demanded:
-    """Return some topics of an application or a connection, for some requesters."""
-    topics = [f"/{name}" for name in some(random, "abc")]
-    inputs = {"ego_data": tuple(InputTopic(topic, "vehicle00") for topic in topics)}
-    routes = tuple(Route(topic, topic) for topic in topics)
-    app = Application("edge/fusion", "object-detection-fusion", "edge", MappingProxyType(inputs))
-    connection = Connection("vehicle00/edge", MQTT, "vehicle00", "edge", "edge", routes)
-    return Demanded(random.choice([app, connection]), some(random, PEOPLE), str)
+Books = dict[str, list[str]]
 
 
-def listed(one: Demanded) -> Iterator[tuple[tuple[Subject, TopicKey], str]]:
-    """Yield each topic and each requester of it."""
-    for topic in one.held.topic_keys():
-        for who in one.requesters:
-            yield (one.held.subject, topic), who
+def resource(kind: str, *ids: str) -> str:
+    """Return the name of a custom resource of the reference."""
+    return "-".join((kind, *ids)).replace("_", "-").replace("/", "-")
 
 
-def counted(ledger: Ledger) -> Lists:
-    """Return the requesters of each topic as often as they hold it."""
-    lists: Lists = defaultdict(list)
+def counted(ledger: Ledger) -> Books:
+    """Return who holds what, as often as they hold it, as :meth:`Operators.books` tells it."""
+    books = defaultdict[str, list[str]](list)
     for claim in ledger:
-        for topic in claim.held.topic_keys():
-            lists[claim.subject, topic] += claim.holders(topic)
-    return {key: sorted(who) for key, who in lists.items()}
+        if not claim.is_on_application:
+            books[resource("mqtt-connection", claim.subject.id)] += claim.requesters
+            continue
+        fusion = resource("of", claim.subject.id)
+        for key in claim.held.topic_keys():
+            role, topic, source = key
+            if role == "point_cloud":
+                topic = f"/{source}_local_objectlist"
+                books[resource("od", claim.application.node, source)] += claim.holders(key)
+            books[f"{fusion} {topic}"] += claim.holders(key)
+    return {name: sorted(who) for name, who in books.items()}
 
 
-def repeats(ledger: Ledger, request: Join) -> bool:
+def running(repo: MemoryRepo) -> Books:
+    """Return the topics of each service and connection, further clouds of a source with its own."""
+    runs, books = defaultdict[str, set[str]](set), repo.bookkeeping()
+    for service in books["services"].values():
+        topics = {topic for role in service["inputs"].values() for topic in role}
+        if service["source"] is None:
+            (id,) = service["applications"]
+            runs[resource("of", id)] = {FURTHER_CLOUD.sub(r"/\1\2", topic) for topic in topics}
+        else:
+            runs[resource("od", service["node"], service["source"])] |= topics
+    for id, entry in books["connections"].items():
+        runs[resource("mqtt-connection", id)] |= {*entry["topics"]}
+    return {name: sorted(topics) for name, topics in runs.items()}
+
+
+class Recorded:
+    """The books or what runs, by steps that say only what they change: there, and here."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self.there: Books = {}
+        self._differs: dict[str, Any] = {}
+
+    def follow(self, step: dict[str, Any]) -> None:
+        self.there = present(self.there | step.get(self._name, {}))
+        differs = self._differs | step.get(f"{self._name}_here", {})
+        self._differs = {name: what for name, what in differs.items() if what != "same"}
+        for name, what in self._differs.items():
+            assert what != self.there.get(name), f"{name} does not differ here"
+
+    @property
+    def here(self) -> Books:
+        return present(self.there | self._differs)
+
+
+def present(books: dict[str, Any]) -> Books:
+    return {name: what for name, what in books.items() if what is not None}
+
+
+def test_a_recorded_run_of_the_reference_is_what_the_model_says_and_what_comes_of_it_here() -> None:
+    operators, repo = Operators(), MemoryRepo()
+    books, runs = Recorded("books"), Recorded("runs")
+    for number, step in enumerate(RUN["steps"], 1):
+        wanted = step["goal"]
+        if isinstance(wanted, str):
+            wanted = yaml.safe_load((ROOT / wanted).read_text())
+        books.follow(step)
+        runs.follow(step)
+
+        reasons = operators.take(wanted)
+        repo.take(wanted, NOW + timedelta(minutes=2 * number))
+
+        assert operators.books() == books.there, number
+        assert reasons <= {step.get("class"), "never-ran"}, number
+        assert counted(repo.state.ledger) == books.here, number
+        assert running(repo) == runs.here, number
+
+
+def test_the_recorded_run_shows_every_difference_that_the_page_explains() -> None:
+    page = (ROOT / "docs" / "reference.md").read_text()
+    assert RUN["reference"]["commit"] in page
+    explained = ROW.findall(page)
+    assert sorted(explained) == sorted({step["class"] for step in RUN["steps"] if "class" in step})
+
+
+CONNECTED = {"vehicle00/edge": ("vehicle00", [EGO[0], CLOUD[0]]), "a": ("station00", ["/a"])}
+
+
+def some(random: Random, among: list[Any]) -> list[Any]:
+    return random.sample(among, random.randint(1, len(among)))
+
+
+def made(random: Random) -> Goal:
+    """Return a goal for some topics of an application, or for some connections, or both."""
+    who = some(random, ["station00", "vehicle00", "vehicle01"])
+    topics = [("ego", EGO), ("ego", ("/b", "vehicle01")), ("clouds", CLOUD)]
+    chosen = some(random, [*topics, ("clouds", STATION_CLOUD)])
+    listed = {of: [topic for kind, topic in chosen if kind == of] for of in ("ego", "clouds")}
+    app = application(random.choice(["edge/one", "edge/two"]), who=who, **listed)
+    links = [
+        connection(id, who=who, ends=(CONNECTED[id][0], "edge"), topics=CONNECTED[id][1])
+        for id in some(random, [*CONNECTED])
+    ]
+    parts = random.choice([([app], []), ([], links), ([app], links)])
+    return goal(*parts, id=random.choice("rs"), shutdown=random.random() < 0.5)
+
+
+def counts_twice(ledger: Ledger, request: DemandRequest) -> bool:
     """Return whether a join asks once more for a topic that its own claim has."""
-    (one,) = request.demanded
-    own = ledger.get(ClaimKey(one.held.subject, demand_id(request.id, one.requesters)))
-    return own is not None and bool({*own.held.topic_keys()} & {*one.held.topic_keys()})
+    for one in request.demanded if isinstance(request, Join) else ():
+        own = ledger.get(ClaimKey(one.held.subject, demand_id(request.id, one.requesters)))
+        if own and {*own.held.topic_keys()} & {*one.held.topic_keys()}:
+            return True
+    return False
 
 
-def test_topics_have_the_requesters_that_the_reference_counts() -> None:
-    for seed in range(300 * TIMES):
-        random, ledger, lists = Random(seed), Ledger(), Lists()
+def test_what_none_of_the_differences_affects_is_counted_as_by_the_operators() -> None:
+    appdef = MemoryRepo().config.appdef_by_wire_type
+    sent = 0
+    for seed in range(40 * TIMES):
+        random, ledger, operators = Random(seed), Ledger(), Operators()
         now = datetime(2026, 1, 31, tzinfo=timezone.utc)
-        for _ in range(30):
-            now += REMEMBERED + timedelta(minutes=2)  # none repeats a shutdown
-            request = random.choice([Join, Shutdown])(random.choice("rs"), (demanded(random),))
-            asked = list(listed(request.demanded[0]))
-            if isinstance(request, Shutdown):
-                held = [(key, who) for key, who in asked if who in lists.get(key, ())]
-                for key, who in held:
-                    lists[key].remove(who)
-                try:
-                    ledger, changes = shut_down(ledger, request, now)
-                except Refused:
-                    assert not held, seed
-                else:
-                    assert held, seed
-                    assert bool(changes.not_held) == (len(held) < len(asked)), seed
-                    assert shut_down(ledger, request, now + REMEMBERED)[0] is ledger, seed
-            elif not repeats(ledger, request):
-                ledger, _ = join(ledger, request, now)
-                for key, who in asked:
-                    lists.setdefault(key, []).append(who)
-            assert counted(ledger) == {key: sorted(who) for key, who in lists.items() if who}, seed
+        for _ in range(60):
+            now += REMEMBERED + timedelta(minutes=2)  # none is a late repeat
+            asked = made(random)
+            request, faults = deployment_request_goal.parse(asked, appdef)
+            assert request is not None
+            assert not faults
+            there = deepcopy(operators)
+            if there.take(asked) or counts_twice(ledger, request):
+                continue
+            operators, sent = there, sent + 1
+            ledger, changes = apply(ledger, request, now)
+            assert not changes.not_held, seed
+            assert counted(ledger) == operators.books(), seed
+    assert sent > 1000 * TIMES
