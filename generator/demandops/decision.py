@@ -26,8 +26,8 @@ from demandops.ledger.ledger import Changes, ClaimChange, Ledger, changes_on
 from demandops.ledger.operations import restoration
 from demandops.ledger.operations.restoration import Restoration
 from demandops.ledger.world import World
-from demandops.plan import implied_connections
-from demandops.plan.checks import denial, quota
+from demandops.plan import implied_connections, output_topics
+from demandops.plan.checks import denial, quota, topic_clash
 from demandops.plan.overrides.claim_overrides import (
     with_kept_claims,
     without_kept_claims,
@@ -131,6 +131,9 @@ def decide(
     ledger, changes = _book(state, request, now)
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
+    clashes = list(topic_clash.faults(request, state, after, keys))
+    if clashes:
+        raise Refused(clashes)
     rendered = changeset.build_changeset(state, after, changes, keys, state.engine, read)
     on_stage("booked")
     outcome: Outcome = "unchanged"
@@ -180,21 +183,23 @@ def admit(
     Raises:
         Refused: with every fault, of form and of content.
     """
-    config = state.config
+    config, ledger = state.config, state.ledger
     if isinstance(goal, dict) and Decommission.is_goal(goal):
         return Decommission.parse(goal)
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         parsed, faults = demand_goal.parse(goal)
         _refuse_large(parsed, config)
         request = permission.with_lease_terms(parsed, config)
-        request = implied_connections.with_implied_connections(request, state.ledger, config)
+        request = output_topics.with_further_topics(request, ledger, config)
+        request = implied_connections.with_implied_connections(request, ledger, config)
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
             raise Refused(faults)
         _refuse_large(wired, config)
         request = permission.with_lease_terms(wired, config)
-    request = admission.with_chosen_types(request, config, state.ledger.connection)
+        request = output_topics.with_further_topics(request, ledger, config)
+    request = admission.with_chosen_types(request, config, ledger.connection)
     malformed = {found.field for found in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
     content = [*admission.faults(request, config), *permission.faults(request, config)]

@@ -1,8 +1,9 @@
 """Names of Kubernetes objects and of derived topics.
 
-A name depends on its own subject only, and two different ids never give the same name. If an id
+A name depends on its own subject only. Two different ids never give the same object name: if an id
 must be shortened or changed to fit, a hash of the exact id is appended. Object names follow
-DNS-1123 and have at most 53 characters, Helm's limit for a release name.
+DNS-1123 and have at most 53 characters, Helm's limit for a release name. Parts of topics are those
+of the reference, where ``a/b`` and ``a-b`` are both ``a_b``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _HASH = 12
 
 _LABEL = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _LOOKS_HASHED = re.compile(rf"(^|.*[-_])[0-9a-f]{{{_HASH}}}")
-_TOPIC_PATH = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_TOPIC_TOKEN = re.compile(r"(?=_*[A-Za-z0-9])[A-Za-z_][A-Za-z0-9_]*")
 _MAX_TOKEN = 120
 
 
@@ -49,14 +50,15 @@ def object_name(prefix: str, *ids: str) -> str:
 
 @lru_cache(maxsize=65_536)
 def topic_part(id: str, extra: str = "") -> str:
-    """Return an id as part of a topic name (``vehicle00``, ``edge/fusion``).
+    """Return an id as part of a topic name: ``edge/lane-view`` gives ``edge_lane_view``.
 
-    ``extra`` keeps names with the same id apart, for example two point clouds of one source. It
-    is added as a slug with a hash. Cached, because a release names all its inputs each time.
+    An id that gives no valid name in this way gets a hash. ``extra`` keeps names with the same id
+    apart, for example two point clouds of one source. It is added as a slug with a hash. Cached,
+    because a release names all its inputs each time.
     """
-    exact = not extra and len(id) <= _MAX_TOKEN and _TOPIC_PATH.fullmatch(id)
-    if exact and not _LOOKS_HASHED.fullmatch(id):
-        return id
+    plain = re.sub("[-/]", "_", id)
+    if not extra and len(id) <= _MAX_TOKEN and _TOPIC_TOKEN.fullmatch(plain):
+        return plain
     words = re.sub(r"[^A-Za-z0-9]+", "_", f"{id}_{extra}" if extra else id).strip("_")[:80]
     words = words.rstrip("_")
     safe = words if words[:1].isalpha() else f"x_{words}" if words else "x"

@@ -40,7 +40,7 @@ REQUESTS = ("station00/collective-perception-intersection", "again", "")
 
 APPLICATIONS = {
     "edge/object_detection_fusion": "edge",
-    "edge/object-detection_fusion": "edge",
+    "edge/object.detection_fusion": "edge",
     "cloud/fusion": "cloud",
 }
 """Each application's own node: the first two share their detections, and nearly their name."""

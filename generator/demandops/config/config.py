@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from demandops import naming
 from demandops.config.appdef import ApplicationDefinition, Service
 from demandops.config.inventory import Broker, Cluster, Node
 from demandops.config.override import OVERRIDES_ROOT, Override
@@ -44,6 +45,18 @@ class Config:
     domain_of: Mapping[str, AccessDomain]
     files: Mapping[str, str]
     overrides: Mapping[str, Override] = field(default_factory=dict)
+    nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
+        init=False, compare=False, repr=False
+    )
+    """The nodes by their part in names of topics, which several may share."""
+
+    def __post_init__(self) -> None:
+        """Set what follows from the other fields."""
+        found: dict[str, tuple[str, ...]] = {}
+        for id in self.nodes:
+            part = naming.topic_part(id)
+            found[part] = (*found.get(part, ()), id)
+        object.__setattr__(self, "nodes_by_topic_part", found)
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
         """Return a node and its access domain.

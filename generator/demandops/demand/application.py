@@ -9,16 +9,22 @@ from dataclasses import dataclass, field, fields, replace
 from itertools import islice, takewhile
 from types import MappingProxyType
 
+from demandops import naming
 from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class InputTopic:
-    """An input topic of an application, and the node that publishes it."""
+    """An input topic of an application, and the node that publishes it.
+
+    ``further`` says that another topic of the node was its usual one when this one was booked
+    (:mod:`demandops.plan.output_topics`).
+    """
 
     topic: str
     source: str
     type: str = ""
+    further: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +69,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
-        """Return the inputs in a role that are ``topic`` of ``source``; they differ by type."""
+        """Return the inputs in a role that are ``topic`` of ``source``."""
         inputs = self.inputs.get(role, ())
         start = bisect_left(inputs, InputTopic(topic, source))
         same = takewhile(
@@ -147,9 +153,12 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def index_entries(self) -> Iterator[tuple[str, ...]]:
         """Yield the entries by which the ledger's index finds it."""
         yield ("node", self.node)
-        for _, topic in self.all_inputs():
+        for role, topic in self.all_inputs():
             yield ("takes", topic.source, topic.topic)
             yield ("node", topic.source)
+            if not topic.further:
+                yield ("usual", topic.source, role)
+        yield ("topics", naming.topic_part(self.id))
 
 
 def _exact(values: Mapping[str, object]) -> str:
@@ -158,8 +167,9 @@ def _exact(values: Mapping[str, object]) -> str:
 
 def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
     """Merge topics by (topic, source); a later type replaces a missing one."""
-    types: dict[tuple[str, str], str] = {}
+    merged: dict[tuple[str, str], InputTopic] = {}
     for topic in topics:
-        key = (topic.topic, topic.source)
-        types[key] = types.get(key) or topic.type
-    return tuple(InputTopic(*key, type) for key, type in sorted(types.items()))
+        known = merged.setdefault((topic.topic, topic.source), topic)
+        if topic.type and not known.type:
+            merged[topic.topic, topic.source] = topic
+    return tuple(topic for _, topic in sorted(merged.items()))

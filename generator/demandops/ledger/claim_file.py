@@ -93,6 +93,7 @@ class _Topic(FrozenModel):
     topic: str
     source: str
     type: str = ""
+    further: bool = False
     requesters: _Requesters = Field(default=(), strict=False)
 
 
@@ -182,7 +183,7 @@ class _ApplicationFile(_Claim):
 
     def held(self) -> Application:
         inputs = {
-            role: tuple(sorted(InputTopic(t.topic, t.source, t.type) for t in topics))
+            role: tuple(sorted(InputTopic(t.topic, t.source, t.type, t.further) for t in topics))
             for role, topics in sorted(self.inputs.items())
             if topics
         }
@@ -281,8 +282,9 @@ def format_timestamp(moment: datetime) -> str:
 
 
 def _topic(claim: Claim, role: str, topic: InputTopic) -> dict[str, Any]:
-    entry = {"topic": topic.topic, "source": topic.source}
+    entry: dict[str, Any] = {"topic": topic.topic, "source": topic.source}
     entry |= {"type": topic.type} if topic.type else {}
+    entry |= {"further": True} if topic.further else {}
     return entry | _partial(claim, (role, topic.topic, topic.source))
 
 

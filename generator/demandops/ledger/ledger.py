@@ -15,7 +15,7 @@ from rpds import HashTrieMap, HashTrieSet
 from demandops.connections import connection_types
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import ConnectionType
-from demandops.demand.application import Application
+from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import UNSTARTED
 from demandops.ledger.recent_shutdowns import RecentShutdown, RecentShutdowns
@@ -135,6 +135,38 @@ class Ledger:
         """Return the claims with ``topic`` of ``source`` as an input, by application and demand."""
         return self._claims("takes", source, topic)
 
+    def each_taking(self, source: str, topic: str) -> Iterator[Claim]:
+        """Yield the claims with ``topic`` of ``source`` as an input, in no order."""
+        for key in self.index.get(("takes", source, topic)) or ():
+            claim = self.get(key)
+            if claim is not None:
+                yield claim
+
+    def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
+        """Return ``topic`` of ``source`` as a claim has it in ``role``."""
+        for claim in self.each_taking(source, topic):
+            if found := claim.application.inputs_from(role, source, topic):
+                return found[0]
+        return None
+
+    def has_usual_topic(self, role: str, source: str, *, but_of: str | None = None) -> bool:
+        """Return whether a topic of ``source`` in ``role`` is no further one.
+
+        The demand ``but_of`` does not count.
+        """
+        keys = self.index.get(("usual", source, role)) or ()
+        return any(key.demand != but_of for key in keys)
+
+    def usual_topics(self, role: str, source: str, *, but: str) -> Iterator[str]:
+        """Yield the topics of ``source`` in ``role`` that are no further ones, except ``but``."""
+        keys = self.index.get(("usual", source, role)) or ()
+        if len(keys) == len(self.index.get(("takes", source, but)) or ()):
+            return  # all of them take that one
+        found = (claim for key in keys if (claim := self.get(key)))
+        topics = (topic for claim in found for topic in claim.application.inputs.get(role, ()))
+        usual = {one.topic for one in topics if one.source == source and not one.further}
+        yield from sorted(usual - {but})
+
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         """Return the connections that bring ``topic`` to the node ``target``, sorted."""
         return self._ids("brings", target, topic)
@@ -171,6 +203,10 @@ class Ledger:
     def applications_at(self, node: str) -> tuple[str, ...]:
         """Return the applications that run on a node or have an input from it, sorted."""
         return self._ids("node", node)
+
+    def applications_in_topics(self, part: str) -> tuple[str, ...]:
+        """Return the applications that are called ``part`` in names of topics, sorted."""
+        return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:
         """Return when the first lease ends, or ``None`` if there is no lease."""

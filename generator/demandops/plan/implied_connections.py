@@ -19,7 +19,7 @@ from demandops.demand.application import Application, InputTopic
 from demandops.demand.demand_request import AnyRequest, Demanded
 from demandops.identifiers import topic_problem
 from demandops.ledger.ledger import Ledger
-from demandops.plan.planner import outputs
+from demandops.plan.output_topics import outputs
 from demandops.plan.release import ServiceKey
 
 
@@ -116,7 +116,8 @@ def foreign_inputs(app: Application, config: Config) -> list[ForeignInput]:
                 key = ServiceKey(
                     producer_name, topic.source, source=topic.source, topic=topic.topic
                 )
-                carried = InputTopic(outputs(config, producer, key)[output], topic.source)
+                names = outputs(config, producer, key, further=topic.further)
+                carried = InputTopic(names[output], topic.source)
             found.append(ForeignInput(name, carried, f"inputs.{role}[{index}]"))
     return found
 

@@ -24,6 +24,7 @@ from demandops.demand.application import InputTopic
 from demandops.demand.claim import Claim, requesters_of
 from demandops.errors import Refused
 from demandops.ledger.world import World
+from demandops.plan.output_topics import outputs, usual_topic
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
@@ -65,10 +66,12 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     appdef = appdef_of(config, first.appdef)
     service = appdef.services[key.service]
     node, domain = config.node_and_domain(key.node)
+    inputs: dict[str, tuple[InputTopic, ...]]
     if service.each is not None:
-        inputs = {service.each: _shared_input(claims, service.each, key)}
+        inputs = {service.each: (_shared_input(claims, service.each, key),)}
     else:
         inputs = _application_inputs(config, appdef, service, claims)
+    further = any(one.further for topics in inputs.values() for one in topics)
     definitions: dict[str, Parameter] = {}
     for name in sorted({claim.application.appdef for claim in claims}, reverse=True):
         definitions |= appdef_of(config, name).parameters
@@ -86,7 +89,7 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         service=service,
         chart=_chart(config, service, claims),
         inputs=MappingProxyType(inputs),
-        outputs=MappingProxyType(outputs(config, service, key)),
+        outputs=MappingProxyType(outputs(config, service, key, further=further)),
         parameters=MappingProxyType(values),
         replicas=_replicas(service.scaling, sum(map(len, inputs.values()))),
         applications=users,
@@ -109,10 +112,11 @@ def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSo
     return next(iter(charts.values()))
 
 
-def _shared_input(claims: Iterable[Claim], role: str, key: ServiceKey) -> tuple[InputTopic, ...]:
+def _shared_input(claims: Iterable[Claim], role: str, key: ServiceKey) -> InputTopic:
     source, topic = str(key.source), str(key.topic)
-    inputs = (one for claim in claims for one in claim.application.inputs_from(role, source, topic))
-    return (InputTopic(topic, source, min((one.type for one in inputs if one.type), default="")),)
+    found = [one for claim in claims for one in claim.application.inputs_from(role, source, topic)]
+    type = min((one.type for one in found if one.type), default="")
+    return InputTopic(topic, source, type, all(one.further for one in found))
 
 
 def _application_inputs(
@@ -125,14 +129,16 @@ def _application_inputs(
             inputs[role] = _united(claims, origin)
             continue
         producer = appdef.services[producer_name]
-        pattern, each = producer.outputs[output], str(producer.each)
-        topics = {
-            (one.source, one.topic)
+        made = set()
+        for topic in {
+            topic
             for claim in claims
-            for one in claim.application.inputs.get(each, ())
-        }
-        names = {(_of_instance(pattern, config, producer, *one), one[0]) for one in topics}
-        inputs[role] = tuple(InputTopic(*name) for name in sorted(names))
+            for topic in claim.application.inputs.get(str(producer.each), ())
+        }:
+            key = ServiceKey(producer_name, topic.source, source=topic.source, topic=topic.topic)
+            names = outputs(config, producer, key, further=topic.further)
+            made.add(InputTopic(names[output], topic.source))
+        inputs[role] = tuple(sorted(made))
     return inputs
 
 
@@ -153,29 +159,9 @@ def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     if key.application is not None:
         return naming.object_name(service.prefix, key.application)
     source, topic = str(key.source), str(key.topic)
-    if _is_usual(config, service, source, topic):
+    if topic == usual_topic(config, source, str(service.each)):
         return naming.object_name(service.prefix, key.node, source)
     return naming.object_name(service.prefix, key.node, source, topic)
-
-
-def _is_usual(config: Config, service: Service, source: str, topic: str) -> bool:
-    node = config.nodes.get(source)
-    return node is not None and node.topics.get(str(service.each)) == topic
-
-
-def outputs(config: Config, service: Service, key: ServiceKey) -> dict[str, str]:
-    """Return the topics that a service instance publishes, by the names of the appdef's outputs."""
-    own = (key.application, "") if key.application is not None else (key.source, key.topic)
-    source, topic = map(str, own)
-    return {
-        name: _of_instance(pattern, config, service, source, topic)
-        for name, pattern in sorted(service.outputs.items())
-    }
-
-
-def _of_instance(pattern: str, config: Config, service: Service, source: str, topic: str) -> str:
-    extra = "" if _is_usual(config, service, source, topic) else topic
-    return pattern.replace("{instance}", naming.topic_part(source, extra))
 
 
 def _replicas(scaling: Scaling, topics: int) -> int:

@@ -84,6 +84,17 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
     )
 
 
+def is_needed(world: World, key: ServiceKey) -> bool:
+    """Return whether a claim needs a service instance."""
+    if key.application is not None:
+        return _role(world, key.application, key) is not None
+    source, topic = str(key.source), str(key.topic)
+    return any(
+        one.application.inputs_from(_role(world, one.subject.id, key) or "", source, topic)
+        for one in world.ledger.each_taking(source, topic)
+    )
+
+
 def _role(world: World, application: str, key: ServiceKey) -> str | None:
     """Return the role that gives a service one instance for each of its inputs.
 

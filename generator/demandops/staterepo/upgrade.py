@@ -22,6 +22,7 @@ from demandops.errors import InvalidInput, StateRepoError, fault
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.claim_file import LEDGER_ROOT
 from demandops.ledger.ledger import Ledger
+from demandops.plan.output_topics import with_booked_topics_marked
 from demandops.plan.overrides.lifecycle import update_ledger
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import planned_releases
@@ -40,6 +41,9 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 _ATTEMPTS = 10
 _PAUSE_S = 0.1
+_FIRST_WITH_MARKS = 2
+"""The render version whose claims say which topics are further ones of their source."""
+
 _FOLDER_DEPTH = 3
 """``clusters/<cluster>/<access domain>``: the commit's message counts files per such folder."""
 
@@ -157,6 +161,8 @@ def _plan(
     subjects = ledger_files.changed_subjects(known.ledger, state.ledger)
     applied = update_ledger(known, state, subjects, last_valid_config.end_markers_at(tree), now)
     state = replace(state, ledger=applied.ledger)
+    if old.repo_settings.render_version < _FIRST_WITH_MARKS:
+        state = replace(state, ledger=with_booked_topics_marked(state.ledger, config))
     if old.repo_settings.gitops != config.repo_settings.gitops:
         _refuse_held(state)
     files_of_ledger = _in_this_schema(trees.texts(tree, (LEDGER_ROOT,)), state.ledger)

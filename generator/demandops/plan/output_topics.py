@@ -1,0 +1,115 @@
+"""The topics that services publish, named as the reference names them.
+
+``{instance}`` in a pattern of an appdef is the application, or the source of a service with
+``each``. A source has one usual topic for an input: the one in its inventory entry, else the first
+that a demand booked. Only names for its further topics contain the topic as well. The claims record
+which topics are further ones, so a name stays the same while anybody demands the topic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from demandops import naming
+from demandops.config.appdef import Service
+from demandops.config.config import Config
+from demandops.demand.application import Application, InputTopic
+from demandops.demand.demand_request import AnyRequest, Put
+from demandops.ledger.ledger import Ledger
+from demandops.plan.release import ServiceKey
+
+
+def outputs(
+    config: Config, service: Service, key: ServiceKey, *, further: bool = False
+) -> dict[str, str]:
+    """Return the topics that a service instance publishes, by the names of the appdef's outputs.
+
+    ``further`` is that of the instance's input in the claims.
+    """
+    if key.application is not None:
+        instance = naming.topic_part(key.application)
+    else:
+        source, topic = str(key.source), str(key.topic)
+        usual = usual_topic(config, source, str(service.each))
+        extra = "" if topic == usual or (usual is None and not further) else topic
+        instance = naming.topic_part(source, extra)
+    return {
+        name: pattern.replace("{instance}", instance)
+        for name, pattern in sorted(service.outputs.items())
+    }
+
+
+def usual_topic(config: Config, source: str, role: str) -> str | None:
+    """Return the usual topic of a source as the inventory has it, or ``None``."""
+    node = config.nodes.get(source)
+    return node.topics.get(role) if node else None
+
+
+def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
+    """Return the request with every input marked that is a further topic of its source."""
+    if not request.adds_claims:
+        return request
+    own = request.demand if isinstance(request, Put) else None  # what it holds now may end
+    first: dict[tuple[str, str], str] = {}
+
+    def is_further(role: str, topic: InputTopic) -> bool:
+        usual = usual_topic(config, topic.source, role)
+        if usual is None:
+            known = ledger.booked_input(role, topic.source, topic.topic)
+            if known is not None:
+                return known.further
+            place = (role, topic.source)
+            if place not in first and ledger.has_usual_topic(*place, but_of=own):
+                return True
+            usual = first.setdefault(place, topic.topic)
+        return topic.topic != usual
+
+    apps = [one.held for one in request.demanded if isinstance(one.held, Application)]
+    for role, topic in (each for app in apps for each in _per_topic(app, config)):
+        known = ledger.booked_input(role, topic.source, topic.topic)
+        if known is not None and not known.further:
+            first.setdefault((role, topic.source), topic.topic)
+    demanded = (
+        replace(one, held=_marked(one.held, config, is_further))
+        if isinstance(one.held, Application)
+        else one
+        for one in request.demanded
+    )
+    return replace(request, demanded=tuple(demanded))
+
+
+def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
+    """Return the ledger of an earlier version with the marks; the oldest topic is the usual one."""
+    first: dict[tuple[str, str], str] = {}
+
+    def is_further(role: str, topic: InputTopic) -> bool:
+        usual = usual_topic(config, topic.source, role) or topic.topic
+        return first.setdefault((role, topic.source), usual) != topic.topic
+
+    claims = [claim for claim in ledger if claim.is_on_application]
+    for claim in sorted(claims, key=lambda one: (one.booked, one.subject.id, one.demand)):
+        held = _marked(claim.application, config, is_further)
+        ledger = ledger.replace(claim.key, replace(claim, held=held))
+    return ledger
+
+
+def _per_topic(app: Application, config: Config) -> Iterator[tuple[str, InputTopic]]:
+    """Yield the inputs of which a service runs once for each topic, with their roles."""
+    appdef = config.appdefs.get(app.appdef)
+    services = appdef.services.values() if appdef else ()
+    for role in sorted({service.each for service in services if service.each}):
+        for topic in app.inputs.get(role, ()):
+            yield role, topic
+
+
+def _marked(
+    app: Application, config: Config, is_further: Callable[[str, InputTopic], bool]
+) -> Application:
+    marked: dict[str, list[InputTopic]] = {}
+    for role, topic in _per_topic(app, config):
+        further = is_further(role, topic)
+        marked.setdefault(role, []).append(replace(topic, further=further))
+    return app.with_inputs(
+        {**app.inputs, **{role: tuple(topics) for role, topics in marked.items()}}
+    )

@@ -1,0 +1,159 @@
+"""Detection and fusion publish the reference's topics; two never publish one topic on a node."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import yaml
+from demandops.demand.claim import Claim
+from demandops.plan.output_topics import with_booked_topics_marked
+
+from tests.kit.config import skeleton
+from tests.kit.goals import APP, CLOUD, Topic, application, goal
+from tests.kit.memory import MemoryRepo, rebuilt
+
+FRONT, REAR = ("/front/points", "vehicle01"), ("/rear/points", "vehicle01")
+"""Two clouds of a vehicle whose entry in the inventory names none."""
+PLAIN = "/vehicle01_local_objectlist"
+REAR_SLUG = "/vehicle01_rear_points_cf82ae10af3d_local_objectlist"
+NODES = "inventory/nodes.yaml"
+
+
+def join(*clouds: Topic, who: str = "vehicle01", id: str = APP, shutdown: bool = False) -> Any:
+    return goal([application(id, who=[who], clouds=clouds)], id=f"of {who}", shutdown=shutdown)
+
+
+def published(repo: MemoryRepo) -> dict[str, str]:
+    """Return the topic of each object list by the topic of its cloud."""
+    values = [release["spec"]["values"] for release in repo.objects("HelmRelease").values()]
+    detections = [one["detection"] for one in values if "detection" in one]
+    return {one["pointCloudTopic"]: one["objectListTopic"] for one in detections}
+
+
+def fused(repo: MemoryRepo) -> set[str]:
+    values = [release["spec"]["values"] for release in repo.objects("HelmRelease").values()]
+    return {topic for one in values if "inputs" in one for topic in one["inputs"]["objectList"]}
+
+
+def with_nodes(*nodes: dict[str, Any]) -> MemoryRepo:
+    """Return a repo in which nodes are added, or have more to say."""
+    inventory = yaml.safe_load(skeleton()[NODES])
+    known = {node["id"]: node for node in inventory["nodes"]}
+    for node in nodes:
+        known.setdefault(node["id"], {"type": "vehicle", "cluster": "c-its"}).update(node)
+    return MemoryRepo({NODES: yaml.safe_dump(inventory | {"nodes": [*known.values()]})})
+
+
+def test_the_fusion_publishes_what_the_reference_names() -> None:
+    repo = MemoryRepo()
+    repo.send(join(CLOUD, id="edge/object-detection_fusion"))
+    (fusion,) = [
+        release["spec"]["values"]["fusion"]
+        for release in repo.objects("HelmRelease").values()
+        if "fusion" in release["spec"]["values"]
+    ]
+    assert fusion["fusedObjectListsTopic"] == "/edge_object_detection_fusion_global_objectlist"
+    assert fusion["fusedTrajectoriesTopic"] == "/edge_object_detection_fusion_global_trajectories"
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_the_first_cloud_of_a_source_is_its_usual_one_and_names_stay_while_they_are_demanded(
+    at_once: bool,
+) -> None:
+    repo = MemoryRepo()
+    for clouds in [(FRONT, REAR)] if at_once else [(FRONT,), (REAR,)]:
+        repo.send(join(*clouds))
+    both = {FRONT[0]: PLAIN, REAR[0]: REAR_SLUG}
+    assert published(repo) == both
+    assert fused(repo) == set(both.values())
+    assert repo.decide(join(REAR, FRONT)).outcome == "unchanged"
+    repo.send(join(FRONT, shutdown=True))
+    assert published(repo) == {REAR[0]: REAR_SLUG}
+    repo.send(join(REAR, who="vehicle00"))
+    repo.send(join(REAR, shutdown=True))
+    assert published(repo) == {REAR[0]: REAR_SLUG}
+    repo.send(join(REAR, who="vehicle00", shutdown=True))
+    repo.send(join(REAR))
+    assert published(repo) == {REAR[0]: PLAIN}
+
+
+def test_the_inventory_says_which_cloud_is_the_usual_one() -> None:
+    repo = with_nodes({"id": "vehicle01", "topics": {"point_cloud": REAR[0]}})
+    repo.send(join(FRONT))
+    slug = "/vehicle01_front_points_4d80b6efb186_local_objectlist"
+    assert published(repo) == {FRONT[0]: slug}
+    repo.send(join(REAR))
+    assert published(repo) == {FRONT[0]: slug, REAR[0]: PLAIN}
+
+
+def put(*clouds: Topic) -> dict[str, Any]:
+    topics = [{"topic": topic, "source": source} for topic, source in clouds]
+    item = {"id": APP, "type": "object-detection-fusion", "node": "edge", "connect": "none"}
+    inputs = {"inputs": {"point_cloud": topics}}
+    head = {"kind": "Demand", "demand": "d", "requesters": ["vehicle01"]}
+    return head | {"applications": [item | inputs]}
+
+
+def test_a_cloud_that_takes_the_place_of_another_takes_its_name_too() -> None:
+    repo = MemoryRepo()
+    repo.send(put(FRONT))
+    repo.send(put(REAR))
+    assert published(repo) == {REAR[0]: PLAIN}
+    repo.send(put(FRONT, REAR))
+    repo.send(put(FRONT, REAR))
+    assert published(repo)[REAR[0]] == PLAIN
+
+
+def test_an_application_whose_topics_another_publishes_is_refused() -> None:
+    repo = MemoryRepo()
+    repo.send(join(CLOUD, id="edge/fusion-1"))
+    assert repo.faults(join(CLOUD, id="edge-fusion/1")) == [
+        "apps[0].header.id: its fused_objects is /edge_fusion_1_global_objectlist, which "
+        "application 'edge/fusion-1' publishes on 'edge' already; use another application id"
+    ]
+    repo.send(goal([application("edge-fusion/1", node="cloud")]))
+
+
+def test_a_source_whose_topic_another_publishes_is_refused() -> None:
+    repo = with_nodes({"id": "robo-1"}, {"id": "robo/1", "selector": {"a": "b"}})
+    repo.send(join(("/a", "robo-1")))
+    assert repo.faults(join(("/b", "robo/1"), id="edge/other")) == [
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its object_list is "
+        "/robo_1_local_objectlist, which object-detection for /a of 'robo-1' publishes on 'edge' "
+        "already; give 'robo/1' another id in inventory/nodes.yaml"
+    ]
+
+
+def test_two_usual_clouds_which_a_person_wrote_are_told_apart_by_the_inventory() -> None:
+    repo = MemoryRepo()
+    repo.send(join(FRONT))
+    repo.send(join(REAR, who="vehicle00"))
+    claims = [replace(claim, held=without_marks(claim)) for claim in repo.state.ledger]
+    repo.state = replace(repo.state, ledger=rebuilt(claims))
+    repo.send(goal([application("cloud/x", node="cloud", clouds=[FRONT])]))
+    assert repo.faults(goal([application("cloud/y", node="cloud", clouds=[REAR])])) == [
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its object_list is "
+        "/vehicle01_local_objectlist, which object-detection for /front/points of 'vehicle01' "
+        "publishes on 'cloud' already; name the usual one of the two as topics.point_cloud of "
+        "'vehicle01' in inventory/nodes.yaml"
+    ]
+
+
+def without_marks(claim: Claim) -> Any:
+    inputs = {
+        role: tuple(replace(topic, further=False) for topic in topics)
+        for role, topics in claim.application.inputs.items()
+    }
+    return claim.application.with_inputs(inputs)
+
+
+def test_an_upgrade_takes_the_oldest_cloud_for_the_usual_one() -> None:
+    repo = MemoryRepo()
+    repo.send(join(REAR, who="vehicle00"))
+    repo.send(join(FRONT), now=repo.now.replace(hour=11))
+    of_before = rebuilt(replace(claim, held=without_marks(claim)) for claim in repo.state.ledger)
+    marked = with_booked_topics_marked(of_before, repo.config)
+    inputs = [topic for claim in marked for topic in claim.application.inputs["point_cloud"]]
+    assert {topic.topic: topic.further for topic in inputs} == {FRONT[0]: False, REAR[0]: True}
