@@ -295,7 +295,7 @@ def _subject_of(field: str) -> tuple[str, int]:
 
 
 def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each input that no connection brings, and each that needs none."""
+    """Yield a warning for each input that no connection brings, each that needs none, each note."""
     ledger = without_suspended(world).ledger
     for one in request.demanded if request.adds_claims else ():
         held = one.held
@@ -308,6 +308,8 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
                         f"{topic.topic} of '{topic.source}' to '{held.node}'"
                     )
             continue
+        if one.note:
+            yield f"connection '{held.id}' {one.note}"
         for route in held.topics:
             if is_bridged(route, *held.nodes, world.config):
                 yield (

@@ -166,19 +166,23 @@ class Books:
         ends = connection.get("source_node_id", ""), connection.get("target_node_id", "")
         if not set(ends) <= self.world.nodes:
             yield "an unknown node"
-        asked = connection.get("broker_node_id", "")
-        brokers = self.world.brokers
-        if asked and asked not in brokers:
-            yield "no broker on the node that is asked for"
-        if not asked and not set(ends) & brokers and len(brokers) != 1:
+        asked, brokers = connection.get("broker_node_id", ""), self.world.brokers
+        if not {asked, *ends} & brokers and len(brokers) != 1:
             yield "no broker"
+
+    def _broker(self, item: Item) -> str:
+        """Return the broker of an item that asks for one: the only one, else the first there."""
+        asked, brokers = item.get("broker_node_id", ""), self.world.brokers
+        ends = (item.get("target_node_id", ""), item.get("source_node_id", ""))
+        found = [*brokers][:1] if len(brokers) == 1 else [n for n in (asked, *ends) if n in brokers]
+        return found[0] if asked and found else ""
 
     # Joining: additive for each claim; what contradicts a standing claim is refused
 
     def _join(self, goal: Goal) -> None:
         for item in _items(goal):
             claims = self.claims.setdefault(_subject(item), {})
-            fixed, broker, routes = _fixed(item), item.get("broker_node_id", ""), _pairs(item)
+            fixed, broker, routes = _fixed(item), self._broker(item), _pairs(item)
             for other in claims.values():
                 if other["fixed"] != fixed:
                     raise _Refused("another node, type or end")

@@ -179,6 +179,13 @@ class ConnectionType(ABC):
         """Yield the other faults of a route from ``sender``, for example of its options."""
         return iter(())
 
+    def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
+        """Return the connection as it will be carried, and a note for the requester if it differs.
+
+        Called for a demand that the inventory can fulfill.
+        """
+        return connection, ""
+
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
         """Return the fields of access rules, with values, that it needs besides both nodes."""
         return []

@@ -10,7 +10,7 @@ The parameters do not contain a broker's user name and password: the pod reads t
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from demandops import naming
@@ -54,21 +54,29 @@ class Mqtt(ConnectionType):
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield a fault if the connection has no broker (:func:`choose_broker`)."""
-        if (
-            not connection.broker
-            and not {connection.source, connection.target} <= config.nodes.keys()
-        ):
+        if not {connection.source, connection.target} <= config.nodes.keys():
             return
         if choose_broker(connection, config) is not None:
             return
         known = ", ".join(sorted(config.brokers))
         remedy = f"name one of: {known}" if known else f"{BROKERS_FILE} has none; add one there"
-        message = (
-            f"is not given, and no broker runs on '{connection.target}' or '{connection.source}'"
-        )
+        message = f"no broker runs on '{connection.target}' or '{connection.source}'"
         if connection.broker:
-            message = f"no broker runs on {quoted(connection.broker)}"
+            message = f"no broker runs on {quoted(connection.broker)}, and {message}"
+        else:
+            message = f"is not given, and {message}"
         yield fault("broker", f"{message}; {remedy}", code=_NO_BROKER)
+
+    def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
+        """Return the connection with the broker that it gets instead of the named one."""
+        broker = choose_broker(connection, config)
+        if not connection.broker or broker is None or broker.node == connection.broker:
+            return connection, ""
+        note = (
+            f"uses the broker on '{broker.node}', because {BROKERS_FILE} has none on "
+            f"{quoted(connection.broker)}"
+        )
+        return replace(connection, broker=broker.node), note
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
         """Return the broker."""
@@ -92,16 +100,16 @@ MQTT = Mqtt()
 
 
 def choose_broker(connection: Connection, config: Config) -> Broker | None:
-    """Return a connection's broker: the named, the target's, the source's or the only one.
+    """Return a connection's broker as the reference chooses it, or ``None``.
 
-    Return ``None`` if there is none of these.
+    It is the only one there is, else the named, the target's or the source's.
     """
-    if connection.broker:
-        return config.brokers.get(connection.broker)
-    for node in (connection.target, connection.source):
+    if len(config.brokers) == 1:
+        return next(iter(config.brokers.values()))
+    for node in (connection.broker, connection.target, connection.source):
         if node in config.brokers:
             return config.brokers[node]
-    return next(iter(config.brokers.values())) if len(config.brokers) == 1 else None
+    return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -216,17 +216,23 @@ def _requesters(requesters: tuple[str, ...]) -> Iterator[Fault]:
 def with_chosen_types(
     request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
 ) -> AnyRequest:
-    """Return ``request`` with a type for each connection that has none.
+    """Return ``request`` with the type and the broker that each connection gets.
 
     A claimed connection keeps its current type. A new one gets the first type that can carry it
     (:func:`connection_types.type_faults`); if no type can, it still has none.
     """
 
     def chosen(one: Demanded) -> Demanded:
-        if not isinstance(one.held, Connection) or one.held.type is not None:
+        connection = one.held
+        if not isinstance(connection, Connection) or not request.adds_claims:
             return one
-        claimed = current(one.held.id)
-        found = claimed.type if claimed else connection_types.choose_type(one.held, config)
-        return replace(one, held=replace(one.held, type=found))
+        if connection.type is None:
+            claimed = current(connection.id)
+            found = claimed.type if claimed else connection_types.choose_type(connection, config)
+            connection = replace(connection, type=found)
+        if connection.type is None or id_problem(connection.broker or "none"):
+            return replace(one, held=connection)
+        held, note = connection.type.settled(connection, config)
+        return replace(one, held=held, note=note)
 
     return replace(request, demanded=tuple(map(chosen, request.demanded)))

@@ -36,6 +36,8 @@ class Demanded:
     term: Term | None = None
     connect: str = "none"
     """How to carry an application's inputs from other nodes: a type's word, ``auto``, ``none``."""
+    note: str = ""
+    """How it is carried, if not as the request says; a warning of the receipt."""
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
         """Return a fault of a field of this item."""

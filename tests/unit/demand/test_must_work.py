@@ -13,7 +13,7 @@ from tests.kit.memory import MemoryRepo
 
 
 class TestOpenBroker:
-    """The requested one, one on the target node, one on the source node, the only one."""
+    """The only one, the requested one, one on the target node, one on the source node."""
 
     @staticmethod
     def hosts(books: MemoryRepo) -> set[str]:
@@ -32,9 +32,14 @@ class TestOpenBroker:
             (("cloud", "edge", "vehicle00"), "", ("vehicle00", "edge"), "edge"),
             (("cloud", "vehicle00"), "", ("vehicle00", "edge"), "vehicle00"),
             (("cloud",), "", ("vehicle00", "edge"), "cloud"),
+            (("cloud",), "edge", ("vehicle00", "edge"), "cloud"),
+            (("cloud", "edge"), "nowhere", ("vehicle00", "edge"), "edge"),
+            (("cloud", "vehicle00"), "station00", ("vehicle00", "edge"), "vehicle00"),
         ],
         ids=["the requested", "the requested, which is the only one", "the target's",
-             "the source's", "the only one"],
+             "the source's", "the only one", "the only one instead of the requested",
+             "the target's instead of one that is not there",
+             "the source's instead of one that is not there"],
     )  # fmt: skip
     def test_the_broker_is_chosen_by_rule(
         self, there: tuple[str, ...], requested: str, ends: tuple[str, str], chosen: str
@@ -43,18 +48,33 @@ class TestOpenBroker:
         books.send(goal([], [connection(broker=requested, ends=ends)]))
         assert self.hosts(books) == {f"broker-{chosen}"}
 
-    def test_a_request_that_names_the_only_brokers_neighbour_is_refused(self) -> None:
-        """With one broker the reference ignores which one is requested."""
-        books = MemoryRepo(brokers("cloud"))
-        assert len(books.faults(goal([], [connection(broker="edge")]))) == 1
+    @pytest.mark.parametrize(
+        ("there", "requested", "note"),
+        [
+            (("cloud",), "edge", "'cloud', because inventory/brokers.yaml has none on 'edge'"),
+            (
+                ("cloud", "edge"),
+                "nowhere",
+                "'edge', because inventory/brokers.yaml has none on 'nowhere'",
+            ),
+        ],
+    )
+    def test_the_receipt_says_if_it_is_not_the_requested_one(
+        self, there: tuple[str, ...], requested: str, note: str
+    ) -> None:
+        books = MemoryRepo(brokers(*there))
+        decision = books.send(goal([], [connection(broker=requested)]))
+        assert decision.warnings == (f"connection 'vehicle00/edge' uses the broker on {note}",)
+        again = books.send(goal([], [connection(broker=there[-1])], id="2"))
+        assert again.outcome == "booked", "both name one broker"
 
     def test_a_broker_left_open_and_one_named_for_one_connection_agree(self) -> None:
         books = MemoryRepo()
         books.send(goal([], [connection(broker="")], id="1"))
         assert books.send(goal([], [connection(broker="cloud")], id="2")).outcome == "booked"
-        assert self.hosts(books) == {"service-mqtt-broker-cloud"}
+        assert self.hosts(books) == {"service-mqtt-broker-cloud.default.svc"}
         books.send(goal([], [connection(broker="cloud")], id="2", shutdown=True))
-        assert self.hosts(books) == {"service-mqtt-broker-edge"}
+        assert self.hosts(books) == {"service-mqtt-broker-edge.default.svc"}
 
 
 def test_absent_fields_take_the_defaults_of_ros() -> None:

@@ -38,7 +38,9 @@ REFUSED: dict[str, Goal] = {
     "a node unlike any other": goal([], [connection(ends=("vehicle00", "Mars"))]),
     "an unknown source of a connection": goal([], [connection(ends=("vehicle9", "edge"))]),
     "an unknown source of a topic": goal([application(clouds=[CLOUD, ("/points", "Mars")])]),
-    "a broker on a node that has none": goal([], [connection(broker="vehicle00")]),
+    "a broker on a node that has none": goal(
+        [], [connection(broker="station00", ends=("vehicle00", "vehicle01"))]
+    ),
     "an open broker, with several and none at either end": goal(
         [], [connection(broker="", ends=("vehicle00", "vehicle01"))]
     ),
