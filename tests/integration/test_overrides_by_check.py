@@ -45,7 +45,7 @@ def bodies(text: str) -> list[Any]:
     ("path", "replaced"),
     [
         (FUSION, [("domainId: 0", "domainId: 7"), ("replicas: 1", "replicas: 3")]),
-        (CLIENT, [("mqtt_client:kilted", "mqtt_client:jazzy")]),
+        (CLIENT, [("mqtt-client:2025-04", "mqtt-client:2026-01")]),
     ],
     ids=["values-and-replicas", "image-of-a-client"],
 )

@@ -25,6 +25,12 @@ DETECTION = f"{EDGE}/od-edge-station00.yaml"
 CLIENT = "clusters/c-its/perception/vehicle00/mqtt-vehicle00-edge-source-d3ca91c2df6c.yaml"
 LOST = "is generated, so a manual edit is lost; revert it"
 
+NEWER_PERCEPTION = [
+    (f"robotkube-{name}\n    tag: 2025-04", f"robotkube-{name}\n    tag: 2025-09")
+    for name in ("object-detection", "object-fusion", "k8s-configmap-watcher")
+]
+"""Edits of `registry/images.yaml`: newer images of all services."""
+
 
 @pytest.fixture(scope="session")
 def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -132,15 +138,15 @@ OTHER_EDITS: list[tuple[str, list[tuple[str, str]], dict[str, Any], list[str]]] 
     ),
     (
         CLIENT,
-        [("mqtt_client:kilted", "mqtt_client:jazzy"), ("replicas: 1", "replicas: 2")],
-        {"images": {"mqtt-client": {"tag": "jazzy"}}},
+        [("mqtt-client:2025-04", "mqtt-client:2026-01"), ("replicas: 1", "replicas: 2")],
+        {"images": {"mqtt-client": {"tag": "2026-01"}}},
         ["Deployment spec.replicas"],
     ),
     (
         CLIENT,
         [
             (
-                "ghcr.io/ika-rwth-aachen/mqtt_client:kilted",
+                "docker.io/rwthika/robotkube-mqtt-client:2025-04",
                 f"mirror.example:5000/mqtt@sha256:{'0' * 64}",
             )
         ],
@@ -299,7 +305,7 @@ def test_a_node_in_use_that_is_taken_away_is_told_with_how_to_give_it_up(
 def test_configuration_shows_in_which_fields_releases_change(
     branch: Path, found: Callable[..., dict[str, Any]]
 ) -> None:
-    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    edit(branch / "registry" / "images.yaml", *NEWER_PERCEPTION)
     data = found()
     assert [one["name"] for one in data["releases"]] == [
         "od-edge-station00", "od-edge-vehicle00", Path(FUSION).stem,
@@ -357,7 +363,7 @@ def test_the_check_of_another_render_version_says_so(
 def test_a_branch_of_several_commits_is_seen_whole_while_main_moves_on(
     bare: Path, branch: Path, found: Callable[..., dict[str, Any]]
 ) -> None:
-    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    edit(branch / "registry" / "images.yaml", *NEWER_PERCEPTION)
     commit(branch)
     (claim,) = claims(branch, "connection: vehicle00/edge")
     claim.unlink()
@@ -390,7 +396,7 @@ def test_without_a_remote_main_is_compared_with(
     branch: Path, found: Callable[..., dict[str, Any]]
 ) -> None:
     git(branch, "remote", "remove", "origin")
-    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    edit(branch / "registry" / "images.yaml", *NEWER_PERCEPTION)
     commit(branch)
     assert len(found()["releases"]) == 3
     assert found("--base", "HEAD")["releases"] == found()["releases"]  # not followed up yet
@@ -443,7 +449,7 @@ def test_a_base_that_is_none_is_told(branch: Path, check: Run) -> None:
 
 
 def test_the_report_is_ready_to_be_posted(branch: Path, check: Run) -> None:
-    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    edit(branch / "registry" / "images.yaml", *NEWER_PERCEPTION)
     (claim,) = claims(branch, "connection: vehicle00/edge")
     claim.unlink()
     edit(branch / DETECTION, ("tolerations: []", "tolerations: [{key: gpu}]"))
@@ -503,7 +509,7 @@ def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Run
     (claim,) = claims(branch, "kind: ApplicationClaim")
     crowd = [f"vehicle-{number:05}" for number in range(4_000)]
     claim.write_text(json.dumps(yaml.safe_load(claim.read_text()) | {"requesters": crowd}))
-    edit(branch / "registry" / "images.yaml", ("tag: 2025-04", "tag: 2025-09"))
+    edit(branch / "registry" / "images.yaml", *NEWER_PERCEPTION)
     code, out, _ = check("--output", "markdown")
     assert code == 0
     assert len(out) <= pull_request_comment.LONGEST == 60_000

@@ -6,6 +6,7 @@ from typing import Any
 
 import yaml
 from demandops.config.appdef import ApplicationDefinition
+from demandops.config.client_settings import ClientsFile
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
 from demandops.config.override import OverrideFile
 from demandops.config.policy import AccessDomainsFile
@@ -27,6 +28,7 @@ CONFIG_MODELS: dict[str, type[BaseModel]] = {
     "policy/access-domains.yaml": AccessDomainsFile,
     "registry/charts.yaml": ChartsFile,
     "registry/images.yaml": ImagesFile,
+    "registry/clients.yaml": ClientsFile,
     APPDEF: ApplicationDefinition,
     "overrides/values.yaml": OverrideFile,
 }
@@ -92,6 +94,7 @@ brokers:
     port: 8883
     tls: {caSecret: ca, caKey: ca.crt}
     credentials: {secret: login, userKey: user, passwordKey: password}
+    topicPrefix: fleet/one
 """
 _DOMAINS = """
 apiVersion: demandops/v1
@@ -129,13 +132,30 @@ charts:
   by-oci: {{oci: "oci://registry.example/charts/x", version: 1.0.0}}
   by-http: {{http: "https://charts.example", version: 1.0.0}}
 """
-_IMAGES = "apiVersion: demandops/v1\nkind: Images\nimages:\n" + "".join(
+_IMAGES = "apiVersion: demandops/v1\nkind: Images\nregistry: mirror:5000\nimages:\n" + "".join(
     f"  {name}: {{repository: registry.example/{name}, tag: v1, digest: '{_DIGEST}'}}\n"
     for name in (
         *("object-detection", "object-fusion", "k8s-configmap-watcher"),
         *("mqtt-client", "zenoh-bridge", "dds-router"),
     )
 )
+_CLIENT = """
+  env: {ROS_STATIC_PEERS: 192.0.2.1}
+  resources: {requests: {cpu: 100m}, limits: {memory: 1Gi}}
+  hostNetwork: false
+  startupProbe: {exec: {command: ["true"]}}
+  readinessProbe: {exec: {command: ["true"]}}
+  livenessProbe: {exec: {command: ["true"]}}
+"""
+_CLIENTS = f"""
+apiVersion: demandops/v1
+kind: Clients
+mqtt:{_CLIENT}
+  launchFile: own.launch.xml
+  rmw: rmw_fastrtps_cpp
+  messages: [std_msgs, sensor_msgs, perception_msgs]
+zenoh:{_CLIENT}
+ros:{_CLIENT}"""
 _APPDEF = """
 apiVersion: demandops/v1
 kind: ApplicationDefinition
@@ -203,6 +223,7 @@ def rich() -> dict[str, str]:
             "policy/access-domains.yaml": _DOMAINS,
             "registry/charts.yaml": _CHARTS,
             "registry/images.yaml": _IMAGES,
+            "registry/clients.yaml": _CLIENTS,
             APPDEF: _APPDEF,
         }
         | {f"overrides/{name}.yaml": text for name, text in _OVERRIDES.items()}

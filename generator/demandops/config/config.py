@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from demandops import naming
 from demandops.config.appdef import ApplicationDefinition, Service
+from demandops.config.client_settings import DEFAULT_SETTINGS, ClientsFile
 from demandops.config.inventory import Broker, Cluster, Node
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.policy import AccessDomain
@@ -21,6 +22,7 @@ BROKERS_FILE = "inventory/brokers.yaml"
 DOMAINS_FILE = "policy/access-domains.yaml"
 CHARTS_FILE = "registry/charts.yaml"
 IMAGES_FILE = "registry/images.yaml"
+CLIENTS_FILE = "registry/clients.yaml"
 
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
 """The top-level entries of a state repo that hold the configuration; people own them."""
@@ -45,6 +47,7 @@ class Config:
     domain_of: Mapping[str, AccessDomain]
     files: Mapping[str, str]
     overrides: Mapping[str, Override] = field(default_factory=dict)
+    clients: ClientsFile = DEFAULT_SETTINGS
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )

@@ -25,6 +25,7 @@ class ConfigReader:
         self.faults: list[Fault] = []
         self._positions: dict[str, dict[str, str]] = {}
         self._incomplete: set[str] = set()
+        self._heads: dict[str, BaseModel] = {}
 
     def add_fault(self, file: str, field: str, message: str) -> None:
         """Add a fault to :attr:`faults`."""
@@ -77,6 +78,11 @@ class ConfigReader:
                 items[name], positions[name] = parsed, field_path(at)
         return items
 
+    def head(self, file: str, model: type[Model]) -> Model | None:
+        """Return a file that :meth:`read_items` read, without its items, if its rest is valid."""
+        head = self._heads.get(file)
+        return head if isinstance(head, model) else None
+
     def place_of(self, file: str, name: str) -> str:
         """Return the field of an item in its file: ``nodes[3]``."""
         return self._positions[file][name]
@@ -115,7 +121,7 @@ class ConfigReader:
             if not isinstance(raw, kind):
                 self.read_file(file, whole)
                 return None
-            parse(whole, {**data, field: kind()}, file)
+            self._heads[file] = parse(whole, {**data, field: kind()}, file)
         except InvalidInput as error:
             self.faults += error.faults
         return raw

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from demandops import strict_yaml
 from demandops.config.appdef import Service
+from demandops.config.client_settings import patched
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
@@ -169,6 +170,11 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
         if override.node is not None:
             reader.check_reference(override.path, "node", override.node, NODES_FILE)
             _check_moved_to(override.node, override, config, reader)
+        if override.values and override.patches_clients():
+            try:
+                patched(config.clients.mqtt, override.values, override.path)  # it has every field
+            except InvalidInput as error:
+                reader.faults += error.faults
         versions = _versions_for(override, config)
         if override.version and versions and override.version not in versions:
             reader.add_fault(

@@ -128,13 +128,14 @@ class Toleration(CamelModel):
         return self
 
 
+Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"]
+
+
 class Ros(CamelModel):
     """The settings that a container needs to join the node's ROS graph."""
 
     domain_id: Annotated[int, Field(ge=0, le=232)] = 0
-    rmw: Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"] = (
-        "rmw_cyclonedds_cpp"
-    )
+    rmw: Rmw = "rmw_cyclonedds_cpp"
 
 
 class Node(CamelModel):
@@ -177,7 +178,10 @@ class Node(CamelModel):
 
 
 class Broker(CamelModel):
-    """A message broker and the node that it runs on."""
+    """A message broker and the node that it runs on.
+
+    Every MQTT topic of a connection at this broker starts with ``topic_prefix`` and ``/``.
+    """
 
     node: NodeId
     type: Literal["mqtt"] = "mqtt"
@@ -185,6 +189,9 @@ class Broker(CamelModel):
     port: Annotated[int, Field(ge=1, le=65535)] = 1883
     tls: Tls | None = None
     credentials: Credentials | None = None
+    topic_prefix: (
+        Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$")] | None
+    ) = None
 
 
 class ClustersFile(FileModel):

@@ -10,9 +10,11 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from demandops.config.appdef import ApplicationDefinition
+from demandops.config.client_settings import DEFAULT_SETTINGS, ClientsFile
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
+    CLIENTS_FILE,
     CLUSTERS_FILE,
     DOMAINS_FILE,
     IMAGES_FILE,
@@ -73,7 +75,8 @@ def load(files: Mapping[str, str]) -> Config:
         brokers=reader.read_items(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
         domains=domains,
         charts=reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart),
-        images=reader.read_items(IMAGES_FILE, ImagesFile, "images", Image),
+        images=_read_images(reader),
+        clients=_read_clients(reader),
         appdefs=_read_appdefs(reader),
         domain_of=_domains_of_nodes(reader, nodes, domains),
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
@@ -83,6 +86,19 @@ def load(files: Mapping[str, str]) -> Config:
     if reader.faults:
         raise InvalidInput(dict.fromkeys(reader.faults))
     return config
+
+
+def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
+    images = reader.read_items(IMAGES_FILE, ImagesFile, "images", Image)
+    head = reader.head(IMAGES_FILE, ImagesFile)
+    if head is None or head.registry is None:
+        return images
+    return {name: image.pulled_from(head.registry) for name, image in images.items()}
+
+
+def _read_clients(reader: ConfigReader) -> ClientsFile:
+    found = reader.read_file(CLIENTS_FILE, ClientsFile) if CLIENTS_FILE in reader.files else None
+    return found or DEFAULT_SETTINGS
 
 
 def _read_appdefs(reader: ConfigReader) -> Mapping[str, ApplicationDefinition]:

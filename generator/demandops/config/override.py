@@ -37,7 +37,7 @@ _MOMENT = re.compile(
     r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,6})\d*)?([Zz]|[+-]\d\d:\d\d)"
 )
 _SHAPING = ("values", "version", "images", "replicas", "node")
-_OF_SERVICES = ("values", "version", "replicas", "node", "keep")
+_OF_SERVICES = ("version", "replicas", "node", "keep")
 EFFECTS = (*_SHAPING, "hold", "deny", "keep")
 """The effects of overrides, in the order of messages."""
 
@@ -194,6 +194,11 @@ class OverrideFile(FileModel):
     def _misplaced(self) -> Iterable[str]:
         """Yield a problem for each effect that the selected releases and claims cannot have."""
         effects = self.effects()
+        if self.values is not None and self.selects_clients() and not self.patches_clients():
+            yield (
+                "select: values are a client's settings if connections are selected, and Helm "
+                "values else; write two overrides"
+            )
         for index, selector in enumerate(self.select):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
             if selector.connections and wrong:
@@ -206,6 +211,14 @@ class OverrideFile(FileModel):
                     f"select[{index}].services: keep is for applications and connections; select "
                     "those"
                 )
+
+    def selects_clients(self) -> bool:
+        """Return whether a selector names connections."""
+        return any(selector.connections for selector in self.select)
+
+    def patches_clients(self) -> bool:
+        """Return whether ``values`` patches the settings of clients, not Helm values."""
+        return all(selector.connections for selector in self.select)
 
     def effects(self) -> tuple[str, ...]:
         """Return the names of this override's effects."""

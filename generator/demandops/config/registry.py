@@ -99,6 +99,13 @@ class Image(FrozenModel):
             raise ValueError("needs a tag or a digest; without one the image is not pinned")
         return self
 
+    def pulled_from(self, registry: str) -> Image:
+        """Return the image with its host, if it names one, replaced by ``registry``."""
+        host, _, path = self.repository.partition("/")
+        named = path and ("." in host or ":" in host or host == "localhost")
+        repository = f"{registry}/{path if named else self.repository}"
+        return self.model_copy(update={"repository": repository})
+
     def parts(self) -> dict[str, str]:
         """Return repository, tag and digest as chart values; absent ones are empty."""
         return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
@@ -118,7 +125,8 @@ class ChartsFile(FileModel):
 
 
 class ImagesFile(FileModel):
-    """``registry/images.yaml``."""
+    """``registry/images.yaml``; all images are pulled from ``registry`` if it is given."""
 
     kind: Literal["Images"]
+    registry: Repository | None = None
     images: dict[DnsLabel, Image]

@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 from demandops import naming, strict_yaml
-from demandops.config.config import Config
+from demandops.config.client_settings import DEFAULT_SETTINGS, ClientSettings, patched
+from demandops.config.config import CLIENTS_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Node
 from demandops.config.override import UNSHAPED, Shaping
@@ -78,9 +79,25 @@ class Client(ABC):
         """Return the part of a configuration that the program reads only at its start."""
         return configuration
 
+    def settings(self, config: Config) -> ClientSettings:
+        """Return how the client runs, with the patches of overrides.
+
+        Raises:
+            InvalidInput: naming the override whose patch gives no valid settings.
+        """
+        found = config.clients.of(self.type.word)
+        for file, patch in self.shaping.patches:
+            found = patched(found, patch, file)
+        return found
+
+    def environment(self, settings: ClientSettings) -> dict[str, str]:
+        """Return the environment that the program needs, beside that of its settings."""
+        return {}
+
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
         """Return (file, entry, effect) for each configuration entry that shapes the client."""
-        return ()
+        if config.clients is not DEFAULT_SETTINGS:
+            yield CLIENTS_FILE, self.type.word, "how its container runs"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +121,12 @@ class End(Client):
     def reads(self, route: Route) -> bool:
         """Return whether this end reads the topic from ROS; the other end then publishes it."""
         return route.reverse is (self.side == "target")
+
+
+def message_type(route: Route, sender: str, config: Config) -> str:
+    """Return the message type of a route from ``sender``, as the route or the inventory says."""
+    known = config.nodes.get(sender)
+    return route.type or (known.types.get(route.read_topic, "") if known else "")
 
 
 UNSUPPORTED = "unsupported-connection-type"

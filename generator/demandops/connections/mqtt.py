@@ -14,16 +14,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from demandops import naming
-from demandops.config.config import BROKERS_FILE, IMAGES_FILE, Config
+from demandops.config.client_settings import ClientSettings, MqttClientSettings
+from demandops.config.config import BROKERS_FILE, CLIENTS_FILE, IMAGES_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Broker
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
+    UNSUPPORTED,
     ClientKey,
     Connections,
     ConnectionType,
     End,
     make_end,
+    message_type,
 )
 from demandops.connections.route import Route
 from demandops.errors import Fault, Refused, fault
@@ -67,6 +70,21 @@ class Mqtt(ConnectionType):
             message = f"is not given, and {message}"
         yield fault("broker", f"{message}; {remedy}", code=_NO_BROKER)
 
+    def route_faults(
+        self, where: str, route: Route, sender: str, config: Config
+    ) -> Iterator[Fault]:
+        """Yield a fault if the clients' image does not carry the route's messages."""
+        package = message_type(route, sender, config).partition("/")[0]
+        carried = config.clients.mqtt.messages
+        if package and carried and package not in carried and not route.primitive:
+            yield fault(
+                f"{where}.type",
+                f"'{route.source}' carries messages of {package}, and mqtt.messages in "
+                f"{CLIENTS_FILE} has only {', '.join(carried)}; use an image that has the package, "
+                "and add it there",
+                code=UNSUPPORTED,
+            )
+
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
         """Return the connection with the broker that it gets instead of the named one."""
         broker = choose_broker(connection, config)
@@ -93,6 +111,8 @@ class Mqtt(ConnectionType):
             message = f"connection '{key.id}' has no broker; add one to {BROKERS_FILE}"
             raise Refused.at("broker", message, code=_NO_BROKER)
         channel = naming.object_name(self.word, key.id)
+        if broker.topic_prefix:
+            channel = f"{broker.topic_prefix}/{channel}"
         return make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
 
 
@@ -125,9 +145,17 @@ class MqttEnd(End):
         return [*End.facts(self), f"broker {self.broker.node}"]
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Return the broker's entry."""
+        """Return the settings' and the broker's entries."""
+        yield from End.shaping_entries(self, config)
         broker = self.broker
         yield BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}"
+
+    def environment(self, settings: ClientSettings) -> dict[str, str]:
+        """Return the ROS domain, and the middleware if the image does not choose it."""
+        ros = self.node.ros
+        rmw = (isinstance(settings, MqttClientSettings) and settings.rmw) or ros.rmw
+        chosen = {} if rmw == "image" else {"RMW_IMPLEMENTATION": rmw}
+        return {"ROS_DOMAIN_ID": str(ros.domain_id), **chosen}
 
     def configuration(self) -> dict[str, Any]:
         """Return the content of one end's ROS parameter file.

@@ -23,6 +23,7 @@ from demandops.connections.connection_type import (
     ConnectionType,
     End,
     make_end,
+    message_type,
 )
 from demandops.connections.route import Route
 from demandops.errors import Fault, Refused, fault
@@ -99,12 +100,6 @@ class Ros(ConnectionType):
 
 
 ROS = Ros()
-
-
-def message_type(route: Route, sender: str, config: Config) -> str:
-    """Return the message type of a route from ``sender``, as the route or the inventory says."""
-    known = config.nodes.get(sender)
-    return route.type or (known.types.get(route.read_topic, "") if known else "")
 
 
 def _listener(connection: Connection, config: Config) -> Node | None:

@@ -34,7 +34,7 @@ def render(client: Client, config: Config, engine: Engine) -> str:
     if kind.image not in config.images:
         message = f"'{kind.image}' is in use, but not in {IMAGES_FILE}; add it there"
         raise Refused.at("images", message, code=UNSUPPORTED)
-    configuration = client.configuration()
+    configuration, settings = client.configuration(), client.settings(config)
     check_configuration(kind.word, configuration, client.name)
     restarts = client.written(client.needs_restart(configuration))
     return engine.text(
@@ -45,6 +45,15 @@ def render(client: Client, config: Config, engine: Engine) -> str:
         node=node,
         selector=node.labels(),
         tolerations=[item.model_dump(exclude_defaults=True) for item in node.tolerations],
+        settings=settings,
+        env=client.environment(settings) | settings.env,
+        probes={
+            f"{name}Probe": probe
+            for name in ("startup", "readiness", "liveness")
+            if (probe := getattr(settings, f"{name}_probe"))
+        },
+        resources=settings.resources.model_dump(),
+        host_network=node.host_network if settings.host_network is None else settings.host_network,
         image=client.shaping.image(kind.image, config.images).reference(),
     )
 

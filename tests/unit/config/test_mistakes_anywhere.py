@@ -20,8 +20,15 @@ DOCUMENTS = [
     *((rich.rich, f"overrides/{name}.yaml") for name in ("hold", "deny", "keep")),
     (rich.rich_with_api, "demandops.yaml"),
 ]
-FREE = {"OverrideFile.values", "Parameter.default"}
-FREE_PLACES = ("values", "parameters.rate.default")
+PROBES = ("startupProbe", "readinessProbe", "livenessProbe")
+FREE = {
+    *("OverrideFile.values", "Parameter.default"),
+    *(f"{kind}ClientSettings.{probe}" for kind in ("", "Mqtt") for probe in PROBES),
+}
+FREE_PLACES = (
+    *("values", "parameters.rate.default"),
+    *(f"{kind}.{probe}" for kind in ("mqtt", "zenoh", "ros") for probe in PROBES),
+)
 
 
 def form_of(file: str) -> Form:

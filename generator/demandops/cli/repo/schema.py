@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from demandops.cli.output import console
 from demandops.cluster.access import AccessFile
 from demandops.config.appdef import ApplicationDefinition
+from demandops.config.client_settings import ClientsFile
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
 from demandops.config.override import OverrideFile
 from demandops.config.policy import AccessDomainsFile
@@ -30,6 +31,7 @@ SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "demand": (DemandGoal, "a demand, for `demandops demand` and `demandops request`"),
     "deployment-request": (WireGoal, "a goal of DeploymentRequest, for `demandops request`"),
     "images": (ImagesFile, "registry/images.yaml"),
+    "clients": (ClientsFile, "registry/clients.yaml"),
     "nodes": (NodesFile, "inventory/nodes.yaml"),
     "override": (OverrideFile, "overrides/<name>.yaml"),
     "state-repo": (RepoSettings, "demandops.yaml"),

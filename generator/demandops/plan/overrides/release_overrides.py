@@ -75,6 +75,8 @@ def effects_on(release: Release, override: Override, config: Config) -> tuple[st
         known = config.charts[release.service.chart].versions()
         possible |= {"values", "replicas", "node"}
         possible |= {"version"} if override.version in known else set()
+    elif override.patches_clients():
+        possible |= {"values"}
     possible |= {"images"} if {*release.images} & {*(override.images or ())} else set()
     return tuple(name for name in override.effects() if name in possible)
 
